@@ -219,7 +219,7 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Flo
         for column in range(columns):
             if not math.isnan(height[row, column]):
                 continue
-            lines, total, weights, doubt = 0, 0.0, 0.0, 0.0
+            lines, total, weights, widest = 0, 0.0, 0.0, 0.0
             for down, right in steps:
                 spread = 0.0
                 first, second, a, b = 0.0, 0.0, 0, 0
@@ -241,10 +241,10 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Flo
                 lines += 1
                 total += w * (first * b + second * a) / (a + b)
                 weights += w
-                doubt = max(doubt, spread + 0.5 * abs(first - second))
+                widest = max(widest, spread + 0.5 * abs(first - second))
             if lines >= 2:
                 filled[row, column] = total / weights
-                filled_sigma[row, column] = doubt
+                filled_sigma[row, column] = widest
     return filled, filled_sigma
 
 

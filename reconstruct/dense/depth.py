@@ -1,12 +1,24 @@
-"""Depth of a reference view from one partner by semi-global matching."""
+"""Depth of a view: semi-global matching with single partners, and what several of them agree on.
+
+A depth is accepted where several independent matches agree: partners of one view, then the depth
+maps of neighbouring views. What only one match claims and nothing confirms is left out.
+"""
+
+import math
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
 from reconstruct.views.model import View
+from reconstruct.views.sight import FAST, KernelLens, pixel_at
+
+Float32 = NDArray[np.float32]
+Look = tuple[NDArray[np.uint8], NDArray[np.bool_]]
+"""A picture of even light, grey (H, W), and which of its pixels may be used, (H, W)."""
 
 MATCH_SIGMA_PX = 0.3
 """Standard deviation of a match that semi-global matching finds, before a survey gives its own."""
@@ -18,11 +30,13 @@ _LEAST_SLOPE = 2.0
 """Mean change over two pixels, grey levels, around a pixel that can be matched."""
 _STEPS = 16
 """OpenCV counts disparity in sixteenths of a pixel."""
+_SHIFTED = 0.2
+"""Share of half a picture by which no port shifts a pixel: what lies farther out is not seen."""
+GATE_SIGMAS = 3.0
+"""Depths that differ by no more than this many standard deviations of their difference agree."""
 
 
-def match(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], disparities_px: int
-) -> NDArray[np.float32]:
+def match(left: NDArray[np.uint8], right: NDArray[np.uint8], disparities_px: int) -> Float32:
     """Disparity of every pixel of a rectified left picture, NaN where no match is sure.
 
     Semi-global matching (Hirschmueller 2008) with OpenCV's Birchfield-Tomasi cost, along three
@@ -61,11 +75,11 @@ def has_texture(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """
     slope = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
     side = 2 * _BLOCK_PX + 1
-    mean: NDArray[np.float32] = cv2.boxFilter(np.abs(slope), -1, (side, side))
+    mean: Float32 = cv2.boxFilter(np.abs(slope), -1, (side, side))
     return np.asarray(mean >= _LEAST_SLOPE)
 
 
-def unrounded(fixed: NDArray[np.int16]) -> NDArray[np.float32]:
+def unrounded(fixed: NDArray[np.int16]) -> Float32:
     """The mean value, in steps of 1/16 px, of what OpenCV rounds to each step.
 
     OpenCV adds half a step to the offset from the best whole disparity and truncates towards
@@ -74,11 +88,11 @@ def unrounded(fixed: NDArray[np.int16]) -> NDArray[np.float32]:
     """
     step = fixed % _STEPS
     lift = np.where(step > _STEPS // 2, 1.0, np.where(step == 0, 0.5, 0.0))
-    found: NDArray[np.float32] = fixed.astype(np.float32) - lift.astype(np.float32)
+    found: Float32 = fixed.astype(np.float32) - lift.astype(np.float32)
     return found
 
 
-def without_mixed(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+def without_mixed(disparity_px: Float32) -> Float32:
     """Remove the pixels on either side of a step, which mix what is near and what is far."""
     kernel = np.ones((3, 3), np.uint8)
     known = np.isfinite(disparity_px)
@@ -88,24 +102,13 @@ def without_mixed(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def pair_depth(
-    reference: View,
-    partner: View,
-    grey_reference: NDArray[np.uint8],
-    grey_partner: NDArray[np.uint8],
-    valid_reference: NDArray[np.bool_],
-    valid_partner: NDArray[np.bool_],
-    points_world: Array,
-    match_sigma_px: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Depth of the reference from one partner.
+    views: tuple[View, View], looks: tuple[Look, Look], points_world: Array, match_sigma_px: float
+) -> tuple[Float32, Float32] | None:
+    """Depth of a reference view from one partner.
 
     Args:
-        reference: view to find depth for.
-        partner: view to match with.
-        grey_reference: (H, W) picture of even light.
-        grey_partner: of the partner.
-        valid_reference: (H, W) which pixels may be used.
-        valid_partner: of the partner.
+        views: the reference, and the partner to match it with.
+        looks: what they show.
         points_world: (N, 3) points that bound the depth.
         match_sigma_px: standard deviation of a match.
 
@@ -113,16 +116,16 @@ def pair_depth(
         (H, W) depth along the reference's axis and its standard deviation, NaN where unknown; None
         where the pair cannot be rectified.
     """
-    pair = rectify(reference, partner, points_world)
+    pair = rectify(*views, points_world)
     if pair is None:
         return None
-    left = warp(grey_reference, pair.rect_from_reference, pair)
+    (grey, usable), (grey_partner, usable_partner) = looks
+    left = warp(grey, pair.rect_from_reference, pair)
     right = warp(grey_partner, pair.rect_from_partner, pair)
     disparity = match(left, right, pair.disparities_px)
-    inside = _valid(valid_reference, pair.rect_from_reference, pair)
-    disparity[~inside] = np.nan
-    _drop_outside(disparity, _valid(valid_partner, pair.rect_from_partner, pair))
-    depth, _ = depth_in_reference(reference, partner, pair, without_mixed(disparity))
+    disparity[~_valid(usable, pair.rect_from_reference, pair)] = np.nan
+    _drop_outside(disparity, _valid(usable_partner, pair.rect_from_partner, pair))
+    depth, _ = depth_in_reference(*views, pair, without_mixed(disparity))
     sigma = depth * depth * np.float32(match_sigma_px / (pair.focal_px * pair.baseline))
     return depth, sigma
 
@@ -133,9 +136,135 @@ def _valid(valid: NDArray[np.bool_], homography: Array, pair: Rectification) -> 
     return np.asarray(cv2.erode(warped, np.ones((_BLOCK_PX, _BLOCK_PX), np.uint8)) == 255)
 
 
-def _drop_outside(disparity: NDArray[np.float32], valid_right: NDArray[np.bool_]) -> None:
+def _drop_outside(disparity: Float32, valid_right: NDArray[np.bool_]) -> None:
     rows, columns = np.nonzero(np.isfinite(disparity))
     at = np.rint(columns - disparity[rows, columns]).astype(np.int64)
     inside = (at >= 0) & (at < disparity.shape[1])
     inside[inside] = valid_right[rows[inside], at[inside]]
     disparity[rows[~inside], columns[~inside]] = np.nan
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def merge_depths(
+    depths: Float32, sigmas: Float32, gate: float
+) -> tuple[Float32, Float32, NDArray[np.uint8]]:
+    """Take the depth that most partners agree on, pixel by pixel.
+
+    Among the depths of a pixel the one with most others within the gate wins (the more certain
+    company where numbers are equal); the result is the weighted mean of that company. A pixel at
+    which two or more partners have a depth and none agree stays unknown.
+
+    Args:
+        depths: (K, H, W) depths from K partners, NaN where unknown.
+        sigmas: (K, H, W) their standard deviations.
+        gate: largest difference in standard deviations of the difference.
+
+    Returns:
+        (H, W) depth and its standard deviation, NaN where unknown, and how many partners agree.
+    """
+    count, height, width = depths.shape
+    merged = np.full((height, width), np.nan, np.float32)
+    sigma = np.full((height, width), np.nan, np.float32)
+    agreeing = np.zeros((height, width), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            known = 0
+            best_company, best_weight, best = 0, 0.0, -1
+            for k in range(count):
+                z = depths[k, row, column]
+                if math.isnan(z):
+                    continue
+                known += 1
+                s = sigmas[k, row, column]
+                company, weight = 0, 0.0
+                for j in range(count):
+                    other = depths[j, row, column]
+                    if math.isnan(other):
+                        continue
+                    t = sigmas[j, row, column]
+                    if (z - other) ** 2 <= gate * gate * (s * s + t * t):
+                        company += 1
+                        weight += 1.0 / (t * t)
+                if company > best_company or (company == best_company and weight > best_weight):
+                    best_company, best_weight, best = company, weight, k
+            if best < 0 or (known > 1 and best_company == 1):
+                continue
+            z = depths[best, row, column]
+            s = sigmas[best, row, column]
+            total, weights = 0.0, 0.0
+            for j in range(count):
+                other = depths[j, row, column]
+                if math.isnan(other):
+                    continue
+                t = sigmas[j, row, column]
+                if (z - other) ** 2 <= gate * gate * (s * s + t * t):
+                    total += other / (t * t)
+                    weights += 1.0 / (t * t)
+            merged[row, column] = total / weights
+            sigma[row, column] = math.sqrt(1.0 / weights)
+            agreeing[row, column] = best_company
+    return merged, sigma, agreeing
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def count_witnesses(
+    depth: Float32,
+    sigma: Float32,
+    slopes: Float32,
+    other_from_ref: Array,
+    other_depth: Float32,
+    other_sigma: Float32,
+    other_lens: KernelLens,
+    gate: float,
+) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """See which depths another view confirms and which it sees through.
+
+    Args:
+        depth: (H, W) of the reference.
+        sigma: (H, W) of it.
+        slopes: (H, W, 2) ray slopes of the reference, see `sight.slopes_of`.
+        other_from_ref: (3, 4) transform of points from the reference camera to the other.
+        other_depth: (h, w) of the other view.
+        other_sigma: (h, w) of it.
+        other_lens: of the other view.
+        gate: largest difference in standard deviations of the difference.
+
+    Returns:
+        (H, W) 1 where the other view finds its surface at the same depth, and (H, W) 1 where it
+        finds its surface clearly behind, so that the reference's point cannot be there.
+    """
+    height, width = depth.shape
+    confirmed = np.zeros((height, width), np.int8)
+    refuted = np.zeros((height, width), np.int8)
+    pinhole, t = other_lens[0], other_from_ref
+    middle_x, middle_y = 0.5 * other_depth.shape[1], 0.5 * other_depth.shape[0]
+    reach_x, reach_y = (1 + _SHIFTED) * middle_x, (1 + _SHIFTED) * middle_y
+    for row in range(height):
+        for column in range(width):
+            z = depth[row, column]
+            if math.isnan(z):
+                continue
+            x, y = slopes[row, column, 0], slopes[row, column, 1]
+            a = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
+            b = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
+            c = z * (t[2, 0] * x + t[2, 1] * y + t[2, 2]) + t[2, 3]
+            if c <= 0.0:
+                continue
+            at_x = pinhole[0] * a / c + pinhole[2]
+            at_y = pinhole[1] * b / c + pinhole[3]
+            if abs(at_x - middle_x) > reach_x or abs(at_y - middle_y) > reach_y:
+                continue
+            at_x, at_y = pixel_at(other_lens, a, b, c)
+            u, v = math.floor(at_x), math.floor(at_y)
+            if u < 0 or v < 0 or u >= other_depth.shape[1] or v >= other_depth.shape[0]:
+                continue
+            there = other_depth[v, u]
+            if math.isnan(there):
+                continue
+            s, r = sigma[row, column], other_sigma[v, u]
+            tolerance = gate * math.sqrt(s * s + r * r)
+            if abs(there - c) <= tolerance:
+                confirmed[row, column] = 1
+            elif there > c + tolerance:
+                refuted[row, column] = 1
+    return confirmed, refuted

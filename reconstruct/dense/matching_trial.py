@@ -7,6 +7,8 @@ matches, and better ones. How far depths from different partners differ, in unit
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -16,8 +18,7 @@ from numpy.typing import NDArray
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
-from reconstruct.dense.stereo_pairs import StereoPair
+from reconstruct.dense.depth import MATCH_SIGMA_PX, Look, pair_depth
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View, scaled_view
@@ -43,27 +44,6 @@ class Conditions:
     """Standard deviation of a match in pixels of the shrunk pictures."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ProbeTask:
-    """One view to try."""
-
-    workspace: Path
-    view: View
-    partners: tuple[View, ...]
-    points_world: Array
-    scales: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProbeResult:
-    """What was found at each scale."""
-
-    known: tuple[float, ...]
-    """Share of the view's pixels with depth from its first partner."""
-    spread: tuple[float, ...]
-    """Scatter of the difference between two partners, in its expected standard deviations."""
-
-
 def matching_scale(view: View) -> float:
     """1, 1/2, 1/4, ...: the largest at which a picture has no more than `LARGEST_PIXELS`."""
     scale = 1.0
@@ -75,7 +55,7 @@ def matching_scale(view: View) -> float:
 def find_conditions(
     workspace: Path,
     views: Sequence[View],
-    pairs: Sequence[Sequence[StereoPair]],
+    partners: Sequence[Sequence[int]],
     points: Sequence[Array],
     scale: float | None,
     executor: Executor,
@@ -85,33 +65,27 @@ def find_conditions(
     Args:
         workspace: with the pictures.
         views: of the model.
-        pairs: for every view.
+        partners: of every view, best first.
         points: (N, 3) for every view, that bound its depth.
         scale: of matching, or None to choose it.
         executor: where tasks run.
     """
-    able = [number for number, found in enumerate(pairs) if found]
+    able = [number for number, found in enumerate(partners) if found]
     chosen = able[:: max(1, len(able) // _PROBES)][:_PROBES]
     largest = min(matching_scale(views[number]) for number in chosen)
     scales = tuple(largest / 2**n for n in range(_SCALES)) if scale is None else (scale,)
     tasks = [
-        ProbeTask(
-            workspace=workspace,
-            view=views[number],
-            partners=tuple(views[pair.partner] for pair in pairs[number][:3]),
-            points_world=points[number],
-            scales=scales,
-        )
+        ((views[number], *(views[n] for n in partners[number][:3])), points[number])
         for number in chosen
     ]
-    results = list(executor.map(probe, tasks, label="try matching"))
-    known = np.mean([result.known for result in results], axis=0)
+    found = executor.map(partial(probe, workspace, scales), tasks, label="try matching")
+    known, spreads = np.moveaxis(np.array(list(found)), -1, 0)
+    share = known.mean(axis=0)
     best = 0
-    while best + 1 < len(scales) and known[best + 1] > _WORTH * known[best]:
+    while best + 1 < len(scales) and share[best + 1] > _WORTH * share[best]:
         best += 1
-    spreads = [result.spread[best] for result in results]
-    known_spreads = [spread for spread in spreads if np.isfinite(spread)]
-    sigma = MATCH_SIGMA_PX * (float(np.median(known_spreads)) if known_spreads else 1.0)
+    spread = spreads[:, best][np.isfinite(spreads[:, best])]
+    sigma = MATCH_SIGMA_PX * (float(np.median(spread)) if len(spread) else 1.0)
     return Conditions(
         scale=scales[best],
         match_sigma_px=round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3),
@@ -134,36 +108,36 @@ def _resized(
     return cv2.resize(colour, size_px, interpolation=cv2.INTER_AREA), np.asarray(small == 255)
 
 
-def probe(task: ProbeTask) -> ProbeResult:
-    """Match a view with its partners at every scale."""
-    known, spread = [], []
-    whole = (task.view, *task.partners)
-    looks = [_looks(task.workspace, view, task.scales) for view in whole]
-    for n, scale in enumerate(task.scales):
-        views = [scaled_view(view, scale) for view in whole]
-        greys, valids = zip(*(look[n] for look in looks), strict=True)
-        maps = []
-        for number in range(1, len(views)):
-            found = pair_depth(
-                views[0],
-                views[number],
-                greys[0],
-                greys[number],
-                valids[0],
-                valids[number],
-                task.points_world,
-                MATCH_SIGMA_PX,
-            )
-            if found is not None:
-                maps.append(found)
-        known.append(float(np.isfinite(maps[0][0]).mean()) if maps else 0.0)
-        spread.append(_spread(maps))
-    return ProbeResult(known=tuple(known), spread=tuple(spread))
+def probe(
+    workspace: Path, scales: Sequence[float], task: tuple[tuple[View, ...], Array]
+) -> list[tuple[float, float]]:
+    """Match a view with its partners at every scale.
+
+    Args:
+        workspace: with the pictures.
+        scales: to try.
+        task: the view and its partners, and points (N, 3) that bound its depth.
+
+    Returns:
+        For each scale the share of the view's pixels with depth from its first partner, and the
+        scatter of the difference between two partners, in its expected standard deviations.
+    """
+    views, points_world = task
+    looks = [_looks(workspace, view, scales) for view in views]
+    found = []
+    for n, scale in enumerate(scales):
+        small = [scaled_view(view, scale) for view in views]
+        shown = [look[n] for look in looks]
+        pairs = (
+            pair_depth((small[0], other), (shown[0], look), points_world, MATCH_SIGMA_PX)
+            for other, look in zip(small[1:], shown[1:], strict=True)
+        )
+        maps = [pair for pair in pairs if pair is not None]
+        found.append((float(np.isfinite(maps[0][0]).mean()) if maps else 0.0, _spread(maps)))
+    return found
 
 
-def _looks(
-    workspace: Path, view: View, scales: Sequence[float]
-) -> list[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
+def _looks(workspace: Path, view: View, scales: Sequence[float]) -> list[Look]:
     """An evened picture and its validity at every scale, the picture read once."""
     pictures = Pictures.open(workspace)
     colour, valid = pictures.colour(view.image), pictures.valid(view.image)
@@ -178,12 +152,9 @@ def _looks(
 def _spread(maps: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> float:
     """Median over pairs of partners of the normalised scatter of their difference; NaN if none."""
     spreads = []
-    for first in range(len(maps)):
-        for second in range(first + 1, len(maps)):
-            (z, s), (y, t) = maps[first], maps[second]
-            both = np.isfinite(z) & np.isfinite(y)
-            if both.sum() < _LEAST_COMMON:
-                continue
+    for (z, s), (y, t) in combinations(maps, 2):
+        both = np.isfinite(z) & np.isfinite(y)
+        if both.sum() >= _LEAST_COMMON:
             difference = (z[both] - y[both]) / np.hypot(s[both], t[both])
             spreads.append(MAD_TO_SIGMA * float(np.median(np.abs(difference))))
     return float(np.median(spreads)) if spreads else float("nan")

@@ -1,7 +1,7 @@
 """Depth maps as points with normals and colours, in local east, north, up."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,13 +132,11 @@ def joined(parts: list[Points]) -> Points:
         sigmas=empty[:, 0],
         views=empty[:, 0].astype(np.int32),
     )
-    parts = [none, *parts]
     return Points(
-        enu=np.concatenate([p.enu for p in parts]),
-        normals=np.concatenate([p.normals for p in parts]),
-        colours=np.concatenate([p.colours for p in parts]),
-        sigmas=np.concatenate([p.sigmas for p in parts]),
-        views=np.concatenate([p.views for p in parts]),
+        **{
+            field.name: np.concatenate([getattr(part, field.name) for part in (none, *parts)])
+            for field in fields(Points)
+        }
     )
 
 

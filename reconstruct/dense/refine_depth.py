@@ -14,7 +14,7 @@ the noise that remains between pictures.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -92,7 +92,7 @@ def _blur(picture: Float32, sigma_px: float) -> Float32:
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def sights(lens: KernelLens, height: int, width: int) -> Float32:
+def pixel_lines(lens: KernelLens, height: int, width: int) -> Float32:
     """Lines on which the spots of a view's pixels lie, (H, W, 4).
 
     Slopes x/z, y/z at an inverse depth of zero, and how they change with it.
@@ -124,7 +124,7 @@ def compare(
     Args:
         inverse_depth: (H, W) along the reference's axis, NaN where unknown.
         reference: (H, W) contrast.
-        lines: (H, W, 4) of the reference, see `sights`.
+        lines: (H, W, 4) of the reference, see `pixel_lines`.
         spline: (h, w) B-spline coefficients of the neighbour's contrast.
         valid: (h, w) of the neighbour.
         other_lens: of the neighbour.
@@ -259,13 +259,8 @@ def _has_step(inverse: Float32, speed: Float32) -> NDArray[np.bool_]:
 
 
 def _chosen(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
-    return _NeighbourSums(
-        pull=np.where(mask, yes.pull, no.pull),
-        curvature=np.where(mask, yes.curvature, no.curvature),
-        speed=np.where(mask, yes.speed, no.speed),
-        likeness=np.where(mask, yes.likeness, no.likeness),
-        seen=np.where(mask, yes.seen, no.seen),
-    )
+    names = [field.name for field in fields(yes)]
+    return _NeighbourSums(**{n: np.where(mask, getattr(yes, n), getattr(no, n)) for n in names})
 
 
 def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
@@ -286,7 +281,7 @@ def _sums(
     shape = inverse.shape
     pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
     likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    lines = sights(lens_of(reference.view), *shape)
+    lines = pixel_lines(lens_of(reference.view), *shape)
     samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
     mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
     spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean

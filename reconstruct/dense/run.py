@@ -7,7 +7,7 @@ prepare pictures, find each view's depth with a few partners, let neighbours con
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,14 @@ from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud, write_c
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_conditions
 from reconstruct.dense.pose_part import find_pose_part
-from reconstruct.dense.stereo_pairs import choose_pairs, neighbours, points_in_sight
+from reconstruct.dense.stereo_pairs import choose_partners, neighbours, points_in_sight
 from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
     LOOKS,
-    CheckTask,
-    DepthTask,
-    PrepareTask,
-    RefineTask,
+    ViewTask,
     check_view,
-    find_doubt,
+    find_sigma_factor,
     looked_at,
     prepare_view,
     refine_view,
@@ -72,59 +69,30 @@ def build_surface(
     """Do the work of the stage in a folder; see `run_dense`."""
     store = ViewStore(folder / "scratch")
     store.folder.mkdir(parents=True, exist_ok=True)
-    partners = choose_pairs(model, settings.dense_partners)
+    partners = choose_partners(model, settings.dense_partners)
     points = points_in_sight(model)
     conditions = find_conditions(
         workspace, model.views, partners, points, settings.dense_scale, executor
     )
     views = [scaled_view(view, conditions.scale) for view in model.views]
-    prepare = [
-        PrepareTask(
-            workspace=workspace,
-            store=store,
-            index=index,
-            image=view.image,
-            size_px=(view.width_px, view.height_px),
-        )
-        for index, view in enumerate(views)
-    ]
-    _drain(executor.map(prepare_view, prepare, label="even out pictures"))
-    depths = [
-        DepthTask(
-            store=store,
-            index=index,
-            view=views[index],
-            partners=tuple((pair.partner, views[pair.partner]) for pair in pairs),
-            points_world=points[index],
-            match_sigma_px=conditions.match_sigma_px,
-        )
-        for index, pairs in enumerate(partners)
-    ]
-    _drain(executor.map(view_depth, depths, label="match"))
-    witnesses = neighbours(model, _WITNESSES)
-    refine_tasks = [
-        RefineTask(
-            store=store,
-            index=index,
-            view=views[index],
-            others=tuple((n, views[n]) for n in looked_at(views, index, partners[index])),
-        )
-        for index in range(len(views))
-    ]
-    _drain(executor.map(refine_view, refine_tasks, label="refine"))
-    checks = [
-        CheckTask(
-            store=store,
-            index=index,
-            view=views[index],
-            neighbours=tuple((n, views[n]) for n in witnesses[index]),
-            doubt=1.0,
-        )
-        for index in range(len(views))
-    ]
-    doubt = find_doubt(checks, executor)
-    checks = [replace(check, doubt=doubt) for check in checks]
-    summaries = list(executor.map(check_view, checks, label="cross-check"))
+
+    def tasks(others: Sequence[Sequence[int]]) -> list[ViewTask]:
+        return [
+            ViewTask(store=store, index=n, view=view, others=tuple((m, views[m]) for m in chosen))
+            for n, (view, chosen) in enumerate(zip(views, others, strict=True))
+        ]
+
+    prepare = partial(prepare_view, workspace)
+    _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
+    match = partial(view_depth, conditions.match_sigma_px)
+    matched = list(zip(tasks(partners), points, strict=True))
+    _drain(executor.map(match, matched, label="match"))
+    looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
+    _drain(executor.map(refine_view, tasks(looks), label="refine"))
+    checks = tasks(neighbours(model, _WITNESSES))
+    sigma_factor = find_sigma_factor(checks, executor)
+    check = partial(check_view, sigma_factor)
+    summaries = list(executor.map(check, checks, label="cross-check"))
     grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
     offset = _offset(grid, summaries)
     edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
@@ -136,8 +104,9 @@ def build_surface(
     )
     write_light(folder / "light.json", light)
     pose_part = find_pose_part(workspace, model)
-    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt, pose_part)
-    tiles = executor.map(fuse_tile, tasks, label="fuse")
+    stations = np.array([view.station for view in views], dtype=np.int64)
+    fuse = partial(fuse_tile, store, light, stations, offset, edge, sigma_factor)
+    tiles = executor.map(fuse, tile_tasks(grid, views, summaries, pose_part), label="fuse")
     parts = _write_rasters(folder, grid, model.frame, tiles)
     with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:
         count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, model.frame)
@@ -155,7 +124,7 @@ def build_surface(
             "matching_scale": conditions.scale,
             "match_sigma_px": conditions.match_sigma_px,
             "refined_with": LOOKS,
-            "sigma_factor": round(doubt, 3),
+            "sigma_factor": round(sigma_factor, 3),
             "pose_sigma": None if pose_part is None else float(f"{pose_part.median:.3g}"),
             "cell": grid.cell,
             "unit": model.frame.unit,
@@ -163,7 +132,7 @@ def build_surface(
             "columns": grid.columns,
             "frame": model.frame.name,
             "vertical_datum": model.frame.vertical_datum,
-            "pairs": sum(len(pairs) for pairs in partners),
+            "pairs": sum(len(chosen) for chosen in partners),
             "gaps_bridged_cells": FILL_CELLS,
             "notes": list(model.frame.notes),
         },

@@ -6,8 +6,6 @@ match that is good to s pixels is good to s (Z / f) (Z / B): the rig partner (B 
 covers everything but is coarse, neighbours along and across the track carry the precision.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -34,19 +32,6 @@ _BEYOND = 1.2
 """Times the farthest point that a view observed: points of others may lie so far away."""
 _LEAST_GAIN = 0.03
 """Share of a view's points that another partner must newly serve to be worth its time."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StereoPair:
-    """A reference view and a partner to match it with."""
-
-    reference: int
-    """Index of the view whose depth is found."""
-    partner: int
-    overlap: float
-    """Share of the reference's points that the partner sees."""
-    base_to_height: float
-    """Baseline across the line of sight, over the median distance."""
 
 
 def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
@@ -95,7 +80,7 @@ def neighbours(model: SparseModel, most: int) -> list[list[int]]:
 
 
 @progress.step("choose partners")
-def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]]:
+def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
     """Choose partners for every view.
 
     The rig partner comes first: it was exposed at the same moment, under the same light. Others
@@ -108,7 +93,7 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
         per_view: largest number of partners of a view.
 
     Returns:
-        For every view its pairs, best first; none for a view with too few sparse points.
+        For every view its partners, best first; none for a view with too few sparse points.
 
     Raises:
         ReconstructionError: no view has a partner.
@@ -117,7 +102,8 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
     centres = np.array([view.world_from_cam.translation for view in model.views]).reshape(-1, 3)
     tree = cKDTree(centres)
     observed = points_of_views(model)
-    chosen: list[list[StereoPair]] = []
+    stations = [view.station for view in model.views]
+    chosen: list[list[int]] = []
     for index in range(len(model.views)):
         points = observed[index]
         if len(points) < LEAST_POINTS:
@@ -125,7 +111,7 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
             continue
         points = points[:: max(1, len(points) // _SAMPLE)]
         distance = float(np.median(np.linalg.norm(points - centres[index], axis=1)))
-        candidates: list[tuple[StereoPair, Array]] = []
+        candidates: dict[int, Array] = {}
         for other in sorted(tree.query_ball_point(centres[index], _USABLE_RATIO[1] * distance)):
             base = centres[other] - centres[index]
             if other == index:
@@ -142,16 +128,9 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
             served = in_frame(model.views[other], points).astype(np.float64)
             if served.mean() < _LEAST_OVERLAP:
                 continue
-            pair = StereoPair(
-                reference=index,
-                partner=int(other),
-                overlap=float(served.mean()),
-                base_to_height=ratio,
-            )
-            candidates.append((pair, served * _quality(ratio) * (1.0 - tilt * tilt)))
-        stations = [view.station for view in model.views]
-        rig = [c for c in candidates if stations[c[0].partner] == stations[index]]
-        chosen.append(_complementary(rig, candidates, per_view))
+            candidates[int(other)] = served * _quality(ratio) * (1.0 - tilt * tilt)
+        rig = [n for n in candidates if stations[n] == stations[index]]
+        chosen.append(_complementary(rig[:per_view], candidates, per_view))
     if not any(chosen):
         raise ReconstructionError(
             f"none of {len(model.views)} registered pictures has a partner with "
@@ -170,24 +149,17 @@ def _quality(ratio: float) -> float:
     return 0.8
 
 
-def _complementary(
-    first: list[tuple[StereoPair, Array]],
-    candidates: list[tuple[StereoPair, Array]],
-    per_view: int,
-) -> list[StereoPair]:
-    if not candidates:
-        return []
-    pairs = [pair for pair, _ in first[:per_view]]
-    missed = np.ones_like(candidates[0][1])
-    for _, quality in first[:per_view]:
-        missed = missed * (1.0 - quality)
-    candidates = [c for c in candidates if c[0] not in pairs]
-    while candidates and len(pairs) < per_view:
-        gains = [float((missed * quality).mean()) for _, quality in candidates]
+def _complementary(first: list[int], candidates: dict[int, Array], per_view: int) -> list[int]:
+    """The first, and candidates that match well what those before them miss."""
+    chosen, missed = list(first), np.array(1.0)
+    for n in first:
+        missed = missed * (1.0 - candidates[n])
+    left = [n for n in candidates if n not in chosen]
+    while left and len(chosen) < per_view:
+        gains = [float((missed * candidates[n]).mean()) for n in left]
         best = int(np.argmax(gains))
-        if gains[best] < _LEAST_GAIN and pairs:
+        if gains[best] < _LEAST_GAIN and chosen:
             break
-        pair, quality = candidates.pop(best)
-        missed = missed * (1.0 - quality)
-        pairs.append(pair)
-    return pairs
+        chosen.append(left.pop(best))
+        missed = missed * (1.0 - candidates[chosen[-1]])
+    return chosen

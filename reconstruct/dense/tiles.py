@@ -54,21 +54,12 @@ class ViewSummary:
 class FuseTask:
     """One tile of the grid to fuse."""
 
-    store: ViewStore
     window: Window
     grid: DemGrid
     """Grid of the tile with its rim."""
     rim: tuple[int, int, int, int]
     """Cells around the tile, top, bottom, left, right, that only serve to judge and fill."""
     views: tuple[tuple[int, View], ...]
-    stations: NDArray[np.int64]
-    """Station of every view of the survey."""
-    light: LightModel
-    offset_enu: tuple[float, float, float]
-    edge: float
-    """Edge of the cubes to which the cloud is thinned."""
-    doubt: float
-    """Factor on the standard deviations of refined depths."""
     pose_sigmas: Array | None
     """(m, n) sigmas of heights from errors of poses, on a lattice over the grid."""
 
@@ -88,19 +79,13 @@ class Tile:
 
 
 def tile_tasks(
-    store: ViewStore,
     grid: DemGrid,
     views: Sequence[View],
     summaries: Sequence[ViewSummary],
-    light: LightModel,
-    offset_enu: tuple[float, float, float],
-    edge: float,
-    doubt: float,
     pose_part: PosePart | None,
 ) -> list[FuseTask]:
     """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
     tasks = []
-    stations = np.array([view.station for view in views], dtype=np.int64)
     nowhere = (np.inf, np.inf, -np.inf, -np.inf)
     bounds = np.array([summary.bounds or nowhere for summary in summaries])
     for window in tiles_of(grid, _TILE_CELLS):
@@ -123,26 +108,32 @@ def tile_tasks(
         if pose_part is not None:
             poses = pose_part.at_nodes(part.north, part.west, part.cell, part.rows, part.columns)
         tasks.append(
-            FuseTask(
-                store=store,
-                window=window,
-                grid=part,
-                rim=rim,
-                views=tuple(seeing),
-                stations=stations,
-                light=light,
-                offset_enu=offset_enu,
-                edge=edge,
-                doubt=doubt,
-                pose_sigmas=poses,
-            )
+            FuseTask(window=window, grid=part, rim=rim, views=tuple(seeing), pose_sigmas=poses)
         )
     return tasks
 
 
-def fuse_tile(task: FuseTask) -> Tile:
-    """Fuse the points of all views in a tile into cells and cloud points."""
-    offset = np.array(task.offset_enu)
+def fuse_tile(
+    store: ViewStore,
+    light: LightModel,
+    stations: NDArray[np.int64],
+    offset_enu: tuple[float, float, float],
+    edge: float,
+    sigma_factor: float,
+    task: FuseTask,
+) -> Tile:
+    """Fuse the points of all views in a tile into cells and cloud points.
+
+    Args:
+        store: with the depth of every view.
+        light: of the survey.
+        stations: (V,) station of every view.
+        offset_enu: origin of the cloud.
+        edge: of the cubes to which the cloud is thinned.
+        sigma_factor: on the standard deviations of refined depths.
+        task: the tile.
+    """
+    offset = np.array(offset_enu)
     grid = task.grid.moved(-offset[0], -offset[1])
     box = (
         grid.west,
@@ -150,11 +141,10 @@ def fuse_tile(task: FuseTask) -> Tile:
         float(grid.north_of(grid.rows)),
         grid.north,
     )
-    store = task.store
     parts = []
     for index, view in task.views:
         depth, sigma = store.load_depth(index, "fine")
-        sigma *= np.float32(task.doubt)
+        sigma *= np.float32(sigma_factor)
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * grid.cell
         parts.append(
@@ -165,14 +155,14 @@ def fuse_tile(task: FuseTask) -> Tile:
                 sigma,
                 store.load_mask(index, "kept", view.width_px) & sure,
                 store.load_colour(index),
-                task.light.factors(view.camera, view.image),
+                light.factors(view.camera, view.image),
                 offset,
                 box,
                 np.asarray(store.load(index, "blocks")),
             )
         )
     points = joined(parts)
-    height, sigma, count, met = fuse_points(grid, points, task.stations)
+    height, sigma, count, met = fuse_points(grid, points, stations)
     stray = ~without_strays(height)
     height[stray], sigma[stray], count[stray], met[stray] = np.nan, np.nan, 0, 0
     height, sigma = fill_gaps(height, sigma, FILL_CELLS)
@@ -185,9 +175,9 @@ def fuse_tile(task: FuseTask) -> Tile:
     columns = DemGrid(
         west=own.west,
         north=own.north,
-        cell=task.edge,
-        rows=math.ceil(own.rows * own.cell / task.edge - 1e-9),
-        columns=math.ceil(own.columns * own.cell / task.edge - 1e-9),
+        cell=edge,
+        rows=math.ceil(own.rows * own.cell / edge - 1e-9),
+        columns=math.ceil(own.columns * own.cell / edge - 1e-9),
     )
     return Tile(
         window=task.window,

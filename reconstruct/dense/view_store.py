@@ -60,22 +60,22 @@ class ViewStore:
         middle = np.float32(np.log(np.median(depth[known]))) if known.any() else np.float32(0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             level = np.rint((np.log(depth) - middle) / _DEPTH_STEP) + 32768
-            doubt = np.rint(np.log(sigma / depth / _SIGMA_LEAST) / _SIGMA_STEP) + 1
+            share = np.rint(np.log(sigma / depth / _SIGMA_LEAST) / _SIGMA_STEP) + 1
         known &= (level >= 1) & (level <= 65535)
         self.save(view, f"{name}.middle", np.array([middle], np.float32))
-        self.save(view, f"{name}.sigma", _code(np.clip(doubt, 1, 255), known, np.uint8))
+        self.save(view, f"{name}.sigma", _code(np.clip(share, 1, 255), known, np.uint8))
         self.save(view, name, _code(level, known, np.uint16))
 
     def load_depth(self, view: int, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth (H, W) and its standard deviation, NaN where unknown."""
-        level, doubt = self.load(view, name), self.load(view, f"{name}.sigma")
+        level, share = self.load(view, name), self.load(view, f"{name}.sigma")
         middle = float(self.load(view, f"{name}.middle")[0])
         codes = np.arange(65536)
         depths = np.exp(middle + (codes - 32768) * _DEPTH_STEP).astype(np.float32)
         shares = (_SIGMA_LEAST * np.exp((np.arange(256) - 1) * _SIGMA_STEP)).astype(np.float32)
         depths[0], shares[0] = np.nan, np.nan
         depth = depths[level]
-        return depth, depth * shares[doubt]
+        return depth, depth * shares[share]
 
     def save_colour(self, view: int, colour: NDArray[np.uint8]) -> None:
         """Keep a picture (H, W, 3) BGR: brightness in full, colour at half the resolution."""

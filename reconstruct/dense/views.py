@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense.depth import pair_depth
-from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.dense.depth import GATE_SIGMAS, count_witnesses, merge_depths, pair_depth
 from reconstruct.dense.matching_trial import shrunk
 from reconstruct.dense.points import block_bounds
 from reconstruct.dense.refine_depth import ComparedView, prepared, refine
-from reconstruct.dense.stereo_pairs import StereoPair, in_frame
+from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joined_samples, low_pass
@@ -36,39 +35,16 @@ _LIGHT_LATTICE = 28
 """Pixels along a picture's width at which the light of views is compared."""
 LOOKS = 4
 """Neighbours by which depth is refined."""
-_DOUBTERS = 12
-_DOUBT_STEP = 7
+_COMPARED_VIEWS = 12
+_COMPARED_STEP_PX = 7
 """Views, and pixels between the pixels of each, by which the sigma factor is measured."""
 _LEAST_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PrepareTask:
-    """One picture to undistort, shrink and even out."""
-
-    workspace: Path
-    store: ViewStore
-    index: int
-    image: str
-    size_px: tuple[int, int]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DepthTask:
-    """One view to find depth for."""
-
-    store: ViewStore
-    index: int
-    view: View
-    partners: tuple[tuple[int, View], ...]
-    points_world: Array
-    match_sigma_px: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefineTask:
-    """One view whose depth is to be made exact."""
+class ViewTask:
+    """One view, and the other views that it is compared with."""
 
     store: ViewStore
     index: int
@@ -76,24 +52,13 @@ class RefineTask:
     others: tuple[tuple[int, View], ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckTask:
-    """One view whose depth is checked against its neighbours."""
-
-    store: ViewStore
-    index: int
-    view: View
-    neighbours: tuple[tuple[int, View], ...]
-    doubt: float
-    """Factor on the standard deviations of refined depths."""
-
-
-def prepare_view(task: PrepareTask) -> None:
+def prepare_view(workspace: Path, task: ViewTask) -> None:
     """Keep a picture's colour and validity at the size of matching."""
-    store = task.store
+    store, view = task.store, task.view
     if store.has(task.index, "low"):
         return
-    colour, valid = shrunk(Pictures.open(task.workspace), task.image, task.size_px)
+    size_px = (view.width_px, view.height_px)
+    colour, valid = shrunk(Pictures.open(workspace), view.image, size_px)
     store.save_colour(task.index, colour)
     store.save_mask(task.index, "valid", valid)
     store.save(task.index, "low", low_pass(colour, valid))
@@ -111,24 +76,25 @@ def _look(store: ViewStore, index: int, width: int) -> tuple[NDArray[Any], ...]:
     return prepared(store.load_bright(index), store.load_mask(index, "valid", width))
 
 
-def view_depth(task: DepthTask) -> None:
-    """Match a view with its partners and merge what they say."""
+def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
+    """Match a view with its partners and merge what they find.
+
+    Args:
+        match_sigma_px: standard deviation of a match.
+        matched: the view with its partners, and points (N, 3) that bound its depth.
+    """
+    task, points_world = matched
     store = task.store
     if store.has(task.index, "agreeing"):
         return
     shape = (task.view.height_px, task.view.width_px)
     depths, sigmas = [], []
-    for number, partner in task.partners:
-        found = pair_depth(
-            task.view,
-            partner,
-            _evened(store, task.index),
-            _evened(store, number),
-            store.load_mask(task.index, "valid", task.view.width_px),
-            store.load_mask(number, "valid", partner.width_px),
-            task.points_world,
-            task.match_sigma_px,
+    for number, partner in task.others:
+        looks = (
+            (_evened(store, task.index), store.load_mask(task.index, "valid", shape[1])),
+            (_evened(store, number), store.load_mask(number, "valid", partner.width_px)),
         )
+        found = pair_depth((task.view, partner), looks, points_world, match_sigma_px)
         if found is not None:
             depths.append(found[0])
             sigmas.append(found[1])
@@ -141,7 +107,7 @@ def view_depth(task: DepthTask) -> None:
     store.save(task.index, "agreeing", agreeing)
 
 
-def refine_view(task: RefineTask) -> None:
+def refine_view(task: ViewTask) -> None:
     """Make a view's depth exact by its best neighbours at once."""
     store = task.store
     if store.has(task.index, "fine"):
@@ -161,32 +127,33 @@ def refine_view(task: RefineTask) -> None:
     store.drop(task.index, "depth.sigma")
 
 
-def find_doubt(checks: Sequence[CheckTask], executor: Executor) -> float:
+def find_sigma_factor(checks: Sequence[ViewTask], executor: Executor) -> float:
     """How far refined depths of neighbouring views differ, in standard deviations as stated.
 
     What the noise of pictures cannot show (detail finer than the window, poses, calibration) shows
     where views differ. The median over some views spread over the survey; at least 1.
     """
-    step = max(1, len(checks) // _DOUBTERS)
+    step = max(1, len(checks) // _COMPARED_VIEWS)
     spreads = list(executor.map(disagreement, checks[::step], label="compare"))
     known = [spread for spread in spreads if np.isfinite(spread)]
     return max(1.0, float(np.median(known))) if known else 1.0
 
 
-def disagreement(task: CheckTask) -> float:
+def disagreement(task: ViewTask) -> float:
     """Scatter of a view's depths against its neighbours', in standard deviations; NaN if none."""
     depth, sigma = task.store.load_depth(task.index, "fine")
     lattice = np.zeros(depth.shape, np.bool_)
-    lattice[_DOUBT_STEP // 2 :: _DOUBT_STEP, _DOUBT_STEP // 2 :: _DOUBT_STEP] = True
+    chosen = slice(_COMPARED_STEP_PX // 2, None, _COMPARED_STEP_PX)
+    lattice[chosen, chosen] = True
     rows, columns = np.nonzero(lattice & np.isfinite(depth))
     points = _world_points(task.view, depth, rows, columns)
     parts = []
-    for number, other in task.neighbours:
-        there, doubt = task.store.load_depth(number, "fine")
+    for number, other in task.others:
+        there, there_sigma = task.store.load_depth(number, "fine")
         seen = in_frame(other, points)
         at = np.floor(other.project(points[seen])).astype(np.int64)
         z = other.world_from_cam.inv().apply(points[seen])[:, 2]
-        other_z, other_sigma = there[at[:, 1], at[:, 0]], doubt[at[:, 1], at[:, 0]]
+        other_z, other_sigma = there[at[:, 1], at[:, 0]], there_sigma[at[:, 1], at[:, 0]]
         own = sigma[rows, columns][seen]
         parts.append((other_z - z) / np.hypot(own, other_sigma))
     apart = np.concatenate(parts) if parts else np.empty(0)
@@ -194,31 +161,34 @@ def disagreement(task: CheckTask) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
 
 
-def looked_at(views: Sequence[View], index: int, pairs: Sequence[StereoPair]) -> list[int]:
+def looked_at(views: Sequence[View], index: int, partners: Sequence[int]) -> list[int]:
     """Views to refine depth with: partners at other stations, whose baselines determine depth best.
 
     That of the same station is taken where there are fewer than two others.
     """
-    chosen = [pair.partner for pair in pairs]
-    apart = [n for n in chosen if views[n].station != views[index].station]
-    return (apart if len(apart) >= 2 else chosen)[:LOOKS]
+    apart = [n for n in partners if views[n].station != views[index].station]
+    return list(apart if len(apart) >= 2 else partners)[:LOOKS]
 
 
-def check_view(task: CheckTask) -> ViewSummary:
+def check_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
     """Keep the depths that two independent looks support.
 
     A depth stays where the neighbours whose windows look alike (or the partners that agree) and the
     neighbouring views that find the same surface number two or more, and no more views see through
     it than confirm it.
+
+    Args:
+        sigma_factor: on the standard deviations of refined depths.
+        task: the view and its neighbours.
     """
     store, view = task.store, task.view
     depth, sigma = store.load_depth(task.index, "fine")
-    sigma *= np.float32(task.doubt)
+    sigma *= np.float32(sigma_factor)
     alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
     refuted = np.zeros_like(alike)
     supported = np.zeros_like(alike)
     slopes = slopes_of(depth, lens_of(view))
-    for number, other in task.neighbours:
+    for number, other in task.others:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
         other_depth, other_sigma = store.load_depth(number, "fine")
         seen, through = count_witnesses(
@@ -227,7 +197,7 @@ def check_view(task: CheckTask) -> ViewSummary:
             slopes,
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
             other_depth,
-            other_sigma * np.float32(task.doubt),
+            other_sigma * np.float32(sigma_factor),
             lens_of(other),
             GATE_SIGMAS,
         )
@@ -263,7 +233,7 @@ def check_view(task: CheckTask) -> ViewSummary:
 
 
 def _shared_light(
-    task: CheckTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    task: ViewTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> LightSamples:
     """Compare the light of a view and its neighbours on a lattice of its pixels."""
     step = max(1, task.view.width_px // _LIGHT_LATTICE)
@@ -273,7 +243,7 @@ def _shared_light(
     here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / size
     own = np.asarray(task.store.load(task.index, "low"))
     parts = []
-    for number, other in task.neighbours:
+    for number, other in task.others:
         seen = in_frame(other, spots)
         there = other.project(spots[seen]) / [other.width_px, other.height_px]
         parts.append(

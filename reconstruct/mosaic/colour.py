@@ -96,23 +96,19 @@ class ColourModel:
         return np.array(values, np.float32)
 
     def corrected(
-        self, light: Float32, camera: str, image: str, places: tuple[Float32, Float32],
-        ranges: Float32,
-    ) -> Float32:  # fmt: skip
+        self, light: Float32, camera: str, image: str, places: Float32, ranges: Float32
+    ) -> Float32:
         """The sea floor's light, (H, W, 3) BGR, where black is not yet taken away.
 
         Args:
             light: (H, W, 3) that the picture shows.
             camera: that took it.
             image: its name.
-            places: (H, W) each, x and y over the picture's width and height.
+            places: (H * W, 2) x and y over the picture's width and height.
             ranges: (H, W); NaN where not known.
         """
         model = self.light
-        x, y = (
-            (p * np.float32(n - 1)).astype(np.float32).ravel()
-            for p, n in zip(places, (GRID[1], GRID[0]), strict=True)
-        )
+        x, y = np.ascontiguousarray((places * np.array([GRID[1] - 1, GRID[0] - 1], np.float32)).T)
         found = bilinear(self.nodes(camera, image), x, y).reshape(*light.shape[:2], 6)
         left = np.maximum(light - found[..., 3:], LEAST_LEFT * light)
         result: Float32 = left * found[..., :3]
@@ -142,11 +138,7 @@ class ColourModel:
 
 @progress.step("even the light")
 def solve_colour(
-    wanted: Colour,
-    samples: LightSamples,
-    facts: Sequence[PictureMeasures],
-    images: Sequence[str],
-    cameras: Sequence[str],
+    wanted: Colour, samples: LightSamples, facts: Sequence[PictureMeasures]
 ) -> ColourModel:
     """Find the model from spots that two views see.
 
@@ -154,34 +146,29 @@ def solve_colour(
         wanted: `raw`: pictures as they are; `even`: without m, g and b; `water`: without A too.
         samples: linear light; its logarithm and ranges.
         facts: of all pictures.
-        images: their names.
-        cameras: and cameras.
     """
-    names = sorted(set(cameras))
-    nothing: Mapping[str, Array] = {name: np.zeros((*GRID, 3)) for name in names}
+    nothing = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
+    model = ColourModel(
+        light=LightModel(
+            patterns=nothing, gains={fact.image: np.zeros(3) for fact in facts}, white=np.ones(3)
+        ),
+        added=nothing,
+        shares=np.zeros(3),
+        share_sigmas=np.full(3, np.nan),
+        notes=("colours: as the pictures show them",),
+    )
     if wanted == "raw":
-        light = LightModel(
-            patterns=nothing, gains={image: np.zeros(3) for image in images}, white=np.ones(3)
-        )
-        return ColourModel(
-            light=light, added=nothing, shares=np.zeros(3), share_sigmas=np.full(3, np.nan),
-            notes=("colours: as the pictures show them",),
-        )  # fmt: skip
-    nodes = np.stack([fact.nodes for fact in facts])
-    added, shares, sigmas = nothing, np.zeros(3), np.full(3, np.nan)
+        return model
     notes = []
     if wanted == "water":
-        added, shares, sigmas, note = _added(samples, nodes, facts, images, cameras)
+        added, shares, sigmas, note = _added(samples, facts)
+        model = replace(model, added=added, shares=shares, share_sigmas=sigmas)
         notes.append(note)
-    cleaned = without(samples, added, cameras)
-    patterns = solve_patterns(
-        cleaned, _nodes_without(nodes, added, cameras), images, cameras, _GAIN_SIGMA
-    )
-    model = ColourModel(
-        light=patterns, added=added, shares=shares, share_sigmas=sigmas, notes=()
-    )  # fmt: skip
+    cleaned = without(samples, model.added, facts)
+    patterns = _patterns(cleaned, model.added, facts)
+    model = replace(model, light=patterns)
     neutral = _unweakened(patterns) if wanted == "water" else None
-    white = _white(cleaned, model, images, cameras, neutral)
+    white = _white(cleaned, model, facts, neutral)
     if neutral is None:
         notes.append(
             "colours: light of lamp, lens and range evened out over the survey; one factor per "
@@ -201,9 +188,9 @@ def solve_colour(
         "68 % of white; sRGB"
     )
     model = replace(model, light=replace(patterns, white=white))
-    black = _black(model, facts, images, cameras)
+    black = _black(model, facts)
     if black.any():
-        grow = _brighter(cleaned, model, images, cameras, black)
+        grow = _brighter(cleaned, model, facts, black)
         model = replace(model, light=replace(patterns, white=white * grow), black=black * grow)
         notes.append(
             f"contrast: light below {100 * _BLACK_SHARE:.0f} % of what the survey's darkest pixels "
@@ -212,16 +199,28 @@ def solve_colour(
     return replace(model, notes=tuple(notes))
 
 
-def _black(
-    model: ColourModel,
-    facts: Sequence[PictureMeasures],
-    images: Sequence[str],
-    cameras: Sequence[str],
-) -> Array:
+def _patterns(
+    cleaned: LightSamples, added: Mapping[str, Array], facts: Sequence[PictureMeasures]
+) -> LightModel:
+    """The light of lamps, pictures and ranges, once that which the water adds is taken away."""
+    nodes = np.exp(np.stack([fact.nodes for fact in facts]))
+    left = nodes - np.stack([added[fact.camera] for fact in facts])
+    with np.errstate(invalid="ignore"):
+        usable = left > LEAST_LEFT * nodes
+    return solve_patterns(
+        cleaned,
+        np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan),
+        [fact.image for fact in facts],
+        [fact.camera for fact in facts],
+        _GAIN_SIGMA,
+    )
+
+
+def _black(model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
     """(3,) corrected light that is shown as black: a share of what is dark in dark pictures."""
     dark = []
-    for fact, image, camera in zip(facts, images, cameras, strict=True):
-        nodes = model.nodes(camera, image).astype(np.float64)
+    for fact in facts:
+        nodes = model.nodes(fact.camera, fact.image).astype(np.float64)
         dark.append(((fact.dark - nodes[..., 3:]) * nodes[..., :3]).reshape(-1, 3))
     levels = np.concatenate(dark)
     levels = levels[np.isfinite(levels).all(axis=1)]
@@ -232,16 +231,12 @@ def _black(
 
 
 def _brighter(
-    samples: LightSamples,
-    model: ColourModel,
-    images: Sequence[str],
-    cameras: Sequence[str],
-    black: Array,
+    samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures], black: Array
 ) -> float:
     """The factor of light and black that puts bright and middle back where they were."""
     if not len(samples.views):
         return 1.0
-    level = _levels(samples, model, images, cameras) * model.light.white
+    level = _levels(samples, model, facts) * model.light.white
     grey, dark = level.mean(axis=1), float(black.mean())
     bright, middle = np.percentile(grey, _BRIGHT_PERCENT), np.median(grey)
     # factor f with (f level - f dark) / (1 - f dark) = wanted
@@ -253,39 +248,47 @@ def _brighter(
     )
 
 
-def _levels(
-    samples: LightSamples, model: ColourModel, images: Sequence[str], cameras: Sequence[str]
-) -> Array:
-    """(N, 3) light of the first views of samples, evened out, white not yet balanced."""
-    light = model.light
-    gains = np.stack([light.gains[image] for image in images])
-    lift = -(sampled(samples, light.patterns, cameras) + gains[samples.views])[:, 0]
+def _weakening(samples: LightSamples, light: LightModel, facts: Sequence[PictureMeasures]) -> Array:
+    """(N, 2, 3) logarithm by which light weakens what both views show of the samples."""
+    gains = np.stack([light.gains[fact.image] for fact in facts])
+    factor = sampled(samples, light.patterns, facts) + gains[samples.views]
     if samples.ranges is not None:
-        lift = lift + (samples.ranges[:, :1] - light.middle_range) * light.fall_off
-    return np.asarray(np.exp(samples.levels[:, 0] + lift))
+        factor = factor - (samples.ranges - light.middle_range)[..., None] * light.fall_off
+    return factor
+
+
+def _levels(samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
+    """(N, 3) light of the first views of samples, evened out, white not yet balanced."""
+    return np.asarray(np.exp(samples.levels[:, 0] - _weakening(samples, model.light, facts)[:, 0]))
 
 
 def without(
-    samples: LightSamples, added: Mapping[str, Array], cameras: Sequence[str]
+    samples: LightSamples, added: Mapping[str, Array], facts: Sequence[PictureMeasures]
 ) -> LightSamples:
     """Samples minus the light that the water adds; where too little is left they are dropped."""
     light = np.exp(samples.levels.astype(np.float64))
-    water = sampled(samples, added, cameras)
-    left = light - water
+    left = light - sampled(samples, added, facts)
     kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
+    return replace(_part(samples, kept), levels=np.log(left[kept]).astype(np.float32))
+
+
+def _part(samples: LightSamples, chosen: Any) -> LightSamples:
+    """The chosen rows of samples."""
     return LightSamples(
-        views=samples.views[kept],
-        places=samples.places[kept],
-        levels=np.log(left[kept]).astype(np.float32),
-        ranges=None if samples.ranges is None else samples.ranges[kept],
+        views=samples.views[chosen],
+        places=samples.places[chosen],
+        levels=samples.levels[chosen],
+        ranges=None if samples.ranges is None else samples.ranges[chosen],
     )
 
 
-def sampled(samples: LightSamples, maps: Mapping[str, Array], cameras: Sequence[str]) -> Array:
+def sampled(
+    samples: LightSamples, maps: Mapping[str, Array], facts: Sequence[PictureMeasures]
+) -> Array:
     """(N, 2, 3) values of maps over the pictures where both views see the spots."""
     names = sorted(maps)
     stacked = np.stack([maps[name].reshape(-1, 3) for name in names])
-    camera_of = np.array([names.index(camera) for camera in cameras])
+    camera_of = np.array([names.index(fact.camera) for fact in facts])
     values = np.empty((len(samples.views), 2, 3))
     for side in range(2):
         at, weights = node_weights(samples.places[:, side])
@@ -294,21 +297,11 @@ def sampled(samples: LightSamples, maps: Mapping[str, Array], cameras: Sequence[
     return values
 
 
-def _nodes_without(nodes: Array, added: Mapping[str, Array], cameras: Sequence[str]) -> Array:
-    water = np.stack([added[camera] for camera in cameras])
-    left = np.exp(nodes) - water
-    with np.errstate(invalid="ignore"):
-        usable = left > LEAST_LEFT * np.exp(nodes)
-    return np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan)
-
-
-def darkest(facts: Sequence[PictureMeasures], cameras: Sequence[str]) -> dict[str, Array] | None:
+def darkest(facts: Sequence[PictureMeasures]) -> dict[str, Array] | None:
     """Per camera (rows, columns, 3) light of the darkest that each place shows; None if too few."""
     maps = {}
-    for name in sorted(set(cameras)):
-        mine = np.stack(
-            [f.dark for f, camera in zip(facts, cameras, strict=True) if camera == name]
-        )
+    for name in sorted({fact.camera for fact in facts}):
+        mine = np.stack([fact.dark for fact in facts if fact.camera == name])
         if (np.isfinite(mine).sum(axis=0) < _FEWEST_PICTURES).any():
             return None
         level = np.nanquantile(mine, _DARK_QUANTILE, axis=0).astype(np.float32)
@@ -319,27 +312,22 @@ def darkest(facts: Sequence[PictureMeasures], cameras: Sequence[str]) -> dict[st
 
 
 def _added(
-    samples: LightSamples,
-    nodes: Array,
-    facts: Sequence[PictureMeasures],
-    images: Sequence[str],
-    cameras: Sequence[str],
+    samples: LightSamples, facts: Sequence[PictureMeasures]
 ) -> tuple[Mapping[str, Array], Array, Array, str]:
     """The water's light, its share of the darkest pixels' per channel with sigma, and a note."""
-    nothing = {name: np.zeros((*GRID, 3)) for name in sorted(set(cameras))}
+    nothing = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
     unknown = np.full(3, np.nan)
-    dark = darkest(facts, cameras)
+    dark = darkest(facts)
     if dark is None:
         note = (
             f"colours: fewer than {_FEWEST_PICTURES} pictures of a camera show each place of it; "
             "no light of the water taken away"
         )
         return nothing, np.zeros(3), unknown, note
-    thin = samples if len(samples.views) <= _MOST_SAMPLES else _thinned(samples)
+    thin = _part(samples, slice(None, None, max(1, -(-len(samples.views) // _MOST_SAMPLES))))
     cost = np.empty((len(_SHARES), 3))
     for n, share in enumerate(_SHARES):
-        maps = {name: share * level for name, level in dark.items()}
-        cost[n] = _misfit(thin, maps, nodes, images, cameras)
+        cost[n] = _misfit(thin, {name: share * level for name, level in dark.items()}, facts)
     shares, sigmas = np.zeros(3), unknown.copy()
     for channel in range(3):
         shares[channel], sigmas[channel] = _lowest(cost[:, channel])
@@ -358,22 +346,8 @@ def _added(
     return {name: shares * level for name, level in dark.items()}, shares, sigmas, note
 
 
-def _thinned(samples: LightSamples) -> LightSamples:
-    step = -(-len(samples.views) // _MOST_SAMPLES)
-    return LightSamples(
-        views=samples.views[::step],
-        places=samples.places[::step],
-        levels=samples.levels[::step],
-        ranges=None if samples.ranges is None else samples.ranges[::step],
-    )
-
-
 def _misfit(
-    samples: LightSamples,
-    added: Mapping[str, Array],
-    nodes: Array,
-    images: Sequence[str],
-    cameras: Sequence[str],
+    samples: LightSamples, added: Mapping[str, Array], facts: Sequence[PictureMeasures]
 ) -> Array:
     """(3,) twice the negative logarithm of the likelihood of an additive light, robust.
 
@@ -381,27 +355,14 @@ def _misfit(
     only noise, whose size is that of I and does not shrink as A grows.
     """
     light = np.exp(samples.levels.astype(np.float64))
-    left = light - sampled(samples, added, cameras)
-    clean = without(samples, added, cameras)
-    model = solve_patterns(
-        clean, _nodes_without(nodes, added, cameras), images, cameras, _GAIN_SIGMA
-    )
-    factor = sampled(samples, model.patterns, cameras)
-    gains = np.stack([model.gains[image] for image in images])
-    factor = factor + gains[samples.views]
-    if samples.ranges is not None:
-        factor = factor - (samples.ranges - model.middle_range)[..., None] * model.fall_off
-    factor = np.exp(factor)
+    left = light - sampled(samples, added, facts)
+    model = _patterns(without(samples, added, facts), added, facts)
+    factor = np.exp(_weakening(samples, model, facts))
     rest = left[:, 0] * factor[:, 1] - left[:, 1] * factor[:, 0]
     size = np.hypot(light[:, 0] * factor[:, 1], light[:, 1] * factor[:, 0])
-    rest = rest / size
-    return np.asarray(_robust_cost(rest))
-
-
-def _robust_cost(rest: Array) -> Array:
-    """(3,) for errors of Laplace's distribution, whose size the rest itself gives."""
-    size = np.abs(rest)
-    mean = np.minimum(size, 4.0 * np.median(size, axis=0)).mean(axis=0) + 1e-9
+    # for errors of Laplace's distribution, whose size the rest itself gives
+    rest = np.abs(rest / size)
+    mean = np.minimum(rest, 4.0 * np.median(rest, axis=0)).mean(axis=0) + 1e-9
     return np.asarray(2.0 * len(rest) / SAMPLES_PER_FACT * np.log(mean))
 
 
@@ -438,8 +399,7 @@ def _unweakened(light: LightModel) -> Array | None:
 def _white(
     samples: LightSamples,
     model: ColourModel,
-    images: Sequence[str],
-    cameras: Sequence[str],
+    facts: Sequence[PictureMeasures],
     neutral: Array | None,
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out.
@@ -450,7 +410,7 @@ def _white(
     """
     if not len(samples.views):
         return np.ones(3)
-    level = _levels(samples, model, images, cameras)
+    level = _levels(samples, model, facts)
     if neutral is None:
         cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
         neutral = cast.mean() / cast

@@ -143,20 +143,15 @@ def neighbours(blocks: Sequence[Block], count: int) -> list[list[Block]]:
     return [groups[key] for key in sorted(groups)]
 
 
-def coarse(grid: DemGrid) -> DemGrid:
-    """The cells of a grid of pixels; its size is a whole number of them."""
+def coarse(grid: DemGrid, side_px: int = CELL_PX) -> DemGrid:
+    """Cells of a number of pixels a side that cover a grid of pixels."""
     return DemGrid(
         west=grid.west,
         north=grid.north,
-        cell=grid.cell * CELL_PX,
-        rows=grid.rows // CELL_PX,
-        columns=grid.columns // CELL_PX,
+        cell=grid.cell * side_px,
+        rows=-(-grid.rows // side_px),
+        columns=-(-grid.columns // side_px),
     )
-
-
-def cells_over(pixels: int) -> int:
-    """Cells that cover a number of pixels."""
-    return -(-pixels // CELL_PX)
 
 
 def _aligned(pixels: int) -> int:

@@ -1,7 +1,8 @@
-"""Tasks of the mosaic: lay seams, paint tiles. Each works on one block."""
+"""Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -11,20 +12,16 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from alice_survey.base.run.resources import release_memory
-from reconstruct.light.solve import at_places
+from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.blend import Blend, ViewPart
 from reconstruct.mosaic.colour import ColourModel
 from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.ortho import sample_lanczos
+from reconstruct.mosaic.picture_measures import DARKEST, well_exposed
 from reconstruct.mosaic.seams import candidates, choose_views
 from reconstruct.mosaic.tools import MosaicSetup, Tools, tools_of
-from reconstruct.mosaic.visibility import (
-    GridHeights,
-    Ground,
-    SeenCells,
-    see,
-)
+from reconstruct.mosaic.visibility import GridHeights, Ground, SeenCells, see
 from reconstruct.raster import opened_raster, small_cache
 from reconstruct.views.model import View
 
@@ -97,6 +94,99 @@ class Painted:
     """(4, H, W) colour and opacity."""
     source: NDArray[np.int32]
     """(H, W) number of the view plus one; 0 where nothing is known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightTask:
+    """A block on which to compare what views show."""
+
+    survey: MosaicSetup
+    block: Block
+    views: tuple[SeenView, ...]
+    step_px: int
+    """Distance of spots."""
+    most: int
+    """Samples to return at most."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Shown:
+    """Spots of a lattice that a view shows; arrays of N rows."""
+
+    number: int
+    spots: NDArray[np.intp]
+    places: Float32
+    levels: Float32
+    ranges: Float32
+
+    def part(self, kept: NDArray[np.bool_]) -> "_Shown":
+        """Those of the spots that are kept."""
+        return _Shown(
+            number=self.number,
+            spots=self.spots[kept],
+            places=self.places[kept],
+            levels=self.levels[kept],
+            ranges=self.ranges[kept],
+        )
+
+
+@small_cache()
+def compare_block(task: LightTask) -> LightSamples:
+    """What views show of the same spots of a lattice, in linear light.
+
+    The survey's light is found from it.
+    """
+    tools = tools_of(task.survey)
+    surface = ground_of(task.survey, task.block).surface(coarse(task.block.grid, task.step_px))
+    if not np.isfinite(surface.height).any():
+        return joined_samples([])
+    seen = []
+    for entry in task.views:
+        optics = tools.optics(entry.view)
+        sight = see(entry.view, optics, surface)
+        copy = tools.small(entry.view.image)
+        spots = np.flatnonzero(sight.quality.ravel() > 0)
+        places = sight.places(optics.size_px)[spots]
+        levels = at_places(copy.broad, places)
+        usable = well_exposed(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
+        shown = _Shown(
+            number=entry.number,
+            spots=spots,
+            places=places,
+            levels=np.log(np.maximum(levels, DARKEST)),
+            ranges=sight.range.ravel()[spots],
+        )
+        seen.append(shown.part(usable))
+    seen = _thinned(seen, surface.height.size, task)
+    parts = []
+    for one, other in combinations(seen, 2):
+        _, a, b = np.intersect1d(one.spots, other.spots, assume_unique=True, return_indices=True)
+        if not len(a):
+            continue
+        parts.append(
+            LightSamples(
+                views=np.tile(np.array([[one.number, other.number]], np.int32), (len(a), 1)),
+                places=np.stack([one.places[a], other.places[b]], axis=1),
+                levels=np.stack([one.levels[a], other.levels[b]], axis=1),
+                ranges=np.stack([one.ranges[a], other.ranges[b]], axis=1),
+            )
+        )
+    return joined_samples(parts)
+
+
+def _thinned(seen: list[_Shown], spots: int, task: LightTask) -> list[_Shown]:
+    """Views with as many of the spots, drawn at random, as give no more samples than allowed."""
+    times = np.zeros(spots, np.int64)
+    for shown in seen:
+        times[shown.spots] += 1
+    pairs = times * (times - 1) // 2
+    if pairs.sum() <= task.most:
+        return seen
+    rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
+    order = rng.permutation(np.flatnonzero(pairs))
+    kept = np.zeros(spots, np.bool_)
+    kept[order[np.cumsum(pairs[order]) <= task.most]] = True
+    return [shown.part(kept[shown.spots]) for shown in seen]
 
 
 @small_cache()
@@ -258,13 +348,12 @@ def _looks(
         sight = SeenCells(
             x=sight.x[box], y=sight.y[box], quality=sight.quality[box], range=sight.range[box]
         )
-        across, down = sight.places(optics.size_px)
-        copy = tools.small.load(entry.view.image)
+        places = sight.places(optics.size_px)
+        copy = tools.small(entry.view.image)
         quality = sight.quality * np.float32(np.clip(entry.sharpness, *_SHARP))
         # dark rims are noisy: their light, where it is less than the middle one, counts as distance
         pattern = task.colour.light.patterns[entry.view.camera]
         light = np.exp(np.minimum(pattern.mean(axis=2), 0.0)).astype(np.float32)
-        places = np.column_stack([across.ravel(), down.ravel()])
         quality *= at_places(light[..., None], places, 1).reshape(quality.shape)
         if not copy.whole:
             valid = at_places(copy.valid[..., None], places, 1).reshape(quality.shape)
@@ -282,12 +371,11 @@ def _bounding(used: NDArray[np.bool_]) -> tuple[slice, slice]:
 def _small_light(task: PaintTask, tools: Tools, found: _ViewOfCells, *, broad: bool) -> Float32:
     """Corrected light of a view's small copy at the cells of its box, (h, w, 3)."""
     view, sight = found.entry.view, found.sight
-    copy = tools.small.load(view.image)
-    across, down = sight.places(tools.optics(view).size_px)
-    places = np.column_stack([across.ravel(), down.ravel()])
+    copy = tools.small(view.image)
+    places = sight.places(tools.optics(view).size_px)
     shape = (*sight.quality.shape, 3)
     shown = at_places(copy.broad if broad else copy.detail, places).reshape(shape)
-    return task.colour.corrected(shown, view.camera, view.image, (across, down), sight.range)
+    return task.colour.corrected(shown, view.camera, view.image, places, sight.range)
 
 
 def _logarithm(light: Float32) -> Float32:

@@ -5,7 +5,6 @@ are taken to be encoded by the sRGB curve (IEC 61966-2-1), as cameras write them
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +44,8 @@ _BROAD_STEP = 4
 class PictureMeasures:
     """Measures of one picture."""
 
+    image: str
+    camera: str
     sharpness: float
     """Mean size of its Laplacian over its mean level; NaN where it is black."""
     grey: bool
@@ -100,15 +101,10 @@ def encoded(light: Float32) -> Float32:
     return levels
 
 
-def measure_picture(task: tuple[Path, Path, str]) -> PictureMeasures:
-    """Measure a picture of a workspace and write its small copy.
-
-    Args:
-        task: workspace, the folder for small copies, and the picture's name.
-    """
-    workspace, folder, image = task
+def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasures:
+    """Measure a picture of a workspace and write its small copy to a folder."""
     pictures = Pictures.open(workspace)
-    taken, usable = pictures.taken(image), pictures.usable(image)
+    taken, usable = pictures.taken(view.image), pictures.usable(view.image)
     height, width = taken.shape[:2]
     table = linear_table()
     shrink = max(_LEAST_SHRINK, round(width / _SMALL_PX))
@@ -124,13 +120,15 @@ def measure_picture(task: tuple[Path, Path, str]) -> PictureMeasures:
     levels = np.rint(np.minimum(encoded(small[..., :3]), 255)).astype(np.uint8)
     content = np.dstack([levels, np.rint(255 * small[..., 3]).astype(np.uint8)])
     copy = _small_copy(content)
-    path = small_path(folder, image)
+    path = _small_path(folder, view.image)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.save(file, copy.levels)
         np.save(file, copy.broad)
     green = taken[..., 1]
     fine, mean = sharp_and_mean(green, np.ones((1, 1), np.bool_) if usable is None else usable)
     return PictureMeasures(
+        image=view.image,
+        camera=view.camera,
         sharpness=fine / mean if mean > 0 else float("nan"),
         grey=bool((taken[..., 0] == green).all() and (taken[..., 2] == green).all()),
         nodes=_broad_nodes(copy),
@@ -232,24 +230,14 @@ def low_levels(
     return found
 
 
-def small_path(folder: Path, image: str) -> Path:
+def _small_path(folder: Path, image: str) -> Path:
     """The file of a picture's small copy."""
     return folder / f"{image}.small"
 
 
-class SmallCopies:
-    """Small copies, read on request; the last few stay in memory."""
-
-    def __init__(self, folder: Path, kept: int = 40) -> None:
-        self._load = lru_cache(maxsize=kept)(lambda image: _read_small(folder, image))
-
-    def load(self, image: str) -> SmallCopy:
-        """The copy of a picture."""
-        return self._load(image)
-
-
-def _read_small(folder: Path, image: str) -> SmallCopy:
-    with small_path(folder, image).open("rb") as file:
+def read_small(folder: Path, image: str) -> SmallCopy:
+    """The small copy of a picture that `measure_view` wrote."""
+    with _small_path(folder, image).open("rb") as file:
         return SmallCopy(levels=np.load(file), broad=np.load(file))
 
 
@@ -266,33 +254,32 @@ def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
     return SmallCopy(levels=content, broad=broad)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ViewTask:
-    """A view to measure."""
-
-    workspace: Path
-    scratch: Path
-    """Folder for what tiles need later."""
-    view: View
-    heights: tuple[float, float]
-    """Lowest and highest cell of the DEM."""
-
-
 @small_cache()
-def measure_view(task: ViewTask) -> tuple[PictureMeasures, PictureFootprint]:
-    """Measure a picture and where it lies; write its small copy and what it sees of the DEM."""
-    facts = measure_picture((task.workspace, task.scratch, task.view.image))
-    dem, grid, whole = _part_seen(task)
+def measure_view(
+    workspace: Path, scratch: Path, heights: tuple[float, float], view: View
+) -> tuple[PictureMeasures, PictureFootprint]:
+    """Measure a picture and where it lies; write its small copy and what it sees of the DEM.
+
+    Args:
+        workspace: with pictures and surface.
+        scratch: folder for what tiles need later.
+        heights: lowest and highest cell of the DEM.
+        view: the view to measure.
+    """
+    facts = measure_picture(workspace, scratch, view)
+    dem, grid, whole = _part_seen(workspace, heights, view)
     if whole:
-        store_visible(task.scratch, task.view, dem, grid)
-    return facts, picture_footprint(task.view, dem, grid)
+        store_visible(scratch, view, dem, grid)
+    return facts, picture_footprint(view, dem, grid)
 
 
-def _part_seen(task: ViewTask) -> tuple[Float32, DemGrid, bool]:
+def _part_seen(
+    workspace: Path, heights: tuple[float, float], view: View
+) -> tuple[Float32, DemGrid, bool]:
     """The DEM below a view and all that it may see, coarser where that is a lot; whether it is."""
-    west, east, south, north = footprints((task.view,), task.heights).boxes[0]
-    camera = enu_from_cam(task.view, np.zeros(3))[:, 3]
-    with opened_raster(task.workspace / "dense" / "dem.tif") as raster:
+    west, east, south, north = footprints((view,), heights).boxes[0]
+    camera = enu_from_cam(view, np.zeros(3))[:, 3]
+    with opened_raster(workspace / "dense" / "dem.tif") as raster:
         t = raster.transform
         columns = [min(west, camera[0]), max(east, camera[0])]
         rows = [max(north, camera[1]), min(south, camera[1])]

@@ -8,6 +8,7 @@ the picture as taken. No step holds more than one block, so that memory does not
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +21,6 @@ from alice_survey.base.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
-from reconstruct.mosaic.compare import LightTask, compare_block
 from reconstruct.mosaic.footprints import write_footprints
 from reconstruct.mosaic.grid import (
     CELL_PX,
@@ -34,14 +34,16 @@ from reconstruct.mosaic.grid import (
     neighbours,
 )
 from reconstruct.mosaic.paint import (
+    LightTask,
     PaintTask,
     SeenView,
+    compare_block,
     label_block,
     label_path,
     paint_tiles,
     tones_path,
 )
-from reconstruct.mosaic.picture_measures import PictureMeasures, ViewTask, measure_view
+from reconstruct.mosaic.picture_measures import PictureMeasures, measure_view
 from reconstruct.mosaic.tools import MosaicSetup
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
@@ -105,16 +107,9 @@ def build_mosaic(
         pixel = settings.mosaic_pixel_m or round_cell(mean_pixel(model))
         grid = mosaic_grid(raster, pixel, model.frame)
     names = [view.image for view in model.views]
+    measure = partial(measure_view, workspace, scratch, heights)
     measured = list(
-        executor.map(
-            measure_view,
-            [
-                ViewTask(workspace=workspace, scratch=scratch, view=view, heights=heights)
-                for view in model.views
-            ],
-            label="measure pictures",
-            task_mib=_TASK_MIB,
-        )
+        executor.map(measure, model.views, label="measure pictures", task_mib=_TASK_MIB)
     )
     facts = [fact for fact, _ in measured]
     water, dispersion = _dispersion(
@@ -210,10 +205,8 @@ def _solve(
     executor: Executor,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
-    images = [view.image for view in model.views]
-    cameras = [view.camera for view in model.views]
     if wanted == "raw":
-        return solve_colour(wanted, joined_samples([]), facts, images, cameras)
+        return solve_colour(wanted, joined_samples([]), facts)
     width = float(np.median([view.width_px for view in model.views]))
     step_px = max(CELL_PX, round(width * mean_pixel(model) / blocks[0].grid.cell / _LIGHT_LATTICE))
     compare = [
@@ -228,7 +221,7 @@ def _solve(
     ]
     found = list(executor.map(compare_block, compare, label="compare light", task_mib=_TASK_MIB))
     parts = [part for part in found if len(part.views)]
-    return solve_colour(wanted, joined_samples(parts), facts, images, cameras)
+    return solve_colour(wanted, joined_samples(parts), facts)
 
 
 def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:

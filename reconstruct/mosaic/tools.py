@@ -2,7 +2,7 @@
 
 import uuid
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reconstruct.mosaic.finish import curve_by_root
 from reconstruct.mosaic.ortho import lanczos_weights
-from reconstruct.mosaic.picture_measures import SmallCopies, linear_table
+from reconstruct.mosaic.picture_measures import linear_table, read_small
 from reconstruct.mosaic.visibility import CameraOptics, Water, camera_optics, channel_optics
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.lens import FlatPortLens
@@ -18,9 +18,11 @@ from reconstruct.views.model import View
 
 _CACHED_BYTES = 100_000_000
 """Pictures as taken that each process keeps."""
+_SMALL_COPIES = 40
+"""Small copies of pictures that each process keeps."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class MosaicSetup:
     """What all tasks share; it travels to each process once a task."""
 
@@ -36,13 +38,13 @@ class MosaicSetup:
 class Tools:
     """What a process keeps between tasks."""
 
-    def __init__(self, workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> None:
-        self._pictures = Pictures.open(workspace)
-        self.small = SmallCopies(scratch)
+    def __init__(self, survey: MosaicSetup) -> None:
+        self._pictures = Pictures.open(survey.workspace)
+        self.small = lru_cache(maxsize=_SMALL_COPIES)(partial(read_small, survey.scratch))
         self.table = linear_table()
         self.weights = lanczos_weights()
         self.curve = curve_by_root()
-        self._water, self._scaled = water, scaled
+        self._water, self._scaled = survey.water, survey.scaled
         self._optics: dict[str, CameraOptics] = {}
         self._channels: dict[str, tuple[CameraOptics, ...]] = {}
         self._kept: dict[str, NDArray[np.uint8]] = {}
@@ -78,13 +80,7 @@ class Tools:
         return taken
 
 
+@lru_cache(maxsize=1)
 def tools_of(survey: MosaicSetup) -> Tools:
     """The tools of this process for a survey."""
-    return _kept_tools(survey.run, survey.workspace, survey.scratch, survey.scaled, survey.water)
-
-
-@lru_cache(maxsize=1)
-def _kept_tools(
-    run: str, workspace: Path, scratch: Path, scaled: bool, water: Water | None
-) -> Tools:
-    return Tools(workspace, scratch, scaled, water)
+    return Tools(survey)

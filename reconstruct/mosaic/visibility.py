@@ -59,12 +59,10 @@ class SeenCells:
     range: Float32
     """Distance from the pinhole's centre; NaN where not seen."""
 
-    def places(self, size_px: tuple[int, int]) -> tuple[Float32, Float32]:
-        """Columns and rows as shares of the picture's width and height."""
-        width, height = size_px
-        across: Float32 = (self.x + np.float32(0.5)) / np.float32(width)
-        down: Float32 = (self.y + np.float32(0.5)) / np.float32(height)
-        return across, down
+    def places(self, size_px: tuple[int, int]) -> Float32:
+        """(H * W, 2) columns and rows as shares of the picture's width and height."""
+        places = np.column_stack([self.x.ravel(), self.y.ravel()])
+        return np.asarray((places + np.float32(0.5)) / np.array(size_px, np.float32))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

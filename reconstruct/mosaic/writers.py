@@ -12,7 +12,7 @@ from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.run import progress
-from reconstruct.mosaic.grid import CELL_PX, cells_over
+from reconstruct.mosaic.grid import CELL_PX, coarse
 from reconstruct.mosaic.paint import Labels, Painted
 from reconstruct.raster import (
     BLOCK,
@@ -72,11 +72,7 @@ def write_labels(
     blocks: Iterator[Labels],
 ) -> None:
     """Write view and tones of each cell, and a raster of how many pictures and stations see it."""
-    rows, columns = cells_over(grid.rows), cells_over(grid.columns)
-    cells = DemGrid(
-        west=grid.west, north=grid.north, cell=grid.cell * CELL_PX, rows=rows, columns=columns
-    )
-    shared = _profile(cells, frame)
+    shared = _profile(coarse(grid), frame)
     with (
         rasterio.open(cells_of[0], "w", count=1, dtype="int32", **shared) as labels,
         rasterio.open(

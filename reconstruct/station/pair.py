@@ -227,17 +227,14 @@ def dense_pair(
     wanted = min(scale or matching_scale(optics.views[0]), 1.0)
     views = [scaled_view(view, wanted) for view in optics.views]
     names, opened = open_pair(optics, pictures)
-    colours, valids = [], []
+    colours, looks = [], []
     for name, view in zip(names, views, strict=True):
         colour, valid = shrunk(opened, name, (view.width_px, view.height_px))
         colours.append(colour)
-        valids.append(valid)
-    greys = [normalise(colour) for colour in colours]
+        looks.append((normalise(colour), valid))
     maps = []
     for a, b in ((0, 1), (1, 0)):
-        found = pair_depth(
-            views[a], views[b], greys[a], greys[b], valids[a], valids[b], points, MATCH_SIGMA_PX
-        )
+        found = pair_depth((views[a], views[b]), (looks[a], looks[b]), points, MATCH_SIGMA_PX)
         if found is None:
             raise ReconstructionError(
                 "the cameras of the rig share too little of their view for dense matching: their "

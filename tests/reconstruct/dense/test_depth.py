@@ -6,6 +6,8 @@ from reconstruct.dense.depth import match, pair_depth, unrounded, without_mixed
 from reconstruct.pictures.normalise import normalise
 from tests.oracles_dense import (
     DEPTH_M,
+    HEIGHT,
+    WIDTH,
     Scene,
     flat,
     hits,
@@ -14,6 +16,8 @@ from tests.oracles_dense import (
     speckle,
     stereo_views,
 )
+
+EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 
 
 def shifted(shift_px: float, height: int = 120, width: int = 260) -> tuple[np.ndarray, np.ndarray]:
@@ -80,13 +84,12 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
     scene = Scene(depth_of=sloped_with_step, paint=speckle())
     views = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]), heading_deg)
     one, other = views[0], views[1]
-    greys = [normalise(render(v, scene)) for v in (one, other)]
-    everywhere = np.ones(greys[0].shape, bool)
+    looks = [(normalise(render(v, scene)), EVERYWHERE) for v in (one, other)]
     rng = np.random.default_rng(1)
     place = rng.uniform(-0.3, 0.9, (200, 2))
     points = np.column_stack([place, sloped_with_step(*place.T)])
 
-    depth, sigma = pair_depth(one, other, *greys, everywhere, everywhere, points, 0.3)
+    depth, sigma = pair_depth((one, other), looks, points, 0.3)
 
     true = one.world_from_cam.inv().apply(hits(one, scene).reshape(-1, 3))[:, 2]
     error = depth - true.reshape(depth.shape)
@@ -101,13 +104,13 @@ def test_masked_pixels_get_no_depth():
     scene = Scene(depth_of=flat, paint=speckle())
     one, other, *_ = stereo_views(np.array([0.0, 0.35]), np.array([0.0, 0.0]), 0.0)
     greys = [normalise(render(v, scene)) for v in (one, other)]
-    everywhere = np.ones(greys[0].shape, bool)
-    masked = everywhere.copy()
+    masked = EVERYWHERE.copy()
     masked[:, :200] = False
     points = np.array([[0.1, 0.1, DEPTH_M + 0.05], [0.0, 0.2, DEPTH_M - 0.05]] * 3)
-    here, _ = pair_depth(one, other, *greys, masked, everywhere, points, 0.3)
-    there, _ = pair_depth(one, other, *greys, everywhere, masked, points, 0.3)
-    free, _ = pair_depth(one, other, *greys, everywhere, everywhere, points, 0.3)
+    here, there, free = (
+        pair_depth((one, other), tuple(zip(greys, usable, strict=True)), points, 0.3)[0]
+        for usable in ((masked, EVERYWHERE), (EVERYWHERE, masked), (EVERYWHERE, EVERYWHERE))
+    )
     assert np.isfinite(free[:, :200]).any()
     assert not np.isfinite(here[:, :200]).any()
     assert np.isfinite(here[:, 210:]).any()

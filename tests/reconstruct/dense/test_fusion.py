@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
-from reconstruct.dense.fusion import count_witnesses, merge_depths
+from reconstruct.dense.depth import count_witnesses, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.views.range_shift import no_shift
 from reconstruct.views.sight import KernelLens, lens_of, pinhole_of, slopes_of

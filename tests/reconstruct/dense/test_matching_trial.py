@@ -7,7 +7,7 @@ import pytest
 
 from alice_survey.base.executor import SERIAL
 from reconstruct.dense.matching_trial import find_conditions, matching_scale
-from reconstruct.dense.stereo_pairs import choose_pairs
+from reconstruct.dense.stereo_pairs import choose_partners
 from reconstruct.views.model import points_of_views
 from tests.oracles_dense import (
     Scene,
@@ -29,8 +29,8 @@ def survey(tmp_path_factory: pytest.TempPathFactory):
 
 
 def conditions(workspace: Path, model, scale: float | None = None):
-    pairs = choose_pairs(model, 3)
-    return find_conditions(workspace, model.views, pairs, points_of_views(model), scale, SERIAL)
+    partners = choose_partners(model, 3)
+    return find_conditions(workspace, model.views, partners, points_of_views(model), scale, SERIAL)
 
 
 def test_clear_pictures_are_matched_as_they_are_and_better_than_assumed(survey):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reconstruct.dense.refine_depth import ComparedView, compare, prepared, refine, sights
+from reconstruct.dense.refine_depth import ComparedView, compare, pixel_lines, prepared, refine
 from reconstruct.views.sight import lens_of
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
@@ -38,7 +38,7 @@ def test_compare_equals_its_slow_twin():
     rest, slope, speed = compare(
         (1 / depth).astype(np.float32),
         one.contrast,
-        sights(lens_of(one.view), *depth.shape),
+        pixel_lines(lens_of(one.view), *depth.shape),
         other.spline,
         other.valid,
         lens_of(other.view),

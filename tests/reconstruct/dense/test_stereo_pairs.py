@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError
-from reconstruct.dense.stereo_pairs import choose_pairs, in_frame, neighbours, points_in_sight
+from reconstruct.dense.stereo_pairs import choose_partners, in_frame, neighbours, points_in_sight
 from reconstruct.views.model import points_of_views
-from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
+from tests.oracles_dense import ALTITUDE_M, Scene, flat, position_code, sparse_model, stereo_views
 
 SCENE = Scene(depth_of=flat, paint=position_code)
 
@@ -21,21 +21,26 @@ def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
     model = sparse_model(line(), SCENE)
     middle = next(n for n, v in enumerate(model.views) if v.image == "left/002.png")
 
-    pairs = choose_pairs(model, per_view=3)[middle]
+    chosen = choose_partners(model, per_view=3)[middle]
 
-    partners = [model.views[pair.partner] for pair in pairs]
+    partners = [model.views[n] for n in chosen]
     assert partners[0].image == "right/002.png"
     assert {partner.station for partner in partners[1:]} == {1, 3}
-    assert pairs[0].base_to_height == pytest.approx(0.05, rel=0.05)
-    assert all(0.15 < pair.base_to_height < 0.3 for pair in pairs[1:])
-    assert all(0.5 < pair.overlap < 0.8 for pair in pairs[1:])
+    own = points_of_views(model)[middle]
+    seen = [in_frame(partner, own).mean() for partner in partners]
+    assert all(0.5 < share < 0.8 for share in seen[1:])
+    centres = np.array(
+        [view.world_from_cam.translation for view in (model.views[middle], *partners)]
+    )
+    base_to_height = np.linalg.norm(centres[1:] - centres[0], axis=1) / ALTITUDE_M
+    assert base_to_height[0] == pytest.approx(0.05, rel=0.05)
+    assert ((base_to_height[1:] > 0.15) & (base_to_height[1:] < 0.3)).all()
 
 
 def test_never_more_partners_than_asked_and_none_twice():
     model = sparse_model(line(), SCENE)
     for most in (1, 2, 4):
-        for pairs in choose_pairs(model, per_view=most):
-            partners = [pair.partner for pair in pairs]
+        for partners in choose_partners(model, per_view=most):
             assert 1 <= len(partners) <= most
             assert len(set(partners)) == len(partners)
 
@@ -50,7 +55,7 @@ def test_points_of_views_are_those_observed():
 def test_one_picture_gives_one_line():
     model = sparse_model(line(1)[:1], SCENE)
     with pytest.raises(ReconstructionError, match="none of 1 registered pictures") as caught:
-        choose_pairs(model)
+        choose_partners(model, 4)
     assert "\n" not in str(caught.value)
 
 
@@ -60,7 +65,7 @@ def test_pictures_too_far_apart_give_one_line():
     away = RigidTransform.from_translation([30.0, 0.0, 0.0])
     far = replace(model.views[1], world_from_cam=away * model.views[1].world_from_cam)
     with pytest.raises(ReconstructionError, match="overlap"):
-        choose_pairs(replace(model, views=(model.views[0], far)))
+        choose_partners(replace(model, views=(model.views[0], far)), 4)
 
 
 def test_points_in_sight_are_all_that_lie_in_the_frame_and_near():

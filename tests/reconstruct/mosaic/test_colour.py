@@ -8,7 +8,6 @@ from reconstruct.mosaic.finish import curve_by_root, finish_colours
 from reconstruct.mosaic.picture_measures import PictureMeasures, encoded, linear_table
 
 IMAGES = [f"left/{n:02d}.png" for n in range(24)]
-CAMERAS = ["left"] * len(IMAGES)
 FALL_OFF = np.array([0.45, 0.5, 0.9])
 """Blue, green, red, 1/m, spreading included."""
 MIDDLE_M = 2.0
@@ -46,10 +45,14 @@ def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[Pictu
         ranges=ranges.astype(np.float32),
     )
     facts = []
-    for _ in IMAGES:
+    for image in IMAGES:
         dark = haze(NODE_X, NODE_Y) + 0.004 * rng.uniform(0, 1, (*GRID, 1))
         mean = 0.27 * rng.lognormal(0, 0.05) * lamp(NODE_X, NODE_Y) + haze(NODE_X, NODE_Y)
-        facts.append(PictureMeasures(sharpness=1.0, grey=False, nodes=np.log(mean), dark=dark))
+        facts.append(
+            PictureMeasures(
+                image=image, camera="left", sharpness=1.0, grey=False, nodes=np.log(mean), dark=dark
+            )
+        )
     return samples, facts
 
 
@@ -60,7 +63,7 @@ def ratios(model: ColourModel, relief_m: float) -> np.ndarray:
     ranges = MIDDLE_M + rng.uniform(-relief_m, relief_m, 500)
     albedo = rng.uniform(0.08, 0.5, (500, 1)) * rng.uniform(0.8, 1.2, (500, 3))
     light = shown(albedo, place, ranges).astype(np.float32)[None]
-    at = (place[None, :, 0].astype(np.float32), place[None, :, 1].astype(np.float32))
+    at = place.astype(np.float32)
     found = model.corrected(light, "left", IMAGES[0], at, ranges[None].astype(np.float32))[0]
     ratio = np.log(found / albedo)
     return ratio - ratio.mean(axis=0)
@@ -68,8 +71,8 @@ def ratios(model: ColourModel, relief_m: float) -> np.ndarray:
 
 def test_water_finds_albedo_ratios_where_even_light_leaves_the_haze() -> None:
     samples, facts = survey(0.4)
-    water = solve_colour("water", samples, facts, IMAGES, CAMERAS)
-    even = solve_colour("even", samples, facts, IMAGES, CAMERAS)
+    water = solve_colour("water", samples, facts)
+    even = solve_colour("even", samples, facts)
     assert (np.abs(water.shares - 1) < 0.2).all()
     np.testing.assert_allclose(water.light.fall_off, FALL_OFF, atol=0.06)
     assert ratios(water, 0.4).std() < 0.06
@@ -78,31 +81,30 @@ def test_water_finds_albedo_ratios_where_even_light_leaves_the_haze() -> None:
 
 def test_water_gives_colours_as_under_a_white_lamp() -> None:
     samples, facts = survey(0.4)
-    water = solve_colour("water", samples, facts, IMAGES, CAMERAS)
+    water = solve_colour("water", samples, facts)
     took = np.exp(FALL_OFF * MIDDLE_M)
     np.testing.assert_allclose(water.light.white / water.light.white[1], took / took[1], rtol=0.15)
 
 
 def test_without_relief_and_with_few_pictures_it_says_what_it_leaves() -> None:
     samples, facts = survey(0.0)
-    flat = solve_colour("water", samples, facts, IMAGES, CAMERAS)
+    flat = solve_colour("water", samples, facts)
     assert any("ranges differ too little" in note for note in flat.notes)
-    names = IMAGES[:8]
     kept = (samples.views < 8).all(axis=1)
     thin = LightSamples(
         views=samples.views[kept], places=samples.places[kept], levels=samples.levels[kept],
         ranges=None if samples.ranges is None else samples.ranges[kept],
     )  # fmt: skip
-    few = solve_colour("water", thin, facts[:8], names, CAMERAS[:8])
+    few = solve_colour("water", thin, facts[:8])
     assert (few.shares == 0).all()
     assert any("fewer than" in note for note in few.notes)
 
 
 def test_raw_changes_nothing() -> None:
     samples, facts = survey(0.4, 100)
-    raw = solve_colour("raw", samples, facts, IMAGES, CAMERAS)
+    raw = solve_colour("raw", samples, facts)
     light = np.random.default_rng(1).uniform(0, 1, (4, 5, 3)).astype(np.float32)
-    at = (np.full((4, 5), 0.3, np.float32), np.full((4, 5), 0.9, np.float32))
+    at = np.tile(np.array([0.3, 0.9], np.float32), (20, 1))
     same = raw.corrected(light, "left", IMAGES[0], at, np.full((4, 5), 3.0, np.float32))
     np.testing.assert_allclose(same, light, rtol=1e-6)
 
@@ -113,14 +115,15 @@ def test_the_srgb_curve_and_its_inverse_agree() -> None:
 
 def test_one_pass_over_pixels_equals_the_steps_over_pictures() -> None:
     samples, facts = survey(0.4)
-    model = solve_colour("even", samples, facts, IMAGES, CAMERAS)
+    model = solve_colour("even", samples, facts)
     rng = np.random.default_rng(3)
     light = rng.uniform(0.01, 0.6, (7, 9, 3)).astype(np.float32)
     x, y = (rng.uniform(0, n - 1, (7, 9)).astype(np.float32) for n in (640, 480))
     x[0, 0] = -1
     ranges = rng.uniform(1.6, 2.4, (7, 9)).astype(np.float32)
     factor = np.full((3, 3, 3), 1.3, np.float32)
-    places = ((x + np.float32(0.5)) / 640, (y + np.float32(0.5)) / 480)
+    places = np.column_stack([(x.ravel() + 0.5) / 640, (y.ravel() + 0.5) / 480])
+    places = places.astype(np.float32)
     lifted = model.corrected(light, "left", IMAGES[3], places, ranges) * 1.3
     expected = np.minimum(encoded(((lifted - model.black) / (1 - model.black)).clip(0, 4)), 600)
     found = light.copy()
@@ -134,7 +137,7 @@ def test_one_pass_over_pixels_equals_the_steps_over_pictures() -> None:
 
 def test_black_leaves_the_order_of_light_and_takes_less_than_the_dark() -> None:
     samples, facts = survey(0.4)
-    model = solve_colour("even", samples, facts, IMAGES, CAMERAS)
+    model = solve_colour("even", samples, facts)
     assert (model.black > 0).all()
     assert (model.black < 0.08).all()
     assert (model.law[7:] > 1).all()
