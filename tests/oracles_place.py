@@ -19,7 +19,7 @@ def covariance_matrix(time: Array, sigma: Array, tau: float, white: float) -> Ar
     return matrix
 
 
-def surprises(matrix: Array, values: Array) -> Array:
+def standard_residuals_densely(matrix: Array, values: Array) -> Array:
     """(N,) each value less what the others predict, over the sigma of that, by partitioning."""
     found = np.empty(len(values))
     for i in range(len(values)):

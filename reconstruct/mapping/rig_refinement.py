@@ -47,7 +47,7 @@ _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 _LEVER = ("lever.x_m", "lever.y_m", "lever.z_m")
 """The body's origin in the rig's frame."""
 _LEVER_SIGMA_M = 0.05
-_MOST_LASTING = 0.98
+_MOST_CORRELATED = 0.98
 """Correlation of navigation's errors from one station to the next."""
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
@@ -141,7 +141,7 @@ def fit_rig(
         information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
     _hold_baseline(information, fields, rig, names)
     state = start_state(mapped, rig, names, frames, ids)
-    fixes = None if fixes is None else _lasting(fixes, state)
+    fixes = None if fixes is None else _with_correlation(fixes, state)
     first = _values(state, fields, names, lever=fixes is not None)
     drift = np.zeros(len(first))
     variance = np.nan
@@ -180,7 +180,7 @@ def fit_rig(
     )
 
 
-def _lasting(fixes: NavigationFixes, state: RigState) -> NavigationFixes:
+def _with_correlation(fixes: NavigationFixes, state: RigState) -> NavigationFixes:
     """Sigmas that account for correlated errors of navigation.
 
     Correlated errors average out less than independent ones: a first-order process of correlation
@@ -191,8 +191,8 @@ def _lasting(fixes: NavigationFixes, state: RigState) -> NavigationFixes:
     off = fixes.positions[known] - bodies
     off = off - off.mean(axis=0)
     spread = np.maximum((off**2).sum(axis=0), 1e-12)
-    lasting = np.clip((off[1:] * off[:-1]).sum(axis=0) / spread, 0.0, _MOST_LASTING)
-    return replace(fixes, sigmas=fixes.sigmas * np.sqrt((1.0 + lasting) / (1.0 - lasting)))
+    correlation = np.clip((off[1:] * off[:-1]).sum(axis=0) / spread, 0.0, _MOST_CORRELATED)
+    return replace(fixes, sigmas=fixes.sigmas * np.sqrt((1.0 + correlation) / (1.0 - correlation)))
 
 
 def _spare(pixels: Pixels, stations: int, shared: int) -> int:

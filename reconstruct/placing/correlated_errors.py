@@ -48,8 +48,18 @@ def whiten(
         (N, P) innovations over their standard deviation, zero where not used, and the logarithm of
         the determinant of the covariance matrix of what is used.
     """
+    found, log_det, _, _ = _filtered(time, sigma, used, values, tau, white)
+    return found, log_det
+
+
+@compiled
+def _filtered(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> tuple[Array, float, Array, Array]:
+    """As `whiten`; also the mean (N, P) and variance (N,) of the Markov part before each value."""
     count, columns = values.shape
     found = np.zeros((count, columns))
+    means, variances = np.zeros((count, columns)), np.ones(count)
     state = np.zeros(columns)
     gain_in = math.sqrt(1.0 - white)
     variance, log_det, last = 1.0, 0.0, -1
@@ -59,43 +69,22 @@ def whiten(
         kept = _kept(time, sigma, last, i, tau) if last >= 0 else 1.0
         last = i
         variance = kept * kept * variance + 1.0 - kept * kept
+        variances[i] = variance
         spread = gain_in * gain_in * variance + white
         root = math.sqrt(spread)
         gain = gain_in * variance / spread
         for k in range(columns):
             state[k] *= kept
+            means[i, k] = state[k]
             innovation = values[i, k] - gain_in * state[k]
             found[i, k] = innovation / root
             state[k] += gain * innovation
         variance -= gain * gain_in * variance
         log_det += math.log(spread)
-    return found, log_det
+    return found, log_det, means, variances
 
 
-@compiled
-def _predictions(
-    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
-) -> tuple[Array, Array]:
-    """Mean and variance of the Markov part of each used value, given the used ones before it."""
-    count = len(values)
-    means, variances = np.zeros(count), np.ones(count)
-    gain_in = math.sqrt(1.0 - white)
-    state, variance, last = 0.0, 1.0, -1
-    for i in range(count):
-        if not used[i]:
-            continue
-        kept = _kept(time, sigma, last, i, tau) if last >= 0 else 1.0
-        last = i
-        state *= kept
-        variance = kept * kept * variance + 1.0 - kept * kept
-        means[i], variances[i] = state, variance
-        gain = gain_in * variance / (gain_in * gain_in * variance + white)
-        state += gain * (values[i] - gain_in * state)
-        variance -= gain * gain_in * variance
-    return means, variances
-
-
-def surprise(
+def standard_residuals(
     time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
 ) -> Array:
     """How far each value is from what all the others predict, in standard deviations.
@@ -114,12 +103,10 @@ def surprise(
     Returns:
         (N,), meaningless where not used.
     """
-    past, past_variance = _predictions(time, sigma, used, values, tau, white)
-    back = slice(None, None, -1)
-    future, future_variance = _predictions(
-        time[back].copy(), sigma[back].copy(), used[back].copy(), values[back].copy(), tau, white
-    )
-    future, future_variance = future[back], future_variance[back]
+    past, past_variance = _filtered(time, sigma, used, values[:, None], tau, white)[2:]
+    reversed_ = (np.ascontiguousarray(row[::-1]) for row in (time, sigma, used, values[:, None]))
+    future, future_variance = (row[::-1] for row in _filtered(*reversed_, tau, white)[2:])
+    past, future = past[:, 0], future[:, 0]
     precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
     mean = (past / past_variance + future / future_variance) / precision
     spread = (1.0 - white) / precision + white
@@ -127,7 +114,7 @@ def surprise(
     return found
 
 
-def lasting_share(time: Array, tau: float, white: float) -> float:
+def correlated_share(time: Array, tau: float, white: float) -> float:
     """Share of the variance that the plain mean over all times keeps beyond that of white error.
 
     0 for white error, near 1 where one error is constant. The times are taken as evenly

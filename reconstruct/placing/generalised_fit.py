@@ -10,14 +10,19 @@ and the covariance of the placement is averaged over all that are likely.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.placing.correlated_errors import LEAST_WHITE, lasting_share, surprise, whiten
+from reconstruct.placing.correlated_errors import (
+    LEAST_WHITE,
+    correlated_share,
+    standard_residuals,
+    whiten,
+)
 from reconstruct.placing.navigation_equations import (
     GROUP_OF,
     GROUPS,
@@ -32,7 +37,7 @@ _TAUS = 10
 _SHORTEST_STEPS, _LONGEST_SPANS = 0.2, 30.0
 """Correlation times tried: from this many median time steps to this many lengths of the survey."""
 _GROSS_SIGMAS = 5.0
-_SURPRISE_SIGMAS = 4.5
+_CONTRADICTED_SIGMAS = 4.5
 """A reading this far from what all others say is left out."""
 _SWEEPS = 3
 _ROUNDS = 6
@@ -42,7 +47,7 @@ _CHI_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lasting:
+class Correlation:
     """How the errors of a group of channels are correlated in time."""
 
     tau: float
@@ -76,7 +81,7 @@ class Estimate:
     """(PARAMETERS,) change, zero for what is held."""
     covariance: Array
     """(PARAMETERS, PARAMETERS) covariance, zero for what is held."""
-    lasting: Mapping[str, Lasting]
+    correlation: Mapping[str, Correlation]
     """Correlation by group, of those with readings."""
     used: NDArray[np.bool_]
     """(M, 6) readings that took part."""
@@ -90,7 +95,7 @@ def estimate(
     extra: Extra = NO_EXTRA,
     *,
     frame_bounds: Mapping[int, float],
-    lasting: Mapping[str, Lasting] | None = None,
+    correlation: Mapping[str, Correlation] | None = None,
 ) -> Estimate:
     """Solve for the parameters, the correlation of errors and the readings to leave out.
 
@@ -103,30 +108,30 @@ def estimate(
         extra: further equations.
         frame_bounds: sigmas of the nuisances of navigation's own frame (turn, stretch) if its
             position errors lasted throughout; they shrink as those average out.
-        lasting: how errors last, where that is known: then no reading is left out either, and the
-            covariance is that of this way alone.
+        correlation: of errors, where that is known: then no reading is left out either, and the
+            covariance is that of this one alone.
     """
     problem = _PlacementProblem(
         time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds
     )
     used = used & np.isfinite(found.misfit)
-    if lasting is not None:
-        parameters, spread = problem.total(used, lasting).solve()
+    if correlation is not None:
+        parameters, spread = problem.total(used, correlation).solve()
         change, covariance = _filled(problem, parameters, spread)
-        return Estimate(change=change, covariance=covariance, lasting=lasting, used=used)
-    lasting = {
-        group: Lasting(tau=float(np.ptp(time)) or 1.0, white=0.1)
+        return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
+    correlation = {
+        group: Correlation(tau=float(np.ptp(time)) or 1.0, white=0.1)
         for group in GROUPS
         if used[:, _channels(group)].any()
     }
     for _ in range(_ROUNDS):
-        lasting = _likeliest(problem, used, lasting)
-        kept = _without_surprises(problem, used, lasting)
+        correlation = _likeliest(problem, used, correlation)
+        kept = _without_contradicted(problem, used, correlation)
         if np.array_equal(kept, used):
             break
         used = kept
-    change, covariance = _averaged(problem, used, lasting)
-    return Estimate(change=change, covariance=covariance, lasting=lasting, used=used)
+    change, covariance = _averaged(problem, used, correlation)
+    return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
 
 
 def without_gross_errors(misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -148,8 +153,7 @@ def without_gross_errors(misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.
     return used
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Normal:
+class _Normal(NamedTuple):
     """Normal equations and likelihood of a group."""
 
     matrix: Array
@@ -159,13 +163,7 @@ class _Normal:
     rows: int
 
     def plus(self, other: "_Normal") -> "_Normal":
-        return _Normal(
-            matrix=self.matrix + other.matrix,
-            vector=self.vector + other.vector,
-            square=self.square + other.square,
-            log_det=self.log_det + other.log_det,
-            rows=self.rows + other.rows,
-        )
+        return _Normal(*(own + more for own, more in zip(self, other, strict=True)))
 
     def solve(self) -> tuple[Array, Array]:
         """Parameters and their covariance."""
@@ -184,18 +182,17 @@ class _PlacementProblem:
     extra: Extra
     frame_bounds: Mapping[int, float]
     cache: dict[Any, _Normal] = field(default_factory=dict)
-    stacks: dict[Any, tuple[Array, Array, Array, Array]] = field(default_factory=dict)
 
-    def group(self, group: str, used: NDArray[np.bool_], lasting: Lasting) -> _Normal:
+    def group(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
         """Normal equations of one group.
 
         A constant error of variance c adds `c 1 1'` to the covariance matrix: its inverse is that
         of the varying part minus a product (Sherman & Morrison 1950).
         """
-        key = (group, used.tobytes(), lasting.tau, lasting.white, lasting.constant)
+        key = (group, used.tobytes(), correlation.tau, correlation.white, correlation.constant)
         if key not in self.cache:
-            self.cache[key] = self._unscaled(group, used, lasting)
-        found, square = self.cache[key], lasting.factor**2
+            self.cache[key] = self._unscaled(group, used, correlation)
+        found, square = self.cache[key], correlation.factor**2
         return _Normal(
             matrix=found.matrix / square,
             vector=found.vector / square,
@@ -204,25 +201,7 @@ class _PlacementProblem:
             rows=found.rows,
         )
 
-    def groups(
-        self, group: str, used: NDArray[np.bool_], choices: Sequence[Lasting]
-    ) -> tuple[Array, Array, Array, Array]:
-        """The equations of many choices of one factor: matrices, vectors, squares, log dets."""
-        key = (group, used.tobytes(), len(choices))
-        if key not in self.stacks:
-            parts = [self.group(group, used, replace(c, factor=1.0)) for c in choices]
-            self.stacks[key] = (
-                np.stack([part.matrix for part in parts]),
-                np.stack([part.vector for part in parts]),
-                np.array([part.square for part in parts]),
-                np.array([part.log_det for part in parts]),
-            )
-        matrix, vector, misfit, log_det = self.stacks[key]
-        square = choices[0].factor ** 2
-        rows = int(used[:, _channels(group)].sum())
-        return matrix / square, vector / square, misfit / square, log_det + rows * np.log(square)
-
-    def _unscaled(self, group: str, used: NDArray[np.bool_], lasting: Lasting) -> _Normal:
+    def _unscaled(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
         size = len(self.free)
         total = _Normal(
             matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
@@ -231,7 +210,7 @@ class _PlacementProblem:
             rows = used[:, channel]
             if not rows.any():
                 continue
-            product, log_det, count = self._products(channel, rows, lasting)
+            product, log_det, count = self._products(channel, rows, correlation)
             ones = product[-1]
             kept = product - np.outer(ones, ones) / (1.0 + ones[-1])
             total = total.plus(
@@ -246,37 +225,37 @@ class _PlacementProblem:
         return total
 
     def _products(
-        self, channel: int, rows: NDArray[np.bool_], lasting: Lasting
+        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
     ) -> tuple[Array, float, int]:
         """Products of all white columns, the last that of a constant error; log det; readings."""
-        varying, constant = self.shares(channel, rows, lasting)
+        varying, constant = self.shares(channel, rows, correlation)
         columns = np.column_stack(
             [self.found.jacobian[:, channel][:, self.free], self.found.misfit[:, channel], constant]
         )
         columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
         sigma = varying * self.found.sigma[:, channel]
-        even, log_det = whiten(self.time, sigma, rows, columns, lasting.tau, lasting.white)
+        even, log_det = whiten(self.time, sigma, rows, columns, correlation.tau, correlation.white)
         return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
 
     def shares(
-        self, channel: int, rows: NDArray[np.bool_], lasting: Lasting
+        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
     ) -> tuple[Array, Array]:
         """Sigmas of the varying and of the constant part over the stated one, (M,) each.
 
         The constant part is as large as the least of the stated sigmas allows.
         """
         sigma = self.found.sigma[:, channel]
-        constant = np.sqrt(lasting.constant) * sigma[rows].min() / sigma
-        constant = np.minimum(constant, np.sqrt(lasting.constant))
+        constant = np.sqrt(correlation.constant) * sigma[rows].min() / sigma
+        constant = np.minimum(constant, np.sqrt(correlation.constant))
         return np.sqrt(1.0 - constant**2), constant
 
-    def rest(self, lasting: Mapping[str, Lasting]) -> _Normal:
+    def rest(self, correlation: Mapping[str, Correlation]) -> _Normal:
         """Normal equations of what is not navigation, and of the turn of navigation's frame."""
         jacobian, misfit = self.extra.jacobian[:, self.free], self.extra.misfit
         matrix, vector = jacobian.T @ jacobian, jacobian.T @ misfit
-        if "horizontal" in lasting:
-            how = lasting["horizontal"]
-            share = lasting_share(self.time, how.tau, how.white)
+        if "horizontal" in correlation:
+            how = correlation["horizontal"]
+            share = correlated_share(self.time, how.tau, how.white)
             share = how.constant + (1.0 - how.constant) * share
             for parameter, bound in self.frame_bounds.items():
                 at = np.flatnonzero(self.free == parameter)
@@ -285,10 +264,10 @@ class _PlacementProblem:
             matrix=matrix, vector=vector, square=float(misfit @ misfit), log_det=0.0, rows=0
         )
 
-    def total(self, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]) -> _Normal:
+    def total(self, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]) -> _Normal:
         """Normal equations of all."""
-        total = self.rest(lasting)
-        for group, how in lasting.items():
+        total = self.rest(correlation)
+        for group, how in correlation.items():
             total = total.plus(self.group(group, used, how))
         return total
 
@@ -297,15 +276,15 @@ def _channels(group: str) -> list[int]:
     return [k for k, name in enumerate(GROUP_OF) if name == group]
 
 
-def _grid(time: Array) -> list[Lasting]:
+def _grid(time: Array) -> list[Correlation]:
     steps = np.diff(np.unique(time))
     if not len(steps):
-        return [Lasting(tau=1.0, white=0.1)]
+        return [Correlation(tau=1.0, white=0.1)]
     taus = np.geomspace(
         _SHORTEST_STEPS * float(np.median(steps)), _LONGEST_SPANS * float(np.ptp(time)), _TAUS
     )
     return [
-        Lasting(tau=float(tau), white=white, constant=constant)
+        Correlation(tau=float(tau), white=white, constant=constant)
         for tau in taus
         for white in _WHITE
         for constant in _CONSTANT
@@ -313,10 +292,10 @@ def _grid(time: Array) -> list[Lasting]:
 
 
 def _likeliest(
-    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
-) -> dict[str, Lasting]:
+    problem: _PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
+) -> dict[str, Correlation]:
     """The likeliest correlation of every group, one after the other, in several rounds."""
-    now = {group: how for group, how in lasting.items() if used[:, _channels(group)].any()}
+    now = {group: how for group, how in correlation.items() if used[:, _channels(group)].any()}
     grid = _grid(problem.time)
     for _ in range(_SWEEPS):
         before = dict(now)
@@ -333,17 +312,21 @@ def _likeliest(
 def _scores(
     problem: _PlacementProblem,
     used: NDArray[np.bool_],
-    now: Mapping[str, Lasting],
+    now: Mapping[str, Correlation],
     group: str,
-    choices: Sequence[Lasting],
+    choices: Sequence[Correlation],
 ) -> Array:
     """Logarithm of the restricted likelihood of each choice for a group, but for a constant."""
     others = problem.rest(now)
     for name, how in now.items():
         if name != group:
             others = others.plus(problem.group(name, used, how))
-    matrix, vector, square, own = problem.groups(group, used, choices)
-    matrix, vector = others.matrix + matrix, others.vector + vector
+    parts = [problem.group(group, used, choice) for choice in choices]
+    matrix = others.matrix + np.stack([part.matrix for part in parts])
+    vector = others.vector + np.stack([part.vector for part in parts])
+    square, own = (
+        np.array(row) for row in zip(*((p.square, p.log_det) for p in parts), strict=True)
+    )
     size = np.sqrt(np.diagonal(matrix[0]))
     size = np.where(size > 0, size, 1.0)
     scaled = matrix / np.outer(size, size)
@@ -357,7 +340,7 @@ def _scores(
 
 
 def _factor(
-    problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Lasting], group: str
+    problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Correlation], group: str
 ) -> float:
     """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
     change, covariance = problem.total(used, now).solve()
@@ -370,16 +353,16 @@ def _factor(
     return float(np.sqrt(ratio)) if ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom) else 1.0
 
 
-def _without_surprises(
-    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+def _without_contradicted(
+    problem: _PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
 ) -> NDArray[np.bool_]:
     """Leave out, of each group, readings that all others contradict, the worst of neighbours first.
 
     An outlier makes its neighbours look wrong too: of two in a row only the worse goes at a time.
     """
-    change, _ = problem.total(used, lasting).solve()
+    change, _ = problem.total(used, correlation).solve()
     kept = used.copy()
-    for group, how in lasting.items():
+    for group, how in correlation.items():
         channels = _channels(group)
         worst = np.zeros(len(problem.time))
         for channel in channels:
@@ -393,20 +376,20 @@ def _without_surprises(
             value, one = whiten(problem.time, sigma, rows, both, how.tau, how.white)[0].T
             steady = float(one @ value) / (1.0 + float(one @ one))
             off = both[:, 0] - steady * both[:, 1]
-            off = np.abs(surprise(problem.time, sigma, rows, off, how.tau, how.white))
+            off = np.abs(standard_residuals(problem.time, sigma, rows, off, how.tau, how.white))
             worst = np.maximum(worst, np.where(rows, off, 0.0))
         if np.count_nonzero(worst) < 3:
             continue
         peak = np.ones(len(worst), dtype=bool)
         peak[1:] &= worst[1:] >= worst[:-1]
         peak[:-1] &= worst[:-1] > worst[1:]
-        contradicted = np.flatnonzero(peak & (worst > _SURPRISE_SIGMAS))
+        contradicted = np.flatnonzero(peak & (worst > _CONTRADICTED_SIGMAS))
         kept[contradicted[:, None], channels] = False
     return kept
 
 
 def _averaged(
-    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+    problem: _PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
 ) -> tuple[Array, Array]:
     """Parameters and covariance over all likely correlations of errors, (P,) and (P, P).
 
@@ -414,16 +397,16 @@ def _averaged(
     """
     rng = np.random.default_rng(0)  # any draws will do; the same bytes each time
     grid = _grid(problem.time)
-    draws: dict[str, list[Lasting]] = {}
-    for group, how in lasting.items():
+    draws: dict[str, list[Correlation]] = {}
+    for group, how in correlation.items():
         choices = [replace(g, factor=how.factor) for g in grid]
-        scores = _scores(problem, used, lasting, group, choices)
+        scores = _scores(problem, used, correlation, group, choices)
         weights = np.exp(scores - scores.max())
         picked = rng.choice(len(choices), size=_DRAWS, p=weights / weights.sum())
         draws[group] = [choices[k] for k in picked]
     solutions = [
-        problem.total(used, {group: draws[group][k] for group in lasting}).solve()
-        for k in range(_DRAWS if lasting else 1)
+        problem.total(used, {group: draws[group][k] for group in correlation}).solve()
+        for k in range(_DRAWS if correlation else 1)
     ]
     changes = np.stack([change for change, _ in solutions])
     mean = changes.mean(axis=0)

@@ -14,9 +14,9 @@ from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.generalised_fit import (
     NO_EXTRA,
+    Correlation,
     Estimate,
     Extra,
-    Lasting,
     estimate,
     without_gross_errors,
 )
@@ -70,7 +70,7 @@ class PlacementFit:
     covariance: Array
     """(7, 7) covariance of rotation about north, east, down (rad), shift north, east, down of the
     middle (m), and the logarithm of the scale."""
-    lasting: Mapping[str, Lasting]
+    correlation: Mapping[str, Correlation]
     """For each group, how navigation's errors are correlated."""
     time_unit: str
     mount_sigma_deg: float
@@ -136,7 +136,7 @@ class PlacementFit:
                     "constant_share": how.constant,
                     "sigma_factor": how.factor,
                 }
-                for group, how in self.lasting.items()
+                for group, how in self.correlation.items()
             },
         }  # fmt: skip
 
@@ -296,7 +296,7 @@ class _NavigationTask:
         if SCALE not in free:
             found = equations(epochs, place, middle)
             scaled = self._estimate(
-                found, place, middle, got.used, [*solved_for, SCALE], lasting=got.lasting
+                found, place, middle, got.used, [*solved_for, SCALE], correlation=got.correlation
             )
         return self._report(place, middle, got, scaled, held=SCALE not in free)
 
@@ -317,7 +317,7 @@ class _NavigationTask:
             free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
             middle_ned=middle,
             covariance=got.covariance[:PLACE, :PLACE],
-            lasting=got.lasting,
+            correlation=got.correlation,
             time_unit="s" if epochs.timed else "stations",
             mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
         )
@@ -354,7 +354,7 @@ class _NavigationTask:
         middle: Array,
         used: NDArray[np.bool_],
         free: list[int],
-        lasting: Mapping[str, Lasting] | None = None,
+        correlation: Mapping[str, Correlation] | None = None,
     ) -> Estimate:
         return estimate(
             self.epochs.time,
@@ -363,7 +363,7 @@ class _NavigationTask:
             free,
             self._extra(place, middle),
             frame_bounds=self._frame_bounds(),
-            lasting=lasting,
+            correlation=correlation,
         )
 
     def _extra(self, place: Similarity, middle: Array) -> Extra:

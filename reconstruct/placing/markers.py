@@ -152,10 +152,10 @@ def _best_dictionary(
 ) -> tuple[str, Counter[int]]:
     """The dictionary with most detections of markers that two pictures or more show."""
     views = {name: Counter(m.number for seen in found for m in seen[name]) for name in tried}
-    sightings = {
+    detections = {
         name: sum(n for n in counts.values() if n >= _LEAST_VIEWS) for name, counts in views.items()
     }
-    best = max(tried, key=lambda name: (sightings[name], -tried.index(name)))
+    best = max(tried, key=lambda name: (detections[name], -tried.index(name)))
     return best, views[best]
 
 
@@ -172,14 +172,14 @@ def _write_template(workspace: Path) -> int:
         (view, point.name, None, None, None, round(x - 0.5), round(y - 0.5))
         for point in known
         if point.name not in coded
-        for view, x, y in _sightings(point, model, pictures)
+        for view, x, y in _expected_in(point, model, pictures)
     ]
     if rows:
         write_csv(picks, _TEMPLATE, rows)
     return len(rows)
 
 
-def _sightings(
+def _expected_in(
     point: KnownPoint, model: SparseModel, pictures: Pictures
 ) -> list[tuple[str, float, float]]:
     """Pictures that should show a point, and where; none where the model has no CRS."""

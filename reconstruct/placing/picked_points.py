@@ -163,10 +163,16 @@ def _nearest(picks: Sequence[Pick], cameras: Mapping[str, Camera]) -> Array | st
     starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
     if not np.isfinite(starts + ways).all():
         return "a pick is beyond the reach of its lens"
+    found = nearest_to_rays(starts, ways)
+    return "the pictures see it from one direction only" if found is None else found
+
+
+def nearest_to_rays(starts: Array, ways: Array) -> Array | None:
+    """The point (3,) nearest to rays with starts and unit directions (N, 3); None if parallel."""
     across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
     system = across.sum(axis=0)
     if np.linalg.cond(system) > _LARGEST_CONDITION:
-        return "the pictures see it from one direction only"
+        return None
     found: Array = np.linalg.solve(system, np.einsum("nij,nj->i", across, starts))
     return found
 

@@ -14,9 +14,9 @@ from alice_survey.base.errors import WorkspaceError
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, describe, tie_control
 from reconstruct.placing.control_file import Pick, read_control, read_picks
-from reconstruct.placing.find_place import body_from_pinhole
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.picked_points import Camera, find_spots
+from reconstruct.placing.run import body_from_pinhole
 from reconstruct.views.lens import Lens, flat_port_lens
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 

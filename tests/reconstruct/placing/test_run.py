@@ -16,8 +16,8 @@ from alice_survey.base.manifest import read_manifest, write_manifest
 from alice_survey.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.run import read_track_poses
 from reconstruct.placing.scale import scale_model
+from reconstruct.placing.track import read_track_poses
 from reconstruct.views.model import read_model
 
 

@@ -8,9 +8,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
-from reconstruct.placing.correlated_errors import lasting_share, surprise, whiten
+from reconstruct.placing.correlated_errors import correlated_share, standard_residuals, whiten
 from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
-from tests.oracles_place import covariance_matrix, surprises
+from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
 DATUM = Datum(32.8236, 34.9553)
 SIGMA = np.array([0.06, 0.06, 0.05, *np.deg2rad([0.05, 0.05, 0.3])])
@@ -106,13 +106,13 @@ def test_errors_over_their_sigmas_are_of_unit_size(tau_s: float) -> None:
     assert 0.5 < np.sqrt(np.mean(turns**2)) < 1.4
 
 
-def test_lasting_is_found() -> None:
+def test_correlation_is_found() -> None:
     body = flight(8, 15)
     for tau_s, low, high in ((1.0, 0.1, 6.0), (25.0, 6.0, 100.0)):
         errors = SIGMA * gauss_markov(np.random.default_rng(3), len(body), tau_s)
         fit, _, _ = place(body, records_of(body, errors, SIGMA), 3)
         for group in ("horizontal", "depth", "heading"):
-            how = fit.lasting[group]
+            how = fit.correlation[group]
             decay = how.tau if how.white < 0.5 else 0.5
             assert low / 2 <= decay <= high, (group, how)
         assert fit.time_unit == "s"
@@ -159,9 +159,9 @@ def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
     errors = 5.0 * SIGMA * gauss_markov(np.random.default_rng(4), len(body), 1.0)
     fit, _, _ = place(body, records_of(body, errors, SIGMA), 1)
     for group in ("horizontal", "depth", "heading"):
-        assert 3.5 < fit.lasting[group].factor < 7.0
+        assert 3.5 < fit.correlation[group].factor < 7.0
     honest, _, _ = place(body, records_of(body, errors / 5.0, SIGMA), 1)
-    assert all(how.factor < 1.3 for how in honest.lasting.values())
+    assert all(how.factor < 1.3 for how in honest.correlation.values())
 
 
 def test_the_mount_adds_its_sigma_and_a_turning_vehicle_tells_it() -> None:
@@ -247,17 +247,17 @@ def test_whitening_is_the_inverse_of_choleskys_factor(tau: float, white: float) 
     np.testing.assert_allclose(found[used], np.linalg.solve(factor, values[used]), atol=1e-8)
     assert log_det == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-8)
     assert np.all(found[~used] == 0)
-    off = surprise(time, sigma, used, values[:, 0], tau, white)
-    expected = surprises(matrix, values[used, 0])
+    off = standard_residuals(time, sigma, used, values[:, 0], tau, white)
+    expected = standard_residuals_densely(matrix, values[used, 0])
     np.testing.assert_allclose(off[used], expected, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("tau", [1.0, 30.0, 1e4])
-def test_the_lasting_share_is_that_of_the_mean(tau: float) -> None:
+def test_the_correlated_share_is_that_of_the_mean(tau: float) -> None:
     time = np.linspace(0, 100, 4000)
     matrix = np.exp(-np.abs(time[:, None] - time) / tau)
-    assert lasting_share(time, tau, 0.2) == pytest.approx(0.8 * matrix.mean(), rel=0.02)
-    assert lasting_share(time, 1e12, 0.0) == pytest.approx(1.0)
+    assert correlated_share(time, tau, 0.2) == pytest.approx(0.8 * matrix.mean(), rel=0.02)
+    assert correlated_share(time, 1e12, 0.0) == pytest.approx(1.0)
 
 
 def test_placing_is_the_same_twice() -> None:

@@ -13,19 +13,16 @@ from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.covariance import (
-    PlaceCovariance,
-    attitude_sigmas_deg,
-    placed_covariances,
-    shape_covariances,
-    write_covariances,
-)
 from reconstruct.placing.navigation_equations import attitude_axes, cross_matrices
 from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
+    attitude_sigmas_deg,
+    placed_covariances,
     read_track_poses,
+    shape_covariances,
     track_sigmas,
+    write_covariances,
     write_track_csv,
     write_track_geojson,
 )
@@ -74,7 +71,7 @@ def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None
         rotation = Rotation.from_rotvec(turn)
         places = middle + np.exp(grow) * rotation.apply(poses.translation - middle) + shift
         moved.append(RigidTransform.from_components(places, rotation * poses.rotation))
-    found = placed_covariances(poses, PlaceCovariance(middle=middle, covariance=covariance))
+    found = placed_covariances(poses, middle, covariance)
     assert_close(found, scatter(poses, moved))
 
 
