@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle import fleet
 from alice_survey.vehicle.files import (
     coefficients_from_file,
     speeds_missing,
@@ -36,6 +36,7 @@ from alice_survey.vehicle.identification.parameters import (
     free_parameters,
     unit_of,
 )
+from alice_survey.vehicle.identification.plots import draw_motion
 from alice_survey.vehicle.identification.two_step import calibrate
 from alice_survey.vehicle.identification.validation import MotionValidation, validate
 from alice_survey.vehicle.identification.windows import (
@@ -44,12 +45,13 @@ from alice_survey.vehicle.identification.windows import (
     make_windows,
     of_windows,
 )
-from alice_survey.vehicle.log import VehicleLog, read_vehicle_log
+from alice_survey.vehicle.log import read_vehicle_log
 from alice_survey.vehicle.vehicle import Vehicle
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
 TWO_STEP_FREE = ("X_udot", "X_uu", "Z_wdot", "Z_ww", "N_rdot", "N_rr")
 """Parameters free by default; the second as in the paper's three manoeuvres."""
+_VALIDATION_WINDOW_S = 10.0
 _HIGH_CORRELATION = 0.9
 _LASTING = 0.2
 """Correlation time, by the length of windows, from which their sigmas are not to be trusted."""
@@ -78,7 +80,6 @@ class IdentifyOptions:
     """Rates that follow the log."""
     window_s: float | None = None
     """Longest stretch simulated in one go; as long as there are no gaps if not given."""
-    validation_window_s: float | None = 10.0
     hold_input: bool = False
 
 
@@ -125,14 +126,24 @@ def identify_report(
     result = _identify(windows, parameters, how, options.method)
     validation, drift = None, None
     if options.validate is not None:
-        shorter = _windows(options.validate, vehicle, options, options.validation_window_s)
+        shorter = _windows(options.validate, vehicle, options, _VALIDATION_WINDOW_S)
         of_windows([*windows, *shorter], vehicle)
         values, drift = _with_its_current(shorter, result, how)
         validation = validate(shorter, parameters, values, simulation=how)
     own = validate(windows, parameters, result.values, simulation=how, horizons_s=())
     text = _text(vehicle, logs, result, thrust, own, validation, drift, options)
     data = _data(vehicle, logs, result, thrust, own, validation)
-    _write(out, vehicle, result, text, data, own, validation)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        identified = parameters.coefficients(result.values, "identified")
+        write_coefficients(out / "coefficients.json", identified, data)
+        (out / "report.txt").write_text(text + "\n", encoding="utf-8")
+        draw_motion(out / "fit.png", f"{vehicle.name}: the logs it was identified from", own)
+        if validation is not None:
+            title = f"{vehicle.name}: predicted, {Path(validation.source).name}"
+            draw_motion(out / "validation.png", title, validation)
+    except OSError as error:
+        raise VehicleError(f"{out}: cannot be written: {error.strerror}") from None
     return f"{text}\n\nwritten to {out}", data
 
 
@@ -143,11 +154,9 @@ def _start(options: IdentifyOptions) -> Vehicle:
     path = Path(options.coefficients)
     if path.suffix:
         return known.with_coefficients(coefficients_from_file(path))
-    from alice_survey.vehicle.fleet import vehicle
-
     if Path(options.vehicle).suffix:
         raise VehicleError(f"{options.vehicle} has its own coefficients: name a file of others")
-    return vehicle(options.vehicle, options.coefficients)
+    return fleet.vehicle(options.vehicle, options.coefficients)
 
 
 def _held(pairs: Sequence[str]) -> dict[str, float]:
@@ -164,7 +173,6 @@ def _held(pairs: Sequence[str]) -> dict[str, float]:
 def _windows(
     path: Path, vehicle: Vehicle, options: IdentifyOptions, window_s: float | None = None
 ) -> list[Window]:
-    log: VehicleLog
     if options.columns is not None:
         log = read_foreign_log(path, read_column_map(options.columns))
     else:
@@ -431,16 +439,7 @@ def _data(
             result.parameters.names, result.values, result.sigma
         ),
         "thrust": [
-            {
-                "thrusters": list(one.thrusters),
-                "way": one.way,
-                "model": one.model,
-                "identified": one.identified,
-                "sigma": known(one.sigma),
-                "factor": one.factor,
-                "readings": one.readings,
-            }
-            for one in thrust
+            {**asdict(one), "sigma": known(one.sigma), "factor": one.factor} for one in thrust
         ],
         "same_logs": fits(own),
     }
@@ -456,27 +455,3 @@ def _data(
     if validation is not None:
         data["validation"] = fits(validation)
     return data
-
-
-def _write(
-    out: Path,
-    vehicle: Vehicle,
-    result: _Identified,
-    text: str,
-    data: dict[str, Any],
-    own: MotionValidation,
-    validation: MotionValidation | None,
-) -> None:
-    from alice_survey.vehicle.identification.plots import draw_motion
-
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        identified: Coefficients = result.parameters.coefficients(result.values, "identified")
-        write_coefficients(out / "coefficients.json", identified, data)
-        (out / "report.txt").write_text(text + "\n", encoding="utf-8")
-        draw_motion(out / "fit.png", f"{vehicle.name}: the logs it was identified from", own)
-        if validation is not None:
-            title = f"{vehicle.name}: predicted, {Path(validation.source).name}"
-            draw_motion(out / "validation.png", title, validation)
-    except OSError as error:
-        raise VehicleError(f"{out}: cannot be written: {error.strerror}") from None

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import fleet
@@ -72,18 +70,6 @@ def test_replacing_an_added_mass_drops_its_mirror() -> None:
     assert dict(after.values) == {"N_vdot": -2.5, "X_uu": -15.0, "K_vdot": -0.2}
     assert after.added_mass[1, 5] == 2.5
     assert before.added_mass[1, 5] == 8.5  # the old set is as it was
-
-
-@settings(deadline=None)
-@given(st.dictionaries(st.sampled_from(["Y_vv", "X_udot", "N_uv", "K_p"]), st.floats(-9, 9)))
-def test_what_is_not_named_is_zero(values: dict[str, float]) -> None:
-    some = Coefficients(name="some", values=values)
-    assert some.quadratic[1, 1] == values.get("Y_vv", 0.0)
-    assert some.added_mass[0, 0] == -values.get("X_udot", 0.0)
-    assert some.lift[3] == values.get("N_uv", 0.0)
-    assert some.linear[3, 3] == values.get("K_p", 0.0)
-    entries = sum(map(np.count_nonzero, (some.quadratic, some.added_mass, some.lift, some.linear)))
-    assert entries == sum(value != 0.0 for value in values.values())
 
 
 @pytest.mark.parametrize("coefficients", fleet.SETS)

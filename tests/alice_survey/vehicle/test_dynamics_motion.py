@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle import fleet
-from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.sea import Current, constant_current, sheared_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 from tests import oracles_dynamics as oracle
@@ -134,15 +133,6 @@ def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str
     assert 0.9e-4 < np.abs(angle[-round(period / 0.01) :]).max() <= 1.0001e-4
 
 
-def test_pendulum_by_hand() -> None:
-    """50 kg, 2 cm low, I_x = 1 with 1 of added inertia, free to sway (25 kg of added mass):
-    I_o - (m z)^2 / (m + m_a) = 2 + 0.02 - 1 / 75."""
-    vehicle = block({"K_pdot": -1.0, "Y_vdot": -25.0}, cg=(0.0, 0.0, 0.02))
-    rate = rates(vehicle, state_of(vehicle, attitude_rad=(1e-6, 0.0, 0.0)))
-    expected = -50.0 * GRAVITY * 0.02 * 1e-6 / (2.02 - 1.0 / 75.0)
-    assert rate[K] == pytest.approx(expected, rel=1e-9)
-
-
 @settings(max_examples=20, deadline=None)
 @given(
     speed=st.floats(0.0, 1.0),
@@ -209,16 +199,6 @@ def test_light_and_heavy_bodies_in_water_that_speeds_up() -> None:
         body = block(half, dry_kg=dry_kg)
         relative = rates(body, state_of(body), current=tide)[X]
         assert relative + 0.1 == pytest.approx(0.1 * share, rel=1e-9)
-
-
-def test_water_that_speeds_up_swings_a_low_weight_back() -> None:
-    """0.1 m/s^2 ahead: the centre of gravity, 3 cm low, stays behind, so that the nose goes down.
-
-    M = - m z a; on I_g, as the body is free to surge.
-    """
-    tide = Current(np.array([0.0, 10.0]), np.zeros(1), np.array([[[0.0, 0.0]], [[1.0, 0.0]]]))
-    low = block(cg=(0.0, 0.0, 0.03))
-    assert rates(low, state_of(low), current=tide)[M] == pytest.approx(-50 * 0.03 * 0.1 / 6.0)
 
 
 def test_water_inside_the_nose_is_carried_where_it_is() -> None:

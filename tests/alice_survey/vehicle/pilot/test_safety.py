@@ -21,11 +21,7 @@ TICK_S = 0.05
 
 def calm(altitude_m: float = 2.0, pitch_rad: float = 0.0, depth_m: float = 13.0) -> Array:
     estimate = np.zeros(vector.ESTIMATE)
-    estimate[[vector.ALTITUDE, vector.PITCH, vector.DEPTH]] = (
-        altitude_m,
-        pitch_rad,
-        depth_m,
-    )
+    estimate[[vector.ALTITUDE, vector.PITCH, vector.DEPTH]] = altitude_m, pitch_rad, depth_m
     estimate[vector.CLEARANCE] = altitude_m
     return estimate
 
