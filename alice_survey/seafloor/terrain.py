@@ -257,7 +257,7 @@ def read_terrain(path: Path) -> Terrain:
     record = read_json(path.with_suffix(".json"))
     try:
         if {key: record[key] for key in _FORMAT} != _FORMAT:
-            raise WorkspaceError(f"is no terrain of version {_FORMAT['version']}")
+            raise WorkspaceError(f"is not a terrain of version {_FORMAT['version']}")
         with path.open("rb") as file:
             counts = {}
             while (line := file.readline()).strip() != b"end_header":

@@ -62,7 +62,7 @@ class _Rows:
     accelerations: Array
     """(T, 6) slopes of straight lines over `_SMOOTH_S`."""
     inner: Mask
-    """(T,) rows with so much around them."""
+    """(T,) rows at least half of `_SMOOTH_S` from either end of their window."""
     weights: tuple[Array, ...]
     """By window: the slope of a straight line is the mean of the derivative with these weights."""
     rps: Array

@@ -214,7 +214,7 @@ def test_rays_that_meet_nothing_see_only_water() -> None:
     assert 0.0 < water.max() < floor.min()
 
 
-def test_an_amphora_hides_strobes_from_the_sand_beside_it() -> None:
+def test_an_amphora_hides_strobes_from_the_sand_next_to_it() -> None:
     config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, grid_m=0.02)
     laid = build_terrain(config, (-1.5, 1.5, -1.5, 1.5), FLOOR_M, np.random.default_rng(4))
     bare = Terrain(

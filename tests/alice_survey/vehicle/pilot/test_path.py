@@ -86,7 +86,7 @@ def test_no_leg_is_skipped_however_wild_the_position(seed: int) -> None:
     assert over == (leg == len(seen) - 1 and total >= MOWER.begins_m[-1] + MOWER.length_m[-1])
 
 
-def test_a_line_beside_does_not_take_over() -> None:
+def test_a_neighbouring_line_does_not_take_over() -> None:
     # Standing on the third line while the progress is on the first: only the projection counts.
     leg, along, _ = 1, 2.0, False
     for _ in range(200):

@@ -93,7 +93,7 @@ def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
         assert watched(pilot, calm(), 0.1, time_s=40.0 * k + 35)[0] == safety.NONE
 
 
-def test_echoes_between_gaps_still_tell_of_low_altitude() -> None:
+def test_echoes_between_gaps_still_show_a_low_altitude() -> None:
     pilot, reason = pilot_in(slot.FOLLOW), 0
     for k in range(200):
         altitude = 0.4 if k % 4 == 0 else math.nan
