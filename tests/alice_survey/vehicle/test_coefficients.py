@@ -6,8 +6,7 @@ import pytest
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
-from alice_survey.vehicle.dynamics import add_damping
-from tests.alice_survey.vehicle.motions import alice, block
+from tests.alice_survey.vehicle.motions import alice
 
 
 def named(**values: float) -> Coefficients:
@@ -30,14 +29,6 @@ def test_each_name_lands_in_its_row_and_column() -> None:
             np.testing.assert_array_equal(added.added_mass, -(one + mirrored))
             assert not added.linear.any() and not added.quadratic.any()
     np.testing.assert_array_equal(named(Y_uv=-1, Z_uw=-2, M_uw=-3, N_uv=4).lift, [-1, -2, -3, 4])
-
-
-def test_a_damping_coefficient_pushes_against_its_motion() -> None:
-    """X_u = -3, N_vv = -5 at u = 2, v = -2: X = -6 N, N = -5 (-2) |-2| = +20 N m."""
-    plant = block({"X_u": -3.0, "N_vv": -5.0}).plant
-    force = np.zeros(6)
-    add_damping(plant.body, np.array([2.0, -2.0, 0, 0, 0, 0]), force)
-    np.testing.assert_allclose(force, [-6.0, 0, 0, 0, 0, 20.0])
 
 
 def test_both_names_of_an_added_mass_share_their_mean() -> None:

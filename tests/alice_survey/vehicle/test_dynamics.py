@@ -19,10 +19,21 @@ from alice_survey.vehicle.dynamics import (
     coriolis_matrix,
     initial_state,
 )
-from alice_survey.vehicle.sea import Current
 from alice_survey.vehicle.vehicle import Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.vehicle.motions import (
+    SHEAR_AND_TIDE,
+    K,
+    M,
+    N,
+    P,
+    Q,
+    R,
+    U,
+    V,
+    W,
+    Y,
+    Z,
     advance,
     alice,
     attitudes,
@@ -35,14 +46,6 @@ from tests.alice_survey.vehicle.motions import (
 
 VELOCITIES = arrays(np.float64, 6, elements=st.floats(-3.0, 3.0))
 ATTITUDES = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
-SHEAR_AND_TIDE = Current(
-    np.array([-10.0, 100.0]),
-    np.array([-50.0, 100.0]),
-    np.array([[[0.1, -0.05], [-0.2, 0.15]], [[-0.1, 0.1], [0.25, 0.05]]]),
-)
-U, V, W, P, Q, R = np.eye(6)
-X, Y, Z, K, M, N = range(7, 13)
-"""Places of the accelerations in the rates of a state."""
 
 
 @settings(deadline=None)

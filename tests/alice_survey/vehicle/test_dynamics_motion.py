@@ -16,6 +16,11 @@ from alice_survey.vehicle.sea import Current, constant_current, sheared_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.vehicle.motions import (
+    SHEAR_AND_TIDE,
+    U,
+    V,
+    W,
+    X,
     advance,
     alice,
     attitudes,
@@ -26,9 +31,6 @@ from tests.alice_survey.vehicle.motions import (
     state_of,
 )
 from tests.oracles_propulsion import wrench
-
-U, V, W, P, Q, R = np.eye(6)
-X, Y, Z, K, M, N = range(7, 13)
 
 
 @pytest.mark.parametrize("newtons", [2.0, -6.0])
@@ -241,13 +243,6 @@ def test_sinking_through_shear_a_vehicle_lags_behind_the_current() -> None:
     np.testing.assert_allclose(states[-1, 7:13], lagging * V + sinking * W, atol=1e-6)
 
 
-RICH = Current(
-    np.array([-10.0, 100.0]),
-    np.array([-50.0, 100.0]),
-    np.array([[[0.1, -0.05], [-0.2, 0.15]], [[-0.1, 0.1], [0.25, 0.05]]]),
-)
-
-
 def thrust_of_all_laws(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
     body = vehicle.rigid_body
     displaced_kg = body.buoyancy_kg + body.entrained_kg
@@ -280,7 +275,7 @@ def test_runge_kutta_agrees_with_an_adaptive_method(
     nu, attitude = np.array([0.3, -0.05, 0.04, 0.05, -0.03, 0.1]), (0.1, -0.05, 0.7)
     start = np.array([0.0, 0.0, 5.0, *attitude])
     eta, velocity, speeds = oracle.integrate(
-        vehicle, RICH, start, nu, np.zeros(5), times, commands, loads, thrust
+        vehicle, SHEAR_AND_TIDE, start, nu, np.zeros(5), times, commands, loads, thrust
     )
     assert np.all(np.ptp(velocity, axis=0) > 0.05)
     truth = Rotation.from_matrix([oracle.ned_from_body(row[3:]) for row in eta])
@@ -290,7 +285,9 @@ def test_runge_kutta_agrees_with_an_adaptive_method(
         rows = [state_of(vehicle, nu, attitude)]
         for i, time_s in enumerate(times[:-1]):
             rows.append(
-                advance(vehicle, rows[-1], 4.0, step_s, loads[i], RICH, time_s, commands[i])[-1]
+                advance(
+                    vehicle, rows[-1], 4.0, step_s, loads[i], SHEAR_AND_TIDE, time_s, commands[i]
+                )[-1]
             )
         states = np.array(rows)
         errors = (
@@ -313,7 +310,7 @@ def test_the_step_is_of_fourth_order() -> None:
     commands = np.full(5, 40.0)
 
     def end(step_s: float) -> Array:
-        return advance(vehicle, state, 0.64, step_s, load, RICH, 0.0, commands)[-1]
+        return advance(vehicle, state, 0.64, step_s, load, SHEAR_AND_TIDE, 0.0, commands)[-1]
 
     best = end(0.00125)
     errors = [np.abs(end(step) - best).max() for step in (0.04, 0.02, 0.01)]

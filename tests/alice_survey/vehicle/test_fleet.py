@@ -4,16 +4,9 @@ import pytest
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import fleet
 from alice_survey.vehicle.dynamics import GRAVITY
-from alice_survey.vehicle.propulsion import Thruster
 
 NAMES = ("alice", "sparus2")
 STARBOARD, PORT, VERTICAL, BOW, STERN = range(5)
-
-
-def force(thruster: Thruster, rps: float) -> float:
-    """In water at rest, N."""
-    kt = thruster.kt_forward if rps > 0 else thruster.kt_reverse
-    return fleet.DENSITY * thruster.diameter_m**4 * kt * rps * abs(rps)
 
 
 @pytest.mark.parametrize("coefficients", fleet.SETS)
@@ -44,7 +37,8 @@ def test_it_is_trimmed_level_and_floats_up_slowly(name: str) -> None:
     assert body.cg_body_m[:2] == (0.0, 0.0) and 0.02 <= body.cg_body_m[2] <= 0.04
     net = plant.buoyancy_n - plant.weight_n
     assert net == pytest.approx(0.1 * GRAVITY, rel=1e-9)
-    assert net < 0.05 * force(vehicle.thrusters[VERTICAL], 50.0)
+    heave = vehicle.thrusters[VERTICAL]
+    assert net < 0.05 * fleet.DENSITY * heave.diameter_m**4 * heave.kt_forward * 50.0**2
 
 
 def test_alice_has_two_thrusters_more_than_sparus2() -> None:

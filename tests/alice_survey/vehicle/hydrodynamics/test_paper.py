@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 from alice_survey.base.errors import AliceError
 from alice_survey.cli.main import app
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.hydrodynamics.comparison import CoefficientRow, coefficient_rows
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE
 from alice_survey.vehicle.hydrodynamics.paper_tables import (
     CALIBRATED,
@@ -23,7 +22,11 @@ from alice_survey.vehicle.hydrodynamics.paper_tables import (
     TABLES,
 )
 from alice_survey.vehicle.hydrodynamics.parts import estimate
-from alice_survey.vehicle.hydrodynamics.report import coefficients_report
+from alice_survey.vehicle.hydrodynamics.report import (
+    CoefficientRow,
+    coefficient_rows,
+    coefficients_report,
+)
 
 ROWS = coefficient_rows()
 

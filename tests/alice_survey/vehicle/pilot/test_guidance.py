@@ -180,9 +180,6 @@ def test_the_offset_has_its_closed_form_without_a_current_along() -> None:
     assert los_offset_m(2.0, speed, across) == pytest.approx(expected, rel=1e-12)
     assert los_offset_m(2.0, speed, across, 1e-9) == pytest.approx(expected, rel=1e-6)
     assert los_offset_m(2.0, speed, -across) == pytest.approx(-expected, rel=1e-12)
-    assert los_offset_m(2.0, speed, across, over_ground=False) == pytest.approx(
-        2.0 * math.tan(math.asin(0.5))
-    )
     assert los_offset_m(2.0, speed, 0.0) == 0.0
 
 
