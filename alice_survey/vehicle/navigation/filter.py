@@ -2,9 +2,9 @@
 
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
 error in NED (his global one: truth = exp(error) belief), and measurements as increments of angle
-and velocity, so that prediction is exact but for noise and the course of velocity in a tick. The
-covariance is (25, 25).
-Errors of the instruments that do not average out are states, else it would be too optimistic.
+and velocity, so that prediction is exact but for noise and the course of velocity in a tick.
+Errors of the instruments that do not average out are states, else the covariance, (25, 25), would
+be too optimistic.
 
 Four choices keep the covariance honest over hours:
 - The attitude's error is in NED, where heading is one number, and is not reset (see `correct`): no
