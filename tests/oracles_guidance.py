@@ -215,44 +215,22 @@ def smoothed_floor(heard_m: Array, rate_rad_s: float, dt_s: float) -> Array:
 
 
 def los_offset_m(
-    look_ahead_m: float,
-    speed_mps: float,
-    across_mps: float,
-    along_mps: float = 0.0,
-    *,
-    over_ground: bool = True,
+    look_ahead_m: float, speed_mps: float, across_mps: float, along_mps: float = 0.0
 ) -> float:
     """Where `los` settles next to a straight path in a steady current, metres to starboard.
 
     Steady means no turning and no drag across the hull, since nothing would balance it: the sway
     relative to the water is zero. With t the tangent of the angle from path to heading, the offset
-    is -look_ahead t. The current's part across the hull must be the sway over ground. If surge
-    relative to the water is kept at U, U sin = -across, so that the offset is
-    look_ahead across / sqrt(U^2 - across^2). If surge over ground is kept at U, the speed along the
-    path is U / cos and the sway over ground -U t, whence U t sqrt(1 + t^2) = along t - across;
-    without a current along the path t^2 = (sqrt(1 + 4 (across / U)^2) - 1) / 2.
+    is -look_ahead t. The current's part across the hull must be the sway over ground: with surge
+    over ground kept at U the speed along the path is U / cos and the sway over ground -U t, whence
+    U t sqrt(1 + t^2) = along t - across.
 
     Args:
         look_ahead_m: of the guidance.
         speed_mps: U, the surge that is kept.
         across_mps: current to starboard of the path.
-        along_mps: current along the path.
-        over_ground: what U is relative to.
-
-    Returns:
-        NaN where there is no such state, or more than one: the current across is too strong for a
-        speed relative to the water, or the current along is not below U.
+        along_mps: current along the path, below U.
     """
-    if not over_ground:
-        if abs(across_mps) >= speed_mps:
-            return math.nan
-        return look_ahead_m * across_mps / math.sqrt(speed_mps**2 - across_mps**2)
-    if along_mps >= speed_mps:
-        return math.nan
-    if along_mps == 0.0:
-        ratio = across_mps / speed_mps
-        size = math.sqrt(0.5 * (math.sqrt(1.0 + 4.0 * ratio**2) - 1.0))
-        return look_ahead_m * math.copysign(size, across_mps)
 
     def surplus(t: float) -> float:
         return speed_mps * t * math.sqrt(1.0 + t * t) - along_mps * t + across_mps

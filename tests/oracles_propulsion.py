@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, lsq_linear
+from scipy.optimize import lsq_linear
 
 from alice_survey.vehicle.propulsion import Thruster
 
@@ -78,18 +78,6 @@ def wrench(
         volume = displaced_kg / density
         total[0] -= 0.5 * density * volume ** (2 / 3) * coefficient * nu[0] * abs(nu[0])
     return total
-
-
-def speed_for(thruster: Thruster, density: float, thrust_n: float, nu: Array) -> float:
-    """The speed, turning the way it pushes, that gives a thrust; by bisection."""
-    if thrust_n == 0:
-        return 0.0
-    way = math.copysign(1, thrust_n)
-
-    def miss(size: float) -> float:
-        return way * (net_thrust_n(thruster, density, way * size, nu) - thrust_n)
-
-    return way * float(brentq(miss, 1e-12, 1e4, xtol=1e-13, rtol=1e-15))
 
 
 def least_miss(matrix: Array, wanted: Array, lower: Array, upper: Array, axes: Array) -> Array:

@@ -293,7 +293,7 @@ def _moments(
 def _to_world(
     origins: Array, directions: Array, moments: Array, rotations: Array, places: Array
 ) -> Floats:
-    """Rays as Open3D wants them, (N, 6) float32, about the origin that `places` count from."""
+    """Rays in Open3D's layout, (N, 6) float32, about the origin that `places` count from."""
     world = np.empty((len(origins), 6), np.float32)
     for i in range(len(origins)):
         rotation, place = rotations[moments[i]], places[moments[i]]

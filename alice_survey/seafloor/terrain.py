@@ -5,7 +5,7 @@ the millimetre), and so they are written: what is read is what was written, to t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -160,9 +160,7 @@ class Terrain:
         Args:
             window_ne_m: least and greatest north, least and greatest east; everything when None.
         """
-        if window_ne_m is None:
-            return self._whole
-        return self._cut(window_ne_m)
+        return self._whole if window_ne_m is None else self._cut(window_ne_m)
 
     @cached_property
     def _whole(self) -> Patch:
@@ -259,7 +257,7 @@ def read_terrain(path: Path) -> Terrain:
     record = read_json(path.with_suffix(".json"))
     try:
         if {key: record[key] for key in _FORMAT} != _FORMAT:
-            raise WorkspaceError(f"is no terrain of version {_FORMAT['version']}")
+            raise WorkspaceError(f"is not a terrain of version {_FORMAT['version']}")
         with path.open("rb") as file:
             counts = {}
             while (line := file.readline()).strip() != b"end_header":
@@ -348,8 +346,7 @@ def build_terrain(
     )
     if not config.amphora:
         return terrain
-    objects = (_lay_amphora(terrain, place_ne, object_rng),)
-    return Terrain(**{**_fields(terrain), "objects": objects})
+    return replace(terrain, objects=(_lay_amphora(terrain, place_ne, object_rng),))
 
 
 @progress.step("make the sea floor")
@@ -385,11 +382,6 @@ def terrain_bounds(
     corners = np.asarray(corners_ne_m, dtype=np.float64).reshape(-1, 2)
     low, high = corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
-
-
-def _fields(terrain: Terrain) -> dict[str, Any]:
-    names = ("offset_ned", "grid_m", "corner_ne", "depths", "material")
-    return {name: getattr(terrain, name) for name in names}
 
 
 def _lay_amphora(terrain: Terrain, place_ne: Array, rng: np.random.Generator) -> TerrainObject:

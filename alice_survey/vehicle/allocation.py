@@ -83,6 +83,9 @@ def preference_weights(propulsion: Propulsion, u: float, weights: Array) -> None
         weights[i] = math.exp(min(t[i, DISTRUST] * u * u, _MOST_EXPONENT))
 
 
+_X, _B, _LOW, _HIGH, _STEP, _SCALE, _REST, _PRICE, _Y = range(9)
+"""Vectors of the exact solver in the scratch, whose first matrix is a: x is brought to the least
+|a x - b| between low and high by steps; then what is left of b, prices, intermediate results."""
 _FREE, _HELD, _FIXED = 0, 1, 2
 """Between its bounds; at one of them for now; at one for good."""
 _RANK = 1e-11
@@ -119,9 +122,10 @@ def allocate_exact(
         `thrust` within the bounds but perhaps not the best.
     """
     n, m = matrix.shape[1], 0
-    a, x, b = scratch.matrices[0], scratch.vectors[0], scratch.vectors[1]
-    low, high, step = scratch.vectors[2], scratch.vectors[3], scratch.vectors[4]
-    scale, state = scratch.vectors[5], scratch.states
+    a, state, scale = scratch.matrices[0], scratch.states, scratch.vectors[_SCALE]
+    x, b, low, high = (
+        scratch.vectors[_X], scratch.vectors[_B], scratch.vectors[_LOW], scratch.vectors[_HIGH],
+    )  # fmt: skip
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(weights[i])
         low[i], high[i] = lower[i] / scale[i], upper[i] / scale[i]
@@ -134,34 +138,24 @@ def allocate_exact(
                 a[m, i] = axes[axis] * matrix[axis, i] * scale[i]
             m += 1
     limit = 10 * n + 10
-    solved = _least_miss(a, m, n, b, x, low, high, step, state, scratch, limit)
+    solved = _least_miss(m, n, scratch, limit)
     if solved > 1:
-        solved = _least_norm(a, m, n, b, x, low, high, step, state, scratch, solved, limit)
+        solved = _least_norm(m, n, scratch, solved, limit)
     for i in range(n):
         thrust[i] = min(max(x[i] * scale[i], lower[i]), upper[i])
     return solved
 
 
 @kernel
-def _least_miss(
-    a: Array,
-    m: int,
-    n: int,
-    b: Array,
-    x: Array,
-    low: Array,
-    high: Array,
-    step: Array,
-    state: NDArray[np.int64],
-    scratch: AllocationScratch,
-    limit: int,
-) -> int:
-    """Bring x, (n,), to a least |a x - b| within the bounds; return the number of problems.
+def _least_miss(m: int, n: int, scratch: AllocationScratch, limit: int) -> int:
+    """Bring x, (n,), to a least |a x - b| within the bounds; return the number of problems solved.
 
     It is 1 if x is of least norm too, as when no bound is in the way. Afterwards thrusters are
     fixed whose bound is in the way of a smaller miss, and the others are free.
     """
-    rest, gradient = scratch.vectors[6], scratch.vectors[7]
+    a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
+    x, b, low, high, step = v[_X], v[_B], v[_LOW], v[_HIGH], v[_STEP]
+    rest, gradient = v[_REST], v[_PRICE]
     for solved in range(1, limit + 1):
         for k in range(m):
             rest[k] = b[k]
@@ -169,7 +163,7 @@ def _least_miss(
                 # The first step is from nothing, so that it ends at the least norm.
                 if solved > 1 or state[i] == _FIXED:
                     rest[k] -= a[k, i] * x[i]
-        _pseudo_solve(a, m, n, rest, step, state, scratch)
+        _pseudo_solve(m, n, rest, step, scratch)
         if solved == 1:
             inside = True
             for i in range(n):
@@ -182,7 +176,7 @@ def _least_miss(
             if inside:
                 return 1
             continue
-        if _advance(n, x, step, low, high, state):
+        if _advance(n, scratch):
             continue
         # The free ones are done: let go the one whose bound is most in the way.
         size = 0.0
@@ -217,39 +211,27 @@ def _least_miss(
 
 
 @kernel
-def _least_norm(
-    a: Array,
-    m: int,
-    n: int,
-    b: Array,
-    x: Array,
-    low: Array,
-    high: Array,
-    step: Array,
-    state: NDArray[np.int64],
-    scratch: AllocationScratch,
-    solved: int,
-    limit: int,
-) -> int:
+def _least_norm(m: int, n: int, scratch: AllocationScratch, solved: int, limit: int) -> int:
     """Bring x, (n,), to the least |x| with the same a x within the bounds.
 
     Returns:
         Number of problems solved, with those before; negative if they were too many.
     """
-    made, price = scratch.vectors[6], scratch.vectors[7]
+    a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
+    x, low, step, made, price = v[_X], v[_LOW], v[_STEP], v[_REST], v[_PRICE]
     for total in range(solved + 1, solved + limit + 1):
         for k in range(m):
             made[k] = 0.0
             for i in range(n):
                 if state[i] == _FREE:
                     made[k] += a[k, i] * x[i]
-        rank = _pseudo_solve(a, m, n, made, step, state, scratch)
+        rank = _pseudo_solve(m, n, made, step, scratch)
         free = 0
         for i in range(n):
             if state[i] == _FREE:
                 step[i] -= x[i]
                 free += 1
-        if rank < free and _advance(n, x, step, low, high, state):
+        if rank < free and _advance(n, scratch):
             continue
         # At the least norm x = a^T y on the free ones; a held one is let go if it would shrink.
         _price(m, n, rank, x, price, scratch)
@@ -270,10 +252,10 @@ def _least_norm(
 
 
 @kernel
-def _advance(
-    n: int, x: Array, step: Array, low: Array, high: Array, state: NDArray[np.int64]
-) -> bool:
+def _advance(n: int, scratch: AllocationScratch) -> bool:
     """Take a step of the free ones as far as the bounds allow; return whether one limited it."""
+    state, v = scratch.states, scratch.vectors
+    x, low, high, step = v[_X], v[_LOW], v[_HIGH], v[_STEP]
     share, blocking = 1.0, -1
     for i in range(n):
         if state[i] != _FREE:
@@ -297,18 +279,17 @@ def _advance(
 
 
 @kernel
-def _factor(a: Array, m: int, n: int, state: NDArray[np.int64], scratch: AllocationScratch) -> int:
+def _factor(m: int, n: int, scratch: AllocationScratch) -> int:
     """Factor the free columns, a = Q^T L V, by Gram and Schmidt; the rank.
 
     Q (rank, m) spans the columns, V (rank, n) the rows, both of orthonormal rows; L is lower
     triangular. They are left in the scratch.
     """
-    q, v, el, work = (
-        scratch.matrices[1],
-        scratch.matrices[2],
-        scratch.matrices[3],
+    a, q, v, el, work = (
+        scratch.matrices[0], scratch.matrices[1], scratch.matrices[2], scratch.matrices[3],
         scratch.matrices[4],
-    )
+    )  # fmt: skip
+    state = scratch.states
     for i in range(n):
         if state[i] == _FREE:
             for k in range(m):
@@ -361,18 +342,10 @@ def _factor(a: Array, m: int, n: int, state: NDArray[np.int64], scratch: Allocat
 
 
 @kernel
-def _pseudo_solve(
-    a: Array,
-    m: int,
-    n: int,
-    right: Array,
-    out: Array,
-    state: NDArray[np.int64],
-    scratch: AllocationScratch,
-) -> int:
+def _pseudo_solve(m: int, n: int, right: Array, out: Array, scratch: AllocationScratch) -> int:
     """Write the least-norm least-squares solution of the free columns, 0 elsewhere; the rank."""
-    rank = _factor(a, m, n, state, scratch)
-    q, v, el, y = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3], scratch.vectors[8]
+    rank = _factor(m, n, scratch)
+    q, v, el, y = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3], scratch.vectors[_Y]
     for i in range(n):
         out[i] = 0.0
     for r in range(rank):
@@ -390,7 +363,7 @@ def _pseudo_solve(
 @kernel
 def _price(m: int, n: int, rank: int, x: Array, out: Array, scratch: AllocationScratch) -> None:
     """Write the least y, (m,), with a^T y = x on the free columns, as they were factored last."""
-    q, v, el, y = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3], scratch.vectors[8]
+    q, v, el, y = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3], scratch.vectors[_Y]
     for r in range(rank):
         y[r] = 0.0
         for i in range(n):

@@ -163,7 +163,7 @@ def validated(path: Path, kind: type[_Kind], table: object) -> _Kind:
         return TypeAdapter(kind).validate_python(table)
     except ValidationError as error:
         faults = [
-            f"{shown('.'.join(str(part) for part in fault['loc']))}: {fault['msg']}"
+            f"{shown('.'.join(map(str, fault['loc']))) or 'the table'}: {fault['msg']}"
             for fault in error.errors()[:_MOST_FAULTS]
         ]
         raise VehicleError(f"{path}: {'; '.join(faults)}") from None

@@ -9,7 +9,7 @@ import difflib
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -81,18 +81,6 @@ class VehicleLog:
     def attitude_rad(self) -> Array:
         """(T, 3) roll, pitch, heading in (-pi, pi]; NaN rows where it was not measured."""
         return attitude_of(self.quaternion_xyzw)
-
-    def rows(self, part: slice) -> "VehicleLog":
-        """A stretch of the log."""
-        return replace(
-            self, time_s=self.time_s[part], position_ned=self.position_ned[part],
-            quaternion_xyzw=self.quaternion_xyzw[part], velocity_body=self.velocity_body[part],
-            rates_body=self.rates_body[part], altitude_m=self.altitude_m[part],
-            rpm={name: value[part] for name, value in self.rpm.items()},
-            thrust_n={name: value[part] for name, value in self.thrust_n.items()},
-            wrench=self.wrench[part],
-            others={name: value[part] for name, value in self.others.items()},
-        )  # fmt: skip
 
 
 def vehicle_log(
@@ -328,12 +316,21 @@ def _quaternions(columns: Mapping[str, Array], source: str) -> Array:
     if given[0] is ANGLES:
         quaternions[known] = rotation_from_attitude(*np.deg2rad(values[known].T)).as_quat()
         return quaternions
-    length = np.linalg.norm(values, axis=1)
-    wrong = np.flatnonzero(known & (np.abs(length - 1) > _UNIT))
+    quaternions[known] = (values / unit_lengths(values, source)[:, None])[known]
+    return quaternions
+
+
+def unit_lengths(quaternions: Array, source: str) -> Array:
+    """Lengths, (T,), of quaternions (T, 4), 1 but for rounding; NaN where one is not known.
+
+    Raises:
+        VehicleError: a length is farther from 1 than rounding.
+    """
+    length: Array = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1) > _UNIT)
     if len(wrong):
         raise VehicleError(
             f"{source} row {wrong[0] + 1}: the quaternion has the length {length[wrong[0]]:.4g}, "
             "not 1"
         )
-    quaternions[known] = values[known] / length[known, None]
-    return quaternions
+    return length

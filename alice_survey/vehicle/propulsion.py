@@ -208,7 +208,7 @@ def pack(thrusters: Sequence[Thruster], density: float, displaced_kg: float) -> 
 
 
 def weakened(propulsion: Propulsion, health: Array) -> Propulsion:
-    """The same thrusters with less speed left in each.
+    """The same thrusters at reduced greatest speeds.
 
     Args:
         propulsion: n thrusters.

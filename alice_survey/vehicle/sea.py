@@ -112,7 +112,7 @@ def checked_current(current: Current) -> Current:
             f"ask for {shape}"
         )
     if not np.all(np.isfinite(current.velocity_ne_mps)):
-        raise VehicleError("a current holds a value that is no finite number")
+        raise VehicleError("a current holds a value that is not a finite number")
     return current
 
 

@@ -245,59 +245,34 @@ class Geometry:
         return moment / self.envelope_volume_m3
 
 
-@dataclass(frozen=True, kw_only=True)
-class ThrusterSize:
-    """Space that a lateral thruster takes inside the hull."""
-
-    diameter_m: float
-    """Diameter across its nozzle."""
-    length_m: float
-    """Length along its axis, with the motor."""
-    shell_m: float
-    """Thickness of the hull around it."""
+T200_DIAMETER_M, T200_LENGTH_M, SHELL_M = 0.100, 0.113, 0.003
+"""Space that a Blue Robotics T200 takes inside the hull: across its nozzle, and along its axis with
+the motor (inferred: outer sizes rounded); thickness of the hull around it (model)."""
 
 
-T200_SIZE = ThrusterSize(diameter_m=0.100, length_m=0.113, shell_m=0.003)
-"""Blue Robotics T200 with its nozzle (inferred: outer sizes rounded); shell 3 mm (model)."""
-
-
-def farthest_tunnel_x(
-    outline: Outline, thruster: ThrusterSize, end: Literal["bow", "stern"]
-) -> float:
+def farthest_tunnel_x(outline: Outline, end: Literal["bow", "stern"]) -> float:
     """Farthest x at which a hull still holds a lateral thruster.
 
     The rule: the thruster, a cylinder lying athwartships at z = 0, stays inside the outline minus
     the shell: r(x + R cos a) - shell >= hypot(L / 2, R sin a) all around its rims.
 
     Args:
-        outline: outline of the hull.
-        thruster: the thruster that must fit.
+        outline: outline of the hull, wide enough for the thruster where it is widest.
         end: end of the hull.
 
     Returns:
         x of the thruster's axis, metres.
-
-    Raises:
-        VehicleError: it fits nowhere.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
-    radius = thruster.diameter_m / 2.0
-    needed = np.hypot(thruster.length_m / 2.0, radius * np.sin(angle)) + thruster.shell_m
-
-    def fits(x_m: float) -> bool:
-        return bool(np.all(outline.radius_at(x_m + radius * np.cos(angle)) >= needed))
-
+    radius = T200_DIAMETER_M / 2.0
+    needed = np.hypot(T200_LENGTH_M / 2.0, radius * np.sin(angle)) + SHELL_M
     radii = np.array(outline.radius_m)
     inside = float(np.mean(np.array(outline.x_m)[radii == radii.max()]))
-    if not fits(inside):
-        raise VehicleError(
-            f"a thruster {thruster.diameter_m:g} m across and {thruster.length_m:g} m long does "
-            f"not fit a hull {outline.diameter_m:g} m thick: take a smaller one"
-        )
     outside = outline.nose_x_m if end == "bow" else outline.tail_x_m
     for _ in range(60):
         middle = (inside + outside) / 2.0
-        inside, outside = (middle, outside) if fits(middle) else (inside, middle)
+        fits = bool(np.all(outline.radius_at(middle + radius * np.cos(angle)) >= needed))
+        inside, outside = (middle, outside) if fits else (inside, middle)
     return inside
 
 
@@ -343,6 +318,7 @@ rebuilt (a nose with camera and thruster, "completely redesigned" tail), so that
 ends is SPARUS II's stretched with the whole. With the ends of SPARUS II unstretched on a longer
 cylinder Y_vv of the hull would be 1.4 % above the paper's, as it is 0.2 %."""
 
+_ENDS: tuple[Literal["bow", "stern"], ...] = ("bow", "stern")
 _MOVED_M = -0.472 - SPARUS2.mast.x_m
 """Inferred. N_pdot / K_vdot = -0.102 / 0.216 puts the mast at x = -0.472; its neighbours on the
 tail section, the pods, are taken to have moved with it."""
@@ -360,17 +336,14 @@ ALICE = Geometry(
     # "At the farthest possible distance" (paper, section III.A); T200 propellers of 0.076 m.
     tunnels=(
         *SPARUS2.tunnels,
-        Tunnel(
-            name="bow",
-            x_m=round(farthest_tunnel_x(_ALICE_HULL, T200_SIZE, "bow"), 3),
-            axis="y",
-            diameter_m=0.076,
-        ),
-        Tunnel(
-            name="stern",
-            x_m=round(farthest_tunnel_x(_ALICE_HULL, T200_SIZE, "stern"), 3),
-            axis="y",
-            diameter_m=0.076,
+        *(
+            Tunnel(
+                name=end,
+                x_m=round(farthest_tunnel_x(_ALICE_HULL, end), 3),
+                axis="y",
+                diameter_m=0.076,
+            )
+            for end in _ENDS
         ),
     ),
 )

@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 
-from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import FORCES, MOTIONS, Coefficients
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
@@ -35,11 +34,6 @@ class Flow:
     """Sea water of 35 psu at 20 C (ITTC 1963)."""
     speed_mps: float = 0.25
     """The axial speed of the paper's lift computations; its X_uu of the hull follows from it."""
-
-    def __post_init__(self) -> None:
-        for name in ("density_kg_m3", "viscosity_m2_s", "speed_mps"):
-            if not getattr(self, name) > 0:
-                raise VehicleError(f"{name} = {getattr(self, name)}: it must be positive")
 
     def reynolds(self, length_m: float) -> float:
         """U l / nu."""

@@ -13,7 +13,13 @@ from alice_survey.base.contents import shown
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.vehicle.files import read_table, validated
-from alice_survey.vehicle.log import TIME, VehicleLog, log_of_columns, read_number_columns
+from alice_survey.vehicle.log import (
+    TIME,
+    VehicleLog,
+    log_of_columns,
+    read_number_columns,
+    unit_lengths,
+)
 
 Three = tuple[str, str, str]
 _FLU = np.array([1.0, -1.0, -1.0])
@@ -123,14 +129,7 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
 
 def _turned(quaternions: Array, columns: ColumnMap, path: Path) -> Array:
     """Quaternions of ned_from_frd, (T, 4); NaN stays."""
-    known = np.all(np.isfinite(quaternions), axis=1)
-    length = np.linalg.norm(quaternions, axis=1)
-    wrong = np.flatnonzero(known & (np.abs(length - 1.0) > 0.05))
-    if len(wrong):
-        row = wrong[0]
-        raise VehicleError(
-            f"{path} row {row + 1}: the quaternion has the length {length[row]:.4g}, not 1"
-        )
+    known = np.isfinite(unit_lengths(quaternions, str(path)))
     turned = np.full(quaternions.shape, np.nan)
     if known.any():
         rotation = Rotation.from_quat(quaternions[known])

@@ -56,7 +56,7 @@ smaller: a parameter that does less is not seen at all."""
 _NOTICED = 2e-3
 """Change of the sum of squares, in sigmas squared, that ends a fit: a twentieth of a sigma of one
 parameter."""
-_HANG = 3.0
+_CORRELATED = 3.0
 """Residuals count as correlated over this many correlation times, at most half a window."""
 _MOST_EVALUATIONS = 60
 """Most evaluations of all windows, in each round."""
@@ -102,7 +102,6 @@ class OutputErrorFit:
     starts: Sequence[Array]
     """(10,) state each window begins with, nu relative to the water."""
     samples: int
-    evaluations: int
 
     @property
     def sigma(self) -> Array:
@@ -146,7 +145,7 @@ def fit_output_error(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
         bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
     )  # fmt: skip
-    values, evaluations = result.x, int(result.nfev)
+    values = result.x
     approach.estimate_sigma(values)
     problem = _FitProblem(windows, parameters, how, approach.sigma)
     rounds = (1e2,) * _ROUNDS + (1.0,)
@@ -160,7 +159,6 @@ def fit_output_error(
             bounds=(lower, upper), x_scale="jac", ftol=looseness * _NOTICED / problem.samples,
             xtol=1e-10, gtol=None, max_nfev=_MOST_EVALUATIONS,
         )  # fmt: skip
-        evaluations += result.nfev
         if result.status == 0:
             raise VehicleError(
                 f"the fit has not settled after {_MOST_EVALUATIONS} evaluations: free fewer "
@@ -171,7 +169,7 @@ def fit_output_error(
             settled = problem.estimate_sigma(values) < _SAME
     held = result.active_mask
     values = np.where(held < 0, lower, np.where(held > 0, upper, values))
-    return problem.result(values, held != 0, evaluations)
+    return problem.result(values, held != 0)
 
 
 class _FitProblem:
@@ -251,7 +249,7 @@ class _FitProblem:
         self.sigma = new
         return changed
 
-    def result(self, values: Array, at_bound: Mask, evaluations: int) -> OutputErrorFit:
+    def result(self, values: Array, at_bound: Mask) -> OutputErrorFit:
         """The fit at the values it settled on."""
         residuals, table = self.residuals(values), self.jacobian(values)
         free = np.flatnonzero(~at_bound)
@@ -267,9 +265,9 @@ class _FitProblem:
         longest_s = float(np.nanmax(times))
         if longest_s > 0:
             scores = self._scores(residuals[:, None] * table[:, free])
-            lasting_s = min(_HANG * longest_s, 0.5 * self._window_s())
-            blocks = max(self._row_s() * sum(len(run) for run in scores) / lasting_s, 2.0)
-            meat = score_information(scores, round(lasting_s / self._row_s()))
+            correlated_s = min(_CORRELATED * longest_s, 0.5 * self._window_s())
+            blocks = max(self._row_s() * sum(len(run) for run in scores) / correlated_s, 2.0)
+            meat = score_information(scores, round(correlated_s / self._row_s()))
             # Few stretches that have nothing to do with one another show their own spread badly.
             meat *= spread * blocks / (blocks - 1.0)
             coloured = inverse @ (meat + self._prior(table[:, free])) @ inverse
@@ -283,7 +281,7 @@ class _FitProblem:
             parameters=self.parameters, values=values, covariance=covariance,
             white_covariance=white, at_bound=at_bound, channel_sigma=sigma * self.sigma,
             correlation_s=times, windows=self.windows, starts=list(self.starts),
-            samples=self.samples, evaluations=evaluations,
+            samples=self.samples,
         )  # fmt: skip
 
     def _solve(self, values: Array) -> list[tuple[Array, Array, Array]] | None:

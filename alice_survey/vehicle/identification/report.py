@@ -2,15 +2,17 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
+from alice_survey.vehicle import fleet
 from alice_survey.vehicle.files import (
     coefficients_from_file,
     speeds_missing,
@@ -44,14 +46,15 @@ from alice_survey.vehicle.identification.windows import (
     make_windows,
     of_windows,
 )
-from alice_survey.vehicle.log import VehicleLog, read_vehicle_log
+from alice_survey.vehicle.log import read_vehicle_log
 from alice_survey.vehicle.vehicle import Vehicle
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
 TWO_STEP_FREE = ("X_udot", "X_uu", "Z_wdot", "Z_ww", "N_rdot", "N_rr")
 """Parameters free by default; the second as in the paper's three manoeuvres."""
+_VALIDATION_WINDOW_S = 10.0
 _HIGH_CORRELATION = 0.9
-_LASTING = 0.2
+_LONG_CORRELATION = 0.2
 """Correlation time, by the length of windows, from which their sigmas are not to be trusted."""
 _POOR = 0.25
 """Relative sigma of a coefficient that the logs hardly determine."""
@@ -78,7 +81,6 @@ class IdentifyOptions:
     """Rates that follow the log."""
     window_s: float | None = None
     """Longest stretch simulated in one go; as long as there are no gaps if not given."""
-    validation_window_s: float | None = 10.0
     hold_input: bool = False
 
 
@@ -125,14 +127,24 @@ def identify_report(
     result = _identify(windows, parameters, how, options.method)
     validation, drift = None, None
     if options.validate is not None:
-        shorter = _windows(options.validate, vehicle, options, options.validation_window_s)
+        shorter = _windows(options.validate, vehicle, options, _VALIDATION_WINDOW_S)
         of_windows([*windows, *shorter], vehicle)
         values, drift = _with_its_current(shorter, result, how)
         validation = validate(shorter, parameters, values, simulation=how)
     own = validate(windows, parameters, result.values, simulation=how, horizons_s=())
     text = _text(vehicle, logs, result, thrust, own, validation, drift, options)
     data = _data(vehicle, logs, result, thrust, own, validation)
-    _write(out, vehicle, result, text, data, own, validation)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        identified = parameters.coefficients(result.values, "identified")
+        write_coefficients(out / "coefficients.json", identified, data)
+        (out / "report.txt").write_text(text + "\n", encoding="utf-8")
+        draw_motion(out / "fit.png", f"{vehicle.name}: the logs it was identified from", own)
+        if validation is not None:
+            title = f"{vehicle.name}: predicted, {Path(validation.source).name}"
+            draw_motion(out / "validation.png", title, validation)
+    except OSError as error:
+        raise VehicleError(f"{out}: cannot be written: {error.strerror}") from None
     return f"{text}\n\nwritten to {out}", data
 
 
@@ -143,11 +155,9 @@ def _start(options: IdentifyOptions) -> Vehicle:
     path = Path(options.coefficients)
     if path.suffix:
         return known.with_coefficients(coefficients_from_file(path))
-    from alice_survey.vehicle.fleet import vehicle
-
     if Path(options.vehicle).suffix:
         raise VehicleError(f"{options.vehicle} has its own coefficients: name a file of others")
-    return vehicle(options.vehicle, options.coefficients)
+    return fleet.vehicle(options.vehicle, options.coefficients)
 
 
 def _held(pairs: Sequence[str]) -> dict[str, float]:
@@ -164,7 +174,6 @@ def _held(pairs: Sequence[str]) -> dict[str, float]:
 def _windows(
     path: Path, vehicle: Vehicle, options: IdentifyOptions, window_s: float | None = None
 ) -> list[Window]:
-    log: VehicleLog
     if options.columns is not None:
         log = read_foreign_log(path, read_column_map(options.columns))
     else:
@@ -313,13 +322,13 @@ def _remarks(result: _Identified) -> list[str]:
     longest = float(np.nanmax(fit.correlation_s))
     if ratio > 1.2:
         lines.append(
-            f"Residuals hang together (up to {longest:.2g} s): the model misses something or the "
+            f"Residuals are correlated (over {longest:.2g} s): the model misses something or the "
             f"vehicle was pushed unseen. Sigmas allow for it (up to {ratio:.2g} times those of "
             "white noise), but not for what a wrong model shifts."
         )
-    if longest > _LASTING * float(np.median(spans)):
+    if longest > _LONG_CORRELATION * float(np.median(spans)):
         lines.append(
-            f"They hang together over much of the {np.median(spans):.3g} s that are simulated in "
+            f"They are correlated over much of the {np.median(spans):.3g} s that are simulated in "
             "one go: sigmas are too small; simulate shorter stretches (--window)"
         )
     return lines
@@ -431,16 +440,7 @@ def _data(
             result.parameters.names, result.values, result.sigma
         ),
         "thrust": [
-            {
-                "thrusters": list(one.thrusters),
-                "way": one.way,
-                "model": one.model,
-                "identified": one.identified,
-                "sigma": known(one.sigma),
-                "factor": one.factor,
-                "readings": one.readings,
-            }
-            for one in thrust
+            {**asdict(one), "sigma": known(one.sigma), "factor": one.factor} for one in thrust
         ],
         "same_logs": fits(own),
     }
@@ -458,25 +458,83 @@ def _data(
     return data
 
 
-def _write(
-    out: Path,
-    vehicle: Vehicle,
-    result: _Identified,
-    text: str,
-    data: dict[str, Any],
-    own: MotionValidation,
-    validation: MotionValidation | None,
-) -> None:
-    from alice_survey.vehicle.identification.plots import draw_motion
+Places = NDArray[np.intp]
+_MEASURED, _MODEL, _CONSTANT = "#95a5a6", "#1b4f72", "#ca6f1e"
+_NAMES = ("u, m/s", "v, m/s", "w, m/s", "p, deg/s", "q, deg/s", "r, deg/s")
+_DRAWN = 8000
+"""Most points of a curve."""
+_LEAST = 0.02
+"""Least height of a strip, m/s; in degrees per second, 100 times that."""
 
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        identified: Coefficients = result.parameters.coefficients(result.values, "identified")
-        write_coefficients(out / "coefficients.json", identified, data)
-        (out / "report.txt").write_text(text + "\n", encoding="utf-8")
-        draw_motion(out / "fit.png", f"{vehicle.name}: the logs it was identified from", own)
-        if validation is not None:
-            title = f"{vehicle.name}: predicted, {Path(validation.source).name}"
-            draw_motion(out / "validation.png", title, validation)
-    except OSError as error:
-        raise VehicleError(f"{out}: cannot be written: {error.strerror}") from None
+
+@figure_style()
+def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
+    """Draw measured and simulated velocities and rates over time, with the fit of each.
+
+    Args:
+        path: PNG, PDF or SVG.
+        title: title of the plot.
+        found: what to draw.
+    """
+    figure = new_figure(8.5, 13)
+    axes = figure.subplots(3, 2, sharex=True)
+    units = np.array([1.0] * 3 + [180.0 / np.pi] * 3)
+    fits, constant_fits = found.fit_percent, found.constant_fit_percent
+    time_s, gaps = _with_gaps(found.time_s)
+    for k in range(6):
+        strip = axes[k % 3, k // 3]
+        measured, model, constant = (
+            _series(table[:, k] * units[k], gaps)
+            for table in (found.measured, found.simulated, found.constant)
+        )
+        some = slice(None, None, max(len(time_s) // _DRAWN, 1))
+        if np.isfinite(fits[k]):
+            strip.plot(time_s[some], constant[some], color=_CONSTANT, lw=0.8, alpha=0.8)
+        strip.plot(time_s[some], measured[some], ".", color=_MEASURED, ms=2.5)
+        strip.plot(time_s[some], model[some], color=_MODEL, lw=1.1)
+        strip.set_ylabel(_NAMES[k])
+        fit = "follows the log"
+        if np.isfinite(fits[k]):
+            fit = f"fit: model {fits[k]:.0f} %, constant {constant_fits[k]:.0f} %"
+        strip.set_title(fit, fontsize=9)
+        _limit(strip, np.concatenate([measured, model]), _LEAST if k < 3 else 100 * _LEAST)
+    for strip in axes[2]:
+        strip.set_xlabel("time, s")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, weight="bold")
+    handles = [
+        figure.axes[0].plot([], [], ".", color=_MEASURED, label="measured")[0],
+        figure.axes[0].plot([], [], color=_MODEL, label="model")[0],
+        figure.axes[0].plot([], [], color=_CONSTANT, label="constant velocity")[0],
+    ]
+    figure.legend(handles=handles, loc="outside upper right", ncol=3, fontsize=9)
+    save_figure(figure, path, dpi=110)
+
+
+def _with_gaps(time_s: Array) -> tuple[Array, Places]:
+    """Times with one more where curves should break, and the places of those.
+
+    Logs follow one another, each from where the last ended.
+    """
+    steps = np.diff(time_s)
+    time_s = time_s.copy()
+    for place in np.flatnonzero(steps <= 0) + 1:
+        time_s[place:] += time_s[place - 1] - time_s[place]
+    usual = np.median(steps) if len(steps) else 1.0
+    gaps = np.flatnonzero((steps > 10 * usual) | (steps <= 0)) + 1
+    longer: Array = np.insert(time_s, gaps, time_s[gaps])
+    return longer, gaps
+
+
+def _series(values: Array, gaps: Places) -> Array:
+    broken: Array = np.insert(values, gaps, np.nan)
+    return broken
+
+
+def _limit(strip: Axes, values: Array, least: float) -> None:
+    """Limits that include nearly all values: diverging ones leave the strip."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return
+    low, high = np.percentile(known, [0.2, 99.8])
+    middle, half = 0.5 * (low + high), max(0.6 * (high - low), least)
+    strip.set_ylim(middle - half, middle + half)

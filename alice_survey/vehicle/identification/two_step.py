@@ -62,13 +62,13 @@ class _Rows:
     accelerations: Array
     """(T, 6) slopes of straight lines over `_SMOOTH_S`."""
     inner: Mask
-    """(T,) rows with so much around them."""
+    """(T,) rows at least half of `_SMOOTH_S` from either end of their window."""
     weights: tuple[Array, ...]
     """By window: the slope of a straight line is the mean of the derivative with these weights."""
     rps: Array
     wrench: Array
     runs: tuple[int, ...]
-    """Rows of each window."""
+    """Number of rows of each window."""
 
 
 @named_step("fit in two steps")
@@ -190,8 +190,7 @@ def _forces(physics: Physics, states: Array, rps: Array, wrench: Array, out: Arr
 def _smoothed(windows: Sequence[Window], parameters: Parameters) -> _Rows:
     """Motion relative to the water and its rates, by sliding straight lines."""
     physics = parameters.physics(parameters.start)
-    states, accelerations, rps, wrench, runs = [], [], [], [], []
-    inner, weights = [], []
+    pieces = []
     for window in windows:
         time_s = window.record.time_s
         step = float(np.median(np.diff(time_s)))
@@ -222,23 +221,19 @@ def _smoothed(windows: Sequence[Window], parameters: Parameters) -> _Rows:
             else np.zeros((len(even), 0))
             for table in (window.record.rps, window.record.wrench)
         ]
-        states.append(state)
-        accelerations.append(rates)
         away = np.arange(length) - length // 2
         # Summed by parts, the slope sum(t u) / sum(t^2) weighs the derivative by a parabola.
         parabola = (length // 2 + 1.0) ** 2 - away**2
-        weights.append(parabola / parabola.sum())
         place = np.arange(len(even))
-        inner.append((place >= length // 2) & (place < len(even) - length // 2))
-        rps.append(inputs[0])
-        wrench.append(inputs[1])
-        runs.append(len(even))
-    if not states:
+        inner = (place >= length // 2) & (place < len(even) - length // 2)
+        pieces.append((state, rates, *inputs, inner, parabola / parabola.sum()))
+    if not pieces:
         raise VehicleError(f"no stretch of the logs is {_SMOOTH_S:g} s long")
+    *tables, weights = zip(*pieces, strict=True)
+    states, accelerations, rps, wrench, inside = (np.concatenate(table) for table in tables)
     return _Rows(
-        states=np.concatenate(states), accelerations=np.concatenate(accelerations),
-        rps=np.concatenate(rps), wrench=np.concatenate(wrench), runs=tuple(runs),
-        inner=np.concatenate(inner), weights=tuple(weights),
+        states=states, accelerations=accelerations, inner=inside, weights=weights, rps=rps,
+        wrench=wrench, runs=tuple(len(state) for state in tables[0]),
     )  # fmt: skip
 
 

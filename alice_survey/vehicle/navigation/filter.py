@@ -2,9 +2,9 @@
 
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
 error in NED (his global one: truth = exp(error) belief), and measurements as increments of angle
-and velocity, so that prediction is exact but for noise and the course of velocity in a tick. The
-covariance is (25, 25).
-Errors of the instruments that do not average out are states, else it would be too optimistic.
+and velocity, so that prediction is exact but for noise and the course of velocity in a tick.
+Errors of the instruments that do not average out are states, else the covariance, (25, 25), would
+be too optimistic.
 
 Four choices keep the covariance honest over hours:
 - The attitude's error is in NED, where heading is one number, and is not reset (see `correct`): no
@@ -91,7 +91,7 @@ and what gravity and push add."""
 MANOEUVRE_S = 5.0
 """Time of acceleration in one direction: half a turn of ALICE at 17 deg/s (paper, section VII)
 takes so long."""
-DOUBT_AFTER = (50, 50, 40, 40, 6, 6)
+WIDEN_AFTER = (50, 50, 40, 40, 6, 6)
 """Rejections in a row, of each instrument, after which covariances are widened: 5 s of compass and
 depth, 2 s of the DVL, 6 fixes. Outliers do not come like that: of 1 in 20, 6 in a row once in 64
 million."""
@@ -138,7 +138,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     from alice_survey.base.frames import rotation_from_attitude
 
     if truth.shape != (13,) or not np.all(np.isfinite(truth)):
-        raise VehicleError("navigation begins at a state that is no finite (13,) vector")
+        raise VehicleError("navigation begins at a state that is not a finite (13,) vector")
     covariance = initial_covariance(sensors)
     hidden_sigma = np.sqrt(np.diag(covariance)[GYRO_BIAS:WATER])
     hidden = hidden_sigma * rng.standard_normal(HIDDEN)
@@ -472,8 +472,8 @@ def weigh(
     place: int,
     innovation: float,
     noise_variance: float,
-    doubted: int,
-    doubted_count: int,
+    widen_from: int,
+    widen_count: int,
 ) -> bool:
     """Use one measured number, whose row h is in ROW of `scratch`, unless it is too far off.
 
@@ -484,8 +484,8 @@ def weigh(
         place: in `innovations`.
         innovation: measured minus estimated.
         noise_variance: noise variance of the measurement.
-        doubted: where the errors begin that are widened after too many rejections in a row.
-        doubted_count: how many.
+        widen_from: where the errors begin that are widened after too many rejections in a row.
+        widen_count: how many.
 
     Returns:
         Whether it was used.
@@ -501,12 +501,12 @@ def weigh(
     if innovation * innovation > sensors.gate * variance:
         counts[instrument, REJECTED] += 1
         counts[instrument, RUN] += 1
-        if counts[instrument, RUN] < DOUBT_AFTER[instrument]:
+        if counts[instrument, RUN] < WIDEN_AFTER[instrument]:
             return False
         size2 = 0.0
-        for i in range(doubted, doubted + doubted_count):
+        for i in range(widen_from, widen_from + widen_count):
             size2 += h[i] * h[i]
-        for i in range(doubted, doubted + doubted_count):
+        for i in range(widen_from, widen_from + widen_count):
             nav.covariance[i, i] += excess / size2
             w[i] += excess / size2 * h[i]
         variance += excess
@@ -596,7 +596,7 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
     i0 = i1 = i2 = 0.0
     if through_water:
         i0, i1, i2 = applied_inverse(turned, x[WATER + 1], x[WATER + 2], 0.0)
-    # What the scale multiplies still: the DVL's velocity about the IMU, less the water's.
+    # What the scale multiplies still: the DVL's velocity about the IMU, minus the water's.
     k0, k1, k2 = q * l2 - r * l1 - i0, r * l0 - p * l2 - i1, p * l1 - q * l0 - i2
     u, v, w = x[VELOCITY] + k0, x[VELOCITY + 1] + k1, x[VELOCITY + 2] + k2
     angle = x[DVL_ANGLE + 1]
@@ -639,9 +639,9 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
         # The rate's noise acts by the same lever as the gyroscopes' bias.
         arm = h[GYRO_BIAS] ** 2 + h[GYRO_BIAS + 1] ** 2 + h[GYRO_BIAS + 2] ** 2
         noise = sigma * sigma + gyro_variance * arm
-        doubted, count = (WATER, 2) if through_water else (VELOCITY, 3)
+        widen_from, count = (WATER, 2) if through_water else (VELOCITY, 3)
         place = INNOVATION_AT[instrument] + i
-        if weigh(nav, sensors, instrument, place, measured - believed, noise, doubted, count):
+        if weigh(nav, sensors, instrument, place, measured - believed, noise, widen_from, count):
             used |= 1 << i
     return used
 
@@ -688,7 +688,7 @@ def use_fix(
     if worst > sensors.gate:
         counts[instrument, REJECTED] += 1
         counts[instrument, RUN] += 1
-        if counts[instrument, RUN] < DOUBT_AFTER[instrument]:
+        if counts[instrument, RUN] < WIDEN_AFTER[instrument]:
             return False
         for axis in range(2):
             nav.covariance[axis, axis] += excess

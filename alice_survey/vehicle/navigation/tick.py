@@ -278,7 +278,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     north, east = (cee * cnd - cne * ced) / determinant, (cnn * ced - cne * cnd) / determinant
     altitude = d - north * n - east * e
     # Of the plane's depth below the point, by that of a beam's end.
-    doubt = 1.0 / count + (cee * n * n - 2.0 * cne * n * e + cnn * e * e) / determinant
+    leverage = 1.0 / count + (cee * n * n - 2.0 * cne * n * e + cnn * e * e) / determinant
 
     share = suite.dvl_every * suite.tick_s / suite.relief_memory_s
     share = max(1.0 / (memory[RELIEF_PINGS] + 1.0), share)
@@ -293,7 +293,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         memory[RELIEF_VARIANCE] += share * (square / freedom - memory[RELIEF_VARIANCE])
     relief = memory[RELIEF_VARIANCE]
     # The spread holds the ranges' noise, of which the plane keeps a part only.
-    spread = max((1.0 + doubt) * relief - noise, doubt * noise)
+    spread = max((1.0 + leverage) * relief - noise, leverage * noise)
     # A tilt turns the ends about the point: over a level floor that moves them sideways only.
     tilt = _variance(nav, ATTITUDE, altitude * east, -altitude * north, 0.0)
     memory[ALTITUDE_PING], memory[ALTITUDE_VARIANCE] = altitude, spread + tilt
@@ -458,7 +458,7 @@ def measure_imu(
 def measure_rates(
     dt_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
 ) -> None:
-    """The rates alone: before the first tick there is no increment."""
+    """The rates alone: the first tick has no increment."""
     noise = sensors.imu.gyro_noise_rad_per_sqrt_s / math.sqrt(dt_s)
     for i in range(3):
         nav.readings[RATES + i] = now[10 + i] + nav.hidden[i] + noise * rng.standard_normal()

@@ -98,7 +98,7 @@ def path_from_legs(
         raise VehicleError(f"the columns of the path's {len(start)} legs are not equally long")
     values = np.concatenate([start.ravel(), *columns, [altitude_m, speed_mps]])
     if not np.all(np.isfinite(values)):
-        raise VehicleError("the path holds a value that is no finite number")
+        raise VehicleError("the path holds a value that is not a finite number")
     if np.any(length[spot == 0] <= 0) or altitude_m <= 0 or speed_mps <= 0:
         raise VehicleError(
             f"the path's lengths (least {length.min():g} m), altitude ({altitude_m:g} m) and speed "

@@ -37,6 +37,8 @@ ALICE too; ALICE's is longer (`Vehicle.hull`)."""
 LOS_DAMPING_RATIO = 0.5
 """Least damping of the path loop of `los` (inferred: one overshoot of a sixth)."""
 _STRAIGHT_PER_M = 1e-9
+_TERRAIN_SMOOTHING_M = 1.5
+"""Relief shorter than this is not followed."""
 _LOOK_AHEADS_M = np.geomspace(CONTROL_LENGTH_M, 100.0, 400)
 _RAMP_PERIODS = 2.0
 """A reference gains its speed in this many times 1 / bandwidth of the loop that follows it: a
@@ -94,9 +96,7 @@ def pilot_guidance(
     most_depth_m: float,
     point_body_m: tuple[float, float, float] = LEFT_PORT_BODY_M,
     look_ahead_m: float | None = None,
-    terrain_smoothing_m: float = 1.5,
     spot_rad_s: float = SPOT_RAD_S,
-    step_mps: float = STEP_MPS,
     limits: SafetyLimits | None = None,
 ) -> Guidance:
     """Settings for a vehicle and a path.
@@ -112,14 +112,12 @@ def pilot_guidance(
         point_body_m: the followed point.
         look_ahead_m: when heading for the path; `shortest_look_ahead_m` when left out, and for
             `sway`, where there is none, SWAY_LOOK_AHEAD_M.
-        terrain_smoothing_m: relief shorter than this is not followed.
         spot_rad_s: greatest rate of turns on the spot; a vehicle that can do less turns slower.
-        step_mps: greatest speed of sway steps; a vehicle that can do less steps slower.
         limits: for safety; half the path's altitude is the least when left out.
 
     Raises:
-        VehicleError: the vehicle has no thrusters for sway, or `los` is to fly sway steps; a value
-            is out of range; or no look-ahead will do for `los`.
+        VehicleError: the vehicle has no thrusters for sway, `los` is to fly sway steps, or no
+            look-ahead will do for `los`.
     """
     axes, speed = gains.axes, path.speed_mps
     by_sway = controller == "sway"
@@ -134,26 +132,20 @@ def pilot_guidance(
             "cannot fly: plan with turns = 'spot' or 'arcs', or fly alice with the controller sway"
         )
     if look_ahead_m is None:
-        found = damped_look_ahead_m(gains, speed, point_body_m[0])
-        if found is None and by_sway:
-            found = SWAY_LOOK_AHEAD_M
-        look_ahead_m = found or shortest_look_ahead_m(gains, speed, point_body_m[0])
-    for name, value, unit in (
-        ("look-ahead", look_ahead_m, "m"),
-        ("terrain smoothing", terrain_smoothing_m, "m"),
-        ("rate of turns on the spot", spot_rad_s, "rad/s"),
-        ("speed of sway steps", step_mps, "m/s"),
-    ):
-        if not 0.0 < value < math.inf:
-            raise VehicleError(f"the {name} is {value:g} {unit}: it must be positive")
+        look_ahead_m = shortest_look_ahead_m(gains, speed, point_body_m[0])
+    if math.isnan(look_ahead_m) and not by_sway:
+        raise VehicleError(
+            f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
+            f"weaving at {speed:g} m/s: lower the speed, or check the vehicle's coefficients"
+        )
     weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
     tightest = float(np.abs(path.curvature_per_m).max())
     turning = turning_speed_mps(gains, tightest, abs(point_body_m[0]) if by_sway else 0.0)
-    spot_rad_s, step_mps = stop_speeds(gains, point_body_m[0], by_sway, spot_rad_s, step_mps)
+    spot_rad_s, step_mps = stop_speeds(gains, point_body_m[0], by_sway, spot_rad_s)
     return Guidance(
         sway=float(by_sway),
         point_body_m=np.array(point_body_m, np.float64),
-        look_ahead_m=look_ahead_m,
+        look_ahead_m=SWAY_LOOK_AHEAD_M if math.isnan(look_ahead_m) else look_ahead_m,
         far_m=0.5 * CONTROL_LENGTH_M,
         near_m=0.25 * CONTROL_LENGTH_M,
         lost_m=5.0 * CONTROL_LENGTH_M,
@@ -161,7 +153,7 @@ def pilot_guidance(
         way_in_m=CONTROL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
         smooth_m=min(speed, turning) / float(axes[YAW, BANDWIDTH]),
         brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
-        floor_rate_rad_s=2.0 * speed / terrain_smoothing_m,
+        floor_rate_rad_s=2.0 * speed / _TERRAIN_SMOOTHING_M,
         surface_m=0.3,
         stop_mps2=speed * float(axes[SURGE, BANDWIDTH]) / _RAMP_PERIODS,
         spot_rad_s=spot_rad_s,
@@ -177,7 +169,6 @@ def stop_speeds(
     lever_m: float,
     by_sway: bool,
     spot_rad_s: float = SPOT_RAD_S,
-    step_mps: float = STEP_MPS,
 ) -> tuple[float, float]:
     """Rate of turns on the spot and speed of sway steps that a vehicle can do.
 
@@ -188,10 +179,9 @@ def stop_speeds(
         lever_m: how far the followed point is ahead of the origin.
         by_sway: whether sway is controlled.
         spot_rad_s: rate that is wanted.
-        step_mps: speed that is wanted.
 
     Returns:
-        Both no greater than wanted; the speed is 0 without sway.
+        The rate, no greater than wanted, and the speed, at most `STEP_MPS`, 0 without sway.
     """
     rate = min(spot_rad_s, float(gains.axes[YAW, FASTEST]))
     if not by_sway:
@@ -199,7 +189,7 @@ def stop_speeds(
     fastest = float(gains.axes[SWAY, FASTEST])
     if lever_m != 0.0:
         rate = min(rate, fastest / abs(lever_m))
-    return rate, min(step_mps, fastest)
+    return rate, min(STEP_MPS, fastest)
 
 
 @kernel
@@ -255,24 +245,6 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     return loop
 
 
-def damped_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float | None:
-    """As `shortest_look_ahead_m`, or None where there is none."""
-    ratios = np.array([
-        damping_ratio(los_loop(gains, speed_mps, lever_m, float(each))) for each in _LOOK_AHEADS_M
-    ])  # fmt: skip
-    if not np.any(ratios >= LOS_DAMPING_RATIO):
-        return None
-    first = int(np.argmax(ratios >= LOS_DAMPING_RATIO))
-    if first == 0:
-        return CONTROL_LENGTH_M
-    low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
-    while high - low > 1e-3:
-        middle = 0.5 * (low + high)
-        enough = damping_ratio(los_loop(gains, speed_mps, lever_m, middle)) >= LOS_DAMPING_RATIO
-        low, high = (low, middle) if enough else (middle, high)
-    return high
-
-
 def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float:
     """The shortest look-ahead with which `los` is damped well enough on a straight path.
 
@@ -291,13 +263,20 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
         speed_mps: surge.
         lever_m: how far the followed point is ahead of the origin.
 
-    Raises:
-        VehicleError: no look-ahead gives that damping.
+    Returns:
+        NaN where no look-ahead up to 100 m gives that damping.
     """
-    found = damped_look_ahead_m(gains, speed_mps, lever_m)
-    if found is None:
-        raise VehicleError(
-            f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
-            f"weaving at {speed_mps:g} m/s: lower the speed, or check the vehicle's coefficients"
-        )
-    return found
+    ratios = np.array([
+        damping_ratio(los_loop(gains, speed_mps, lever_m, float(each))) for each in _LOOK_AHEADS_M
+    ])  # fmt: skip
+    if not np.any(ratios >= LOS_DAMPING_RATIO):
+        return math.nan
+    first = int(np.argmax(ratios >= LOS_DAMPING_RATIO))
+    if first == 0:
+        return CONTROL_LENGTH_M
+    low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        enough = damping_ratio(los_loop(gains, speed_mps, lever_m, middle)) >= LOS_DAMPING_RATIO
+        low, high = (low, middle) if enough else (middle, high)
+    return high

@@ -61,7 +61,7 @@ def place_demand(
     Args:
         gains: gains of all axes.
         axis: row of gains.
-        error: wanted place less place.
+        error: wanted place minus place.
         speed: measured.
         feed: speed of the wanted place.
         total: k_I times the integral of the error, a speed.
@@ -84,7 +84,7 @@ def place_sum_step(gains: Gains, axis: int, error: float, full: float, dt_s: flo
     Args:
         gains: gains of all axes.
         axis: row of gains.
-        error: wanted place less place.
+        error: wanted place minus place.
         full: +1 or -1 where the force is cut at its greatest or least, else 0.
         dt_s: the tick.
     """
@@ -162,7 +162,7 @@ _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
 or heading is kept, or stays wrong, but no faster than at the edge of being kept; on the way to a
 new one they would only wind up."""
-_MOST_SURPRISE_M = 1.0
+_MOST_INNOVATION_M = 1.0
 """A greater step of the sea floor is followed at this rate only: it may be a false echo, and a
 ledge is not to be dived from at once."""
 _RISE_ON_S = 5.0
@@ -215,9 +215,9 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
         memory[slot.FLOOR_KNOWN], memory[slot.FLOOR] = 1.0, heard
         restart_watch(pilot)
         return
-    surprise = clamped(heard - memory[slot.FLOOR], _MOST_SURPRISE_M)
-    memory[slot.FLOOR] += dt_s * (memory[slot.FLOOR_SLOPE] + 2.0 * rate * surprise)
-    memory[slot.FLOOR_SLOPE] += dt_s * rate * rate * surprise
+    innovation = clamped(heard - memory[slot.FLOOR], _MOST_INNOVATION_M)
+    memory[slot.FLOOR] += dt_s * (memory[slot.FLOOR_SLOPE] + 2.0 * rate * innovation)
+    memory[slot.FLOOR_SLOPE] += dt_s * rate * rate * innovation
 
 
 @kernel

@@ -80,6 +80,14 @@ def fly(workspace: Path, until_s: float = 9.0) -> None:
     put_stage(workspace, "flight", flight)
 
 
+def pose_of(row: dict[str, str]) -> RigidTransform:
+    """`ned_from_cam` of a row of poses.csv."""
+    return RigidTransform.from_components(
+        [float(row[k]) for k in ("north_m", "east_m", "depth_m")],
+        Rotation.from_quat([float(row[k]) for k in ("qx", "qy", "qz", "qw")]),
+    )
+
+
 def content(folder: Path) -> dict[str, bytes]:
     """All files but the record of the stage, which holds times."""
     return {
@@ -143,10 +151,7 @@ def test_truth_holds_the_poses_that_were_flown(survey: Path) -> None:
     for row, time_s, camera in zip(rows, np.repeat(TIMES_S, 2), ["left", "right"] * 3, strict=True):
         body = interpolate_poses(track.time_s, track.ned_from_body, np.array([time_s]))[0]
         expected = body * rig.body_from_cam(camera)
-        place = [float(row[k]) for k in ("north_m", "east_m", "depth_m")]
-        turn = Rotation.from_quat([float(row[k]) for k in ("qx", "qy", "qz", "qw")])
-        np.testing.assert_allclose(place, expected.translation, atol=1e-11)
-        assert (turn * expected.rotation.inv()).magnitude() < 1e-10
+        np.testing.assert_allclose(pose_of(row).as_matrix(), expected.as_matrix(), atol=1e-10)
     assert rig.cameras["left"].width_px == 211
     assert rig.cameras["left"] != rig.cameras["right"]
 
@@ -160,11 +165,7 @@ def test_range_maps_fit_terrain_and_poses(survey: Path) -> None:
     ranges = cv2.imread(str(truth / "range" / "right_000001.tif"), cv2.IMREAD_UNCHANGED)
     assert ranges.dtype == np.float32
     camera = rig.cameras["right"]
-    pose = RigidTransform.from_components(
-        [float(row[k]) for k in ("north_m", "east_m", "depth_m")],
-        Rotation.from_quat([float(row[k]) for k in ("qx", "qy", "qz", "qw")]),
-    )
-    points = pose.apply(camera.at_depth(camera.pixel_centres(), ranges).reshape(-1, 3))
+    points = pose_of(row).apply(camera.at_depth(camera.pixel_centres(), ranges).reshape(-1, 3))
     miss = points[:, 2] - terrain.depth_at(points[:, :2])
     on_sand = np.abs(miss) < 0.0002
     assert on_sand.mean() > 0.9

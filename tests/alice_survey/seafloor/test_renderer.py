@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import ImagingConfig, SeafloorConfig, SurveyConfig
+from alice_survey.base.config import SeafloorConfig, SurveyConfig
 from alice_survey.base.errors import ImageError
 from alice_survey.base.frames import rotation_from_attitude
 from alice_survey.seafloor.as_built import true_rig
@@ -107,27 +107,13 @@ def test_an_edge_on_the_floor_is_where_fermat_puts_it(
     """The whole way from picture over ray casting to the world, half a pixel included."""
     at_m = 0.137 if axis == 0 else -0.218
     view = pose(0.03, -0.02, 2.0, *attitude)
-    dark = render(
-        Scene(terrain=flat(), texture=Stripes(seed=0, at_m=9.0, axis=axis)),
-        CAMERA,
-        LIGHT,
-        still(view),
-        4,
-    )
-    bright = render(
-        Scene(terrain=flat(), texture=Stripes(seed=0, at_m=-9.0, axis=axis)),
-        CAMERA,
-        LIGHT,
-        still(view),
-        4,
-    )
-    half = render(
-        Scene(terrain=flat(), texture=Stripes(seed=0, at_m=at_m, axis=axis)),
-        CAMERA,
-        LIGHT,
-        still(view),
-        4,
-    )
+    dark, bright, half = (
+        render(
+            Scene(terrain=flat(), texture=Stripes(seed=0, at_m=at, axis=axis)), CAMERA, LIGHT,
+            still(view), 4,
+        )
+        for at in (9.0, -9.0, at_m)
+    )  # fmt: skip
     share = (half - dark)[..., 1] / (bright - dark)[..., 1]
 
     points = np.zeros((41, 3))
@@ -228,7 +214,7 @@ def test_rays_that_meet_nothing_see_only_water() -> None:
     assert 0.0 < water.max() < floor.min()
 
 
-def test_an_amphora_hides_strobes_from_the_sand_beside_it() -> None:
+def test_an_amphora_hides_strobes_from_the_sand_next_to_it() -> None:
     config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, grid_m=0.02)
     laid = build_terrain(config, (-1.5, 1.5, -1.5, 1.5), FLOOR_M, np.random.default_rng(4))
     bare = Terrain(
@@ -286,14 +272,3 @@ def test_pixels_are_sampled_evenly_over_their_area() -> None:
         first = rays.directions[: samples**2]
         assert len(np.unique(np.round(first[:, 0], 6))) == samples**2
         assert len(np.unique(np.round(first[:, 1], 6))) == samples**2
-
-
-def test_more_light_is_lost_in_turbid_water() -> None:
-    scene = Scene(terrain=flat(), texture=Even(seed=0))
-    pictures = {}
-    for jerlov in ("I", "5C"):
-        light = camera_light(
-            CAMERA, RIG.body_from_cam("left"), ImagingConfig(), water_optics(jerlov), 5.0
-        )
-        pictures[jerlov] = render(scene, CAMERA, light, still(pose()), 1)
-    assert np.all(pictures["5C"].mean(axis=(0, 1)) < 0.5 * pictures["I"].mean(axis=(0, 1)))

@@ -1,3 +1,4 @@
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,11 @@ def build(seed: int = 1, **settings_: float | bool) -> Terrain:
 @pytest.fixture(scope="module")
 def terrain() -> Terrain:
     return build()
+
+
+@cache
+def bare_sand() -> Terrain:
+    return build(amphora=False)
 
 
 def look_down(terrain: Terrain, points_ne: np.ndarray) -> np.ndarray:
@@ -120,20 +126,9 @@ def test_normals_point_into_the_water(terrain: Terrain) -> None:
 @settings(max_examples=20, deadline=None)
 @given(north=st.floats(10.0, 16.0), east=st.floats(-3.0, 2.0))
 def test_depth_is_that_of_the_triangles(north: float, east: float) -> None:
-    smooth = _no_amphora()
-    point = np.array([[north, east]])
-    hit = look_down(smooth, np.clip(point, [10.001, -2.999], [15.999, 1.999]))
-    depth = smooth.depth_at(np.clip(point, [10.001, -2.999], [15.999, 1.999]))
-    np.testing.assert_allclose(depth, hit, atol=3e-6)
-
-
-_cache: dict[str, Terrain] = {}
-
-
-def _no_amphora() -> Terrain:
-    if "smooth" not in _cache:
-        _cache["smooth"] = build(amphora=False)
-    return _cache["smooth"]
+    smooth = bare_sand()
+    point = np.clip([[north, east]], [10.001, -2.999], [15.999, 1.999])
+    np.testing.assert_allclose(smooth.depth_at(point), look_down(smooth, point), atol=3e-6)
 
 
 def test_depth_beyond_the_edge_is_nan(terrain: Terrain) -> None:

@@ -89,7 +89,7 @@ def test_specks_end_smoothly_within_their_cell() -> None:
     assert 0.005 < np.mean(inside) < 0.2
 
 
-def test_a_place_has_one_colour_whoever_asks() -> None:
+def test_a_place_has_one_colour_in_any_order_of_evaluation() -> None:
     points = plane(0.0018, 80)
     order = np.random.default_rng(0).permutation(len(points))
     straight, shuffled = albedo(points, 0.0018), albedo(points[order], 0.0018)

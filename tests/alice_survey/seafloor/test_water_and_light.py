@@ -23,7 +23,6 @@ from camera_calib.flat_port import FlatPortCamera
 from camera_calib.water import (
     ASYMMETRY,
     WaterOptics,
-    diffuse_attenuation_per_m,
     phase_per_sr,
     water_optics,
 )
@@ -115,26 +114,6 @@ def test_a_strobe_sends_all_of_its_power(half_angle_deg: float) -> None:
 
 def test_a_wide_strobe_without_an_edge_is_lamberts() -> None:
     assert beam_solid_angle_sr(np.deg2rad(120.0)) == pytest.approx(np.pi, rel=1e-6)
-
-
-@pytest.mark.parametrize("jerlov", CLEAR_TO_TURBID)
-def test_a_beam_is_weakened_more_than_daylight(jerlov: Jerlov) -> None:
-    water = water_optics(jerlov)
-    nm = np.array([600.0, 530.0, 460.0])
-    diffuse = diffuse_attenuation_per_m(jerlov, nm)
-    a, b = water.absorption_per_m, water.scattering_per_m
-    np.testing.assert_allclose(0.9 * diffuse, np.sqrt(a**2 + 0.256 * a * b), rtol=1e-9)
-    assert np.all(water.attenuation_per_m > 0.9 * diffuse)
-    assert np.all(a > 0)
-    assert np.all(np.diff(b) > 0)  # more for shorter waves
-
-
-def test_jerlov_types_go_from_clear_to_turbid_and_keep_their_tables() -> None:
-    at_green = [water_optics(j).attenuation_per_m[1] for j in CLEAR_TO_TURBID]
-    assert np.all(np.diff(at_green) > 0)
-    assert diffuse_attenuation_per_m("II", np.array([550.0]))[0] == 0.089
-    # Pure water absorbs 0.22 / m at 600 nm and 0.043 / m at 530 nm (Pope & Fry 1997).
-    np.testing.assert_allclose(water_optics("I").absorption_per_m[:2], [0.22, 0.043], rtol=0.2)
 
 
 def test_all_scattered_light_goes_somewhere_and_little_of_it_backward() -> None:

@@ -18,6 +18,14 @@ from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
 Array = NDArray[np.float64]
 STILL = constant_current(0.0, 0.0)
+SHEAR_AND_TIDE = Current(
+    np.array([-10.0, 100.0]),
+    np.array([-50.0, 100.0]),
+    np.array([[[0.1, -0.05], [-0.2, 0.15]], [[-0.1, 0.1], [0.25, 0.05]]]),
+)
+U, V, W, P, Q, R = np.eye(6)
+X, Y, Z, K, M, N = range(7, 13)
+"""Places of the accelerations in the rates of a state."""
 
 
 _PLAIN = (

@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
-from alice_survey.vehicle.dynamics import add_damping
-from tests.alice_survey.vehicle.motions import alice, block
+from tests.alice_survey.vehicle.motions import alice
 
 
 def named(**values: float) -> Coefficients:
@@ -32,14 +29,6 @@ def test_each_name_lands_in_its_row_and_column() -> None:
             np.testing.assert_array_equal(added.added_mass, -(one + mirrored))
             assert not added.linear.any() and not added.quadratic.any()
     np.testing.assert_array_equal(named(Y_uv=-1, Z_uw=-2, M_uw=-3, N_uv=4).lift, [-1, -2, -3, 4])
-
-
-def test_a_damping_coefficient_pushes_against_its_motion() -> None:
-    """X_u = -3, N_vv = -5 at u = 2, v = -2: X = -6 N, N = -5 (-2) |-2| = +20 N m."""
-    plant = block({"X_u": -3.0, "N_vv": -5.0}).plant
-    force = np.zeros(6)
-    add_damping(plant.body, np.array([2.0, -2.0, 0, 0, 0, 0]), force)
-    np.testing.assert_allclose(force, [-6.0, 0, 0, 0, 0, 20.0])
 
 
 def test_both_names_of_an_added_mass_share_their_mean() -> None:
@@ -72,18 +61,6 @@ def test_replacing_an_added_mass_drops_its_mirror() -> None:
     assert dict(after.values) == {"N_vdot": -2.5, "X_uu": -15.0, "K_vdot": -0.2}
     assert after.added_mass[1, 5] == 2.5
     assert before.added_mass[1, 5] == 8.5  # the old set is as it was
-
-
-@settings(deadline=None)
-@given(st.dictionaries(st.sampled_from(["Y_vv", "X_udot", "N_uv", "K_p"]), st.floats(-9, 9)))
-def test_what_is_not_named_is_zero(values: dict[str, float]) -> None:
-    some = Coefficients(name="some", values=values)
-    assert some.quadratic[1, 1] == values.get("Y_vv", 0.0)
-    assert some.added_mass[0, 0] == -values.get("X_udot", 0.0)
-    assert some.lift[3] == values.get("N_uv", 0.0)
-    assert some.linear[3, 3] == values.get("K_p", 0.0)
-    entries = sum(map(np.count_nonzero, (some.quadratic, some.added_mass, some.lift, some.linear)))
-    assert entries == sum(value != 0.0 for value in values.values())
 
 
 @pytest.mark.parametrize("coefficients", fleet.SETS)

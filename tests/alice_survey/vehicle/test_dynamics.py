@@ -18,13 +18,22 @@ from alice_survey.vehicle.dynamics import (
     add_damping,
     coriolis_matrix,
     initial_state,
-    scratch_for,
 )
-from alice_survey.vehicle.sea import Current
 from alice_survey.vehicle.vehicle import Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.vehicle.motions import (
-    STILL,
+    SHEAR_AND_TIDE,
+    K,
+    M,
+    N,
+    P,
+    Q,
+    R,
+    U,
+    V,
+    W,
+    Y,
+    Z,
     advance,
     alice,
     attitudes,
@@ -37,23 +46,6 @@ from tests.alice_survey.vehicle.motions import (
 
 VELOCITIES = arrays(np.float64, 6, elements=st.floats(-3.0, 3.0))
 ATTITUDES = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
-SHEAR_AND_TIDE = Current(
-    np.array([-10.0, 100.0]),
-    np.array([-50.0, 100.0]),
-    np.array([[[0.1, -0.05], [-0.2, 0.15]], [[-0.1, 0.1], [0.25, 0.05]]]),
-)
-U, V, W, P, Q, R = np.eye(6)
-X, Y, Z, K, M, N = range(7, 13)
-"""Places of the accelerations in the rates of a state."""
-
-
-@pytest.mark.parametrize("coefficients", fleet.SETS)
-@pytest.mark.parametrize("name", ["alice", "sparus2"])
-def test_inertia_is_symmetric_and_positive_definite(name: str, coefficients: str) -> None:
-    vehicle = fleet.vehicle(name, coefficients)
-    np.testing.assert_array_equal(vehicle.mass, vehicle.mass.T)
-    assert np.linalg.eigvalsh(vehicle.mass)[0] > 0.1
-    np.testing.assert_allclose(vehicle.plant.body.mass_inverse @ vehicle.mass, np.eye(6), atol=1e-9)
 
 
 @settings(deadline=None)
@@ -320,29 +312,6 @@ def test_drag_of_the_mast_leans_the_vehicle_over() -> None:
         assert vehicle.mass[1, 3] > vehicle.rigid_body.mass_matrix[1, 3]
 
 
-def test_starboard_thruster_turns_to_port_and_bow_thruster_to_starboard() -> None:
-    vehicle = alice()
-    names = [thruster.name for thruster in vehicle.thrusters]
-    for name, sign in (("starboard", -1.0), ("port", 1.0), ("bow", 1.0), ("stern", -1.0)):
-        speeds = np.array([20.0 * (other == name) for other in names])
-        turn = rates(vehicle, state_of(vehicle, rps=speeds))[N]
-        assert math.copysign(1.0, turn) == sign and abs(turn) > 0.01
-
-
-def test_reaction_of_a_right_handed_propeller_rolls_to_port() -> None:
-    """Seen from astern it turns clockwise, the body the other way: K < 0, by k_q / k_t of T."""
-    port = next(t for t in alice().thrusters if t.name == "port")
-    only = replace(block(), thrusters=(replace(port, handedness=1),))
-    rate = rates(only, state_of(only, rps=np.array([30.0])))
-    thrust = 1025.0 * port.diameter_m**4 * port.kt_forward * 900.0
-    torque = 1025.0 * port.diameter_m**5 * port.kq_forward * 900.0
-    assert rate[X] == pytest.approx(thrust / 50.0, rel=1e-12)
-    assert rate[K] == pytest.approx(-torque / 1.0, rel=1e-12)
-    mirrored = replace(block(), thrusters=(replace(port, handedness=-1),))
-    opposite = rates(mirrored, state_of(mirrored, rps=np.array([30.0])))
-    assert opposite[K] == pytest.approx(-rate[K], rel=1e-12)
-
-
 def test_initial_state_holds_what_it_is_given() -> None:
     nu = np.arange(6.0)
     state = initial_state(np.array([1.0, 2.0, 3.0]), np.array([0.1, -0.2, 2.0]), 3, nu)
@@ -352,13 +321,3 @@ def test_initial_state_holds_what_it_is_given() -> None:
     np.testing.assert_array_equal(state[7:13], nu)
     np.testing.assert_array_equal(state[13:], 0.0)
     assert not initial_state(np.zeros(3), np.zeros(3), 2)[7:].any()
-
-
-def test_scratch_has_room_for_each_vehicle() -> None:
-    for name in ("alice", "sparus2"):
-        vehicle = fleet.vehicle(name)
-        first = rates(vehicle, state_of(vehicle, np.full(6, 0.2)), current=STILL)
-        again = rates(vehicle, state_of(vehicle, np.full(6, 0.2)), current=STILL)
-        assert np.all(np.isfinite(first))
-        np.testing.assert_array_equal(first, again)
-    assert len(scratch_for(5).force) == 6

@@ -12,11 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle import fleet
-from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.sea import Current, constant_current, sheared_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.vehicle.motions import (
+    SHEAR_AND_TIDE,
+    U,
+    V,
+    W,
+    X,
     advance,
     alice,
     attitudes,
@@ -27,9 +31,6 @@ from tests.alice_survey.vehicle.motions import (
     state_of,
 )
 from tests.oracles_propulsion import wrench
-
-U, V, W, P, Q, R = np.eye(6)
-X, Y, Z, K, M, N = range(7, 13)
 
 
 @pytest.mark.parametrize("newtons", [2.0, -6.0])
@@ -134,15 +135,6 @@ def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str
     assert 0.9e-4 < np.abs(angle[-round(period / 0.01) :]).max() <= 1.0001e-4
 
 
-def test_pendulum_by_hand() -> None:
-    """50 kg, 2 cm low, I_x = 1 with 1 of added inertia, free to sway (25 kg of added mass):
-    I_o - (m z)^2 / (m + m_a) = 2 + 0.02 - 1 / 75."""
-    vehicle = block({"K_pdot": -1.0, "Y_vdot": -25.0}, cg=(0.0, 0.0, 0.02))
-    rate = rates(vehicle, state_of(vehicle, attitude_rad=(1e-6, 0.0, 0.0)))
-    expected = -50.0 * GRAVITY * 0.02 * 1e-6 / (2.02 - 1.0 / 75.0)
-    assert rate[K] == pytest.approx(expected, rel=1e-9)
-
-
 @settings(max_examples=20, deadline=None)
 @given(
     speed=st.floats(0.0, 1.0),
@@ -211,16 +203,6 @@ def test_light_and_heavy_bodies_in_water_that_speeds_up() -> None:
         assert relative + 0.1 == pytest.approx(0.1 * share, rel=1e-9)
 
 
-def test_water_that_speeds_up_swings_a_low_weight_back() -> None:
-    """0.1 m/s^2 ahead: the centre of gravity, 3 cm low, stays behind, so that the nose goes down.
-
-    M = - m z a; on I_g, as the body is free to surge.
-    """
-    tide = Current(np.array([0.0, 10.0]), np.zeros(1), np.array([[[0.0, 0.0]], [[1.0, 0.0]]]))
-    low = block(cg=(0.0, 0.0, 0.03))
-    assert rates(low, state_of(low), current=tide)[M] == pytest.approx(-50 * 0.03 * 0.1 / 6.0)
-
-
 def test_water_inside_the_nose_is_carried_where_it_is() -> None:
     """Water inside the hull is pushed along at its own centre as any other: nothing turns, and the
     drained part alone lags, by its low centre of gravity."""
@@ -261,13 +243,6 @@ def test_sinking_through_shear_a_vehicle_lags_behind_the_current() -> None:
     np.testing.assert_allclose(states[-1, 7:13], lagging * V + sinking * W, atol=1e-6)
 
 
-RICH = Current(
-    np.array([-10.0, 100.0]),
-    np.array([-50.0, 100.0]),
-    np.array([[[0.1, -0.05], [-0.2, 0.15]], [[-0.1, 0.1], [0.25, 0.05]]]),
-)
-
-
 def thrust_of_all_laws(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
     body = vehicle.rigid_body
     displaced_kg = body.buoyancy_kg + body.entrained_kg
@@ -300,7 +275,7 @@ def test_runge_kutta_agrees_with_an_adaptive_method(
     nu, attitude = np.array([0.3, -0.05, 0.04, 0.05, -0.03, 0.1]), (0.1, -0.05, 0.7)
     start = np.array([0.0, 0.0, 5.0, *attitude])
     eta, velocity, speeds = oracle.integrate(
-        vehicle, RICH, start, nu, np.zeros(5), times, commands, loads, thrust
+        vehicle, SHEAR_AND_TIDE, start, nu, np.zeros(5), times, commands, loads, thrust
     )
     assert np.all(np.ptp(velocity, axis=0) > 0.05)
     truth = Rotation.from_matrix([oracle.ned_from_body(row[3:]) for row in eta])
@@ -310,7 +285,9 @@ def test_runge_kutta_agrees_with_an_adaptive_method(
         rows = [state_of(vehicle, nu, attitude)]
         for i, time_s in enumerate(times[:-1]):
             rows.append(
-                advance(vehicle, rows[-1], 4.0, step_s, loads[i], RICH, time_s, commands[i])[-1]
+                advance(
+                    vehicle, rows[-1], 4.0, step_s, loads[i], SHEAR_AND_TIDE, time_s, commands[i]
+                )[-1]
             )
         states = np.array(rows)
         errors = (
@@ -333,7 +310,7 @@ def test_the_step_is_of_fourth_order() -> None:
     commands = np.full(5, 40.0)
 
     def end(step_s: float) -> Array:
-        return advance(vehicle, state, 0.64, step_s, load, RICH, 0.0, commands)[-1]
+        return advance(vehicle, state, 0.64, step_s, load, SHEAR_AND_TIDE, 0.0, commands)[-1]
 
     best = end(0.00125)
     errors = [np.abs(end(step) - best).max() for step in (0.04, 0.02, 0.01)]

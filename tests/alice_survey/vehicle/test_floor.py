@@ -100,23 +100,3 @@ def test_a_beam_ends_on_the_near_side_of_a_ridge() -> None:
     assert found == pytest.approx(expected, abs=1e-6)
     beyond = floor_range(level_floor(10.0), 2.0, 0.5, 9.0, *beam, 60.0)
     assert beyond == pytest.approx(1.0 / beam[2], abs=1e-6)
-
-
-def test_beams_of_a_dvl_give_the_slope_back() -> None:
-    """Four beams 30 degrees off the vertical over a known plane: the plane through their ends."""
-    slopes = (0.2, -0.1)
-    floor = tilted(20.0, *slopes)
-    ends = []
-    for azimuth in np.deg2rad([45.0, 135.0, 225.0, 315.0]):
-        beam = np.array([
-            math.sin(math.radians(30.0)) * math.cos(azimuth),
-            math.sin(math.radians(30.0)) * math.sin(azimuth),
-            math.cos(math.radians(30.0)),
-        ])  # fmt: skip
-        ends.append(
-            np.array([3.0, 4.0, 12.0]) + floor_range(floor, 3.0, 4.0, 12.0, *beam, 50.0) * beam
-        )
-    points = np.array(ends)
-    design = np.column_stack([points[:, :2], np.ones(4)])
-    fitted = np.linalg.lstsq(design, points[:, 2], rcond=None)[0]
-    np.testing.assert_allclose(fitted, [*slopes, 20.0], atol=1e-5)

@@ -49,11 +49,11 @@ def test_swell_is_added_to_the_current_along_its_way() -> None:
     for time_s in (0.0, 1.0, 17.3, 42.0):
         waves = at(current, time_s, 12.5) - [0.0, 0.1]
         along = waves @ [math.cos(towards), math.sin(towards)]
-        beside = waves @ [-math.sin(towards), math.cos(towards)]
+        across = waves @ [-math.sin(towards), math.cos(towards)]
         expected = most * math.cos(2 * math.pi * time_s / period_s)
         # Straight pieces between times and between layers.
         assert along == pytest.approx(expected, abs=0.012 * most)
-        assert beside == pytest.approx(0.0, abs=1e-12)
+        assert across == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_varying_current_is_kept_under_the_waves() -> None:

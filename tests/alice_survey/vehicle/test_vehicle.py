@@ -94,24 +94,6 @@ def test_configuration_matrix_is_the_thrusters_at_work(name: str) -> None:
         np.testing.assert_allclose(matrix[:3, i], thruster.direction_body)
 
 
-def test_configuration_matrix_of_alice_by_hand() -> None:
-    """Rows X, Y, Z, N as in the paper (with N of the starboard thruster negative: FRD)."""
-    vehicle = fleet.vehicle("alice")
-    names = [thruster.name for thruster in vehicle.thrusters]
-    matrix = vehicle.configuration_matrix
-    starboard, port, vertical, bow, stern = (
-        matrix[:, names.index(name)] for name in ("starboard", "port", "vertical", "bow", "stern")
-    )
-    np.testing.assert_allclose(starboard[[0, 1, 2, 5]], [1, 0, 0, -0.167], atol=1e-12)
-    np.testing.assert_allclose(port[[0, 1, 2, 5]], [1, 0, 0, 0.167], atol=1e-12)
-    np.testing.assert_allclose(vertical[[0, 1, 2]], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(bow[[0, 1, 2]], [0, 1, 0], atol=1e-12)
-    assert bow[5] > 0.3 and stern[5] < -0.3
-    # The surge propellers turn against each other: no roll when they push equally.
-    assert starboard[3] == pytest.approx(-port[3], abs=1e-12)
-    assert abs(starboard[3]) > 1e-4
-
-
 def test_thrusters_and_coefficients_can_be_exchanged() -> None:
     full = fleet.vehicle("alice")
     failed = full.without(["bow"])
@@ -121,20 +103,3 @@ def test_thrusters_and_coefficients_can_be_exchanged() -> None:
     other = full.with_coefficients(Coefficients(name="light", values={"X_udot": -1.0}))
     assert other.mass[0, 0] == pytest.approx(full.rigid_body.mass_matrix[0, 0] + 1.0)
     assert other.thrusters == full.thrusters
-
-
-@pytest.mark.parametrize(
-    ("name", "coefficients", "wrong"),
-    [("nemo", "cfd", "nemo"), ("alice", "guessed", "guessed")],
-)
-def test_names_that_are_not_known_are_refused(name: str, coefficients: str, wrong: str) -> None:
-    with pytest.raises(VehicleError, match=f"{wrong}.*known: .*"):
-        fleet.vehicle(name, coefficients)
-
-
-def test_known_vehicles_are_in_trim() -> None:
-    """Neutral, the centre of gravity straight below the centre of buoyancy."""
-    for name in ("alice", "sparus2"):
-        body = fleet.vehicle(name).rigid_body
-        assert body.dry_kg == pytest.approx(body.buoyancy_kg, rel=0.01)
-        assert body.cg_body_m[2] > 0.01

@@ -5,15 +5,13 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from alice_survey.base.errors import AliceError
 from alice_survey.cli.main import app
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.hydrodynamics.comparison import CoefficientRow, coefficient_rows
-from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2
+from alice_survey.vehicle.hydrodynamics.geometry import ALICE
 from alice_survey.vehicle.hydrodynamics.paper_tables import (
     CALIBRATED,
     CFD,
@@ -24,7 +22,11 @@ from alice_survey.vehicle.hydrodynamics.paper_tables import (
     TABLES,
 )
 from alice_survey.vehicle.hydrodynamics.parts import estimate
-from alice_survey.vehicle.hydrodynamics.report import coefficients_report
+from alice_survey.vehicle.hydrodynamics.report import (
+    CoefficientRow,
+    coefficient_rows,
+    coefficients_report,
+)
 
 ROWS = coefficient_rows()
 
@@ -33,23 +35,13 @@ def row(table: str, coefficient: str, part: str = "vehicle") -> CoefficientRow:
     return next(r for r in ROWS if (r.table, r.coefficient, r.part) == (table, coefficient, part))
 
 
-@pytest.mark.parametrize(
-    ("table", "coefficient", "part", "percent"),
-    [
-        ("IV", "Y_uv", "vehicle", 1.0),
-        ("IV", "Z_uw", "vehicle", 1.0),
-        ("IV", "M_uw", "vehicle", 1.0),
-        ("IV", "X_uu", "hull", 1.0),
-        ("IV", "Y_vv", "hull", 1.0),
-        ("III", "Y_vdot", "vehicle", 5.0),
-        ("III", "N_rdot", "vehicle", 5.0),
-        ("III", "Y_vv", "vehicle", 5.0),
-        ("III", "Z_ww", "vehicle", 5.0),
-        ("III", "N_vdot", "vehicle", 5.0),
-    ],
-)
-def test_these_follow_from_shape(table: str, coefficient: str, part: str, percent: float) -> None:
-    assert abs(row(table, coefficient, part).difference_percent) <= percent
+def test_these_follow_from_shape() -> None:
+    for coefficient in ("Y_uv", "Z_uw", "M_uw"):
+        assert abs(row("IV", coefficient).difference_percent) <= 1.0
+    for coefficient in ("X_uu", "Y_vv"):
+        assert abs(row("IV", coefficient, "hull").difference_percent) <= 1.0
+    for coefficient in ("Y_vdot", "N_rdot", "Y_vv", "Z_ww", "N_vdot"):
+        assert abs(row("III", coefficient).difference_percent) <= 5.0
 
 
 def test_every_row_of_the_paper_is_there() -> None:
@@ -96,20 +88,6 @@ def test_tables_agree_where_they_repeat_each_other() -> None:
             assert any(abs(each.printed) == pytest.approx(abs(k), rel=3e-3) for k in known if k)
 
 
-def test_no_set_gains_energy_by_moving() -> None:
-    """Damping and lift take power in any motion: |nu| = 1, m/s and rad/s, axes big and small."""
-    rng = np.random.default_rng(1)
-    motions = rng.standard_normal((50_000, 6)) * rng.choice([0.01, 0.1, 1.0], (50_000, 6))
-    motions /= np.linalg.norm(motions, axis=1)[:, None]
-    u, v, w, _, q, r = motions.T
-    for each in (ESTIMATED, CFD, CALIBRATED, estimate(ALICE), estimate(SPARUS2)):
-        force = motions * np.abs(motions) @ each.quadratic.T
-        y_uv, z_uw, m_uw, n_uv = each.lift
-        lift = y_uv * abs(u) * v * v + z_uw * abs(u) * w * w + m_uw * u * w * q + n_uv * u * v * r
-        power = np.sum(motions * force, axis=1) + lift
-        assert power.min() > -400.0 and power.max() < -0.15, each.name
-
-
 def test_the_surge_fit_is_about_the_water_inside() -> None:
     fit = row("V", "X_udot")
     assert fit.paper_other is not None
@@ -132,24 +110,13 @@ def test_the_command_prints_and_writes_every_row(tmp_path: Path) -> None:
         assert float(line["computed"]) == each.computed == shown["computed"]
     first = picture.read_bytes()
     assert b"N_rr" in first and b"stern" in first
-    coefficients_report(plot=picture)
+    _, values = coefficients_report(plot=picture)
+    assert values["counts"] == {"reproduced": 7, "near": 12, "no": 39}
     assert picture.read_bytes() == first
 
 
-def test_the_text_holds_each_coefficient() -> None:
-    text, data = coefficients_report()
-    for each in ROWS:
-        assert f"\n{each.coefficient} " in text
-    assert data["counts"] == {"reproduced": 7, "near": 12, "no": 39}
-
-
-@pytest.mark.parametrize(
-    ("option", "name", "words"),
-    [("plot", "picture.bmp", "change the suffix"), ("csv", "folder", "is a folder")],
-)
-def test_files_that_cannot_be_written_are_refused(
-    tmp_path: Path, option: str, name: str, words: str
-) -> None:
+@pytest.mark.parametrize(("option", "name"), [("plot", "picture.bmp"), ("csv", "folder")])
+def test_files_that_cannot_be_written_are_refused(tmp_path: Path, option: str, name: str) -> None:
     (tmp_path / "folder").mkdir()
-    with pytest.raises(AliceError, match=words):
+    with pytest.raises(AliceError, match=name):
         coefficients_report(**{option: tmp_path / name})

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2, Geometry, Outline
 from alice_survey.vehicle.hydrodynamics.parts import (
@@ -149,14 +148,6 @@ def test_strips_of_a_spheroid_lie_just_above_the_exact_added_mass() -> None:
     assert -hull["X_udot"] == pytest.approx(alpha / (2.0 - alpha) * displaced, rel=1e-8)
 
 
-def test_parts_add_up() -> None:
-    whole = estimate(ALICE).values
-    for name, value in whole.items():
-        if name not in ("Y_uv", "Z_uw", "M_uw", "N_uv"):
-            summed = sum(share.get(name, 0.0) for share in SHARES.values())
-            assert summed == pytest.approx(value, rel=1e-9, abs=1e-12)
-
-
 def test_names_turn_back_into_the_matrix() -> None:
     matrix = np.arange(36, dtype=np.float64).reshape(6, 6)
     again = Coefficients(name="test", values=named(matrix, kind="quadratic"))
@@ -166,21 +157,6 @@ def test_names_turn_back_into_the_matrix() -> None:
     np.testing.assert_array_equal(again.added_mass, symmetric)
 
 
-def test_finer_strips_change_nothing() -> None:
-    """Halving every segment of the outline leaves all coefficients as they are."""
-    x, r = np.array(ALICE.outline.x_m), np.array(ALICE.outline.radius_m)
-    finer_x = np.sort(np.concatenate([x, (x[1:] + x[:-1]) / 2.0]))
-    finer = Outline(x_m=tuple(finer_x), radius_m=tuple(np.interp(finer_x, x, r)))
-    values = estimate(replace(ALICE, outline=finer)).values
-    for name, value in estimate(ALICE).values.items():
-        assert values[name] == pytest.approx(value, rel=1e-9, abs=1e-12)
-
-
 def test_faster_water_rubs_less() -> None:
     slow, fast = (-estimate(ALICE, Flow(speed_mps=v)).values["X_uu"] for v in (0.2, 1.0))
     assert 0.6 * slow < fast < 0.95 * slow
-
-
-def test_a_flow_that_is_none_is_refused() -> None:
-    with pytest.raises(VehicleError, match="speed_mps = 0"):
-        Flow(speed_mps=0.0)

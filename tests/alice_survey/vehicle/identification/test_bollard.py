@@ -37,13 +37,13 @@ def test_factors_are_found_forward_and_reverse(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert found[0].factor == pytest.approx(0.8, rel=1e-6)
     assert found[1].factor == pytest.approx(1.2, rel=1e-6)
-    mended = with_thrust(KNOWN, found)
+    changed = with_thrust(KNOWN, found)
     before, after = np.zeros(6), np.zeros(6)
     speeds = np.array([30.0, 30.0, 0, 0, 0])
     add_thrust(KNOWN.plant.propulsion, speeds, np.zeros(6), before)
-    add_thrust(mended.plant.propulsion, speeds, np.zeros(6), after)
+    add_thrust(changed.plant.propulsion, speeds, np.zeros(6), after)
     assert after[0] == pytest.approx(0.8 * before[0])
-    assert mended.thrusters[2] == KNOWN.thrusters[2]
+    assert changed.thrusters[2] == KNOWN.thrusters[2]
 
 
 def test_sigmas_are_those_of_the_readings(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_one_reading_has_no_sigma(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "told"),
+    ("rows", "message"),
     [
         ("thruster,rpm\nport,100\n", "column force_n is missing"),
         ("thruster,rpm,force_n\n", "has no rows"),
@@ -76,9 +76,9 @@ def test_one_reading_has_no_sigma(tmp_path: Path) -> None:
         ("thruster,rpm,force_n\nport,900,3\nport+starboard,900,6\n", "alone and with others"),
     ],
 )
-def test_faults_are_named(tmp_path: Path, rows: str, told: str) -> None:
+def test_faults_are_named(tmp_path: Path, rows: str, message: str) -> None:
     path = tmp_path / "pull.csv"
     path.write_text(rows)
     with pytest.raises(VehicleError) as raised:
         fit_pulls(read_pulls(path), KNOWN)
-    assert told in str(raised.value)
+    assert message in str(raised.value)

@@ -83,7 +83,7 @@ def test_a_name_is_a_known_vehicle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("dry_kg = 10.0\n", "", "rigid_body.dry_kg"),
         ("dry_kg = 10.0", "weight = 10.0", "rigid_body.weight"),
@@ -96,11 +96,13 @@ def test_a_name_is_a_known_vehicle() -> None:
         ("[rigid_body]", "[rigid_body", "small.toml"),
     ],
 )
-def test_faults_of_vehicle_files_are_named(tmp_path: Path, old: str, new: str, told: str) -> None:
+def test_faults_of_vehicle_files_are_named(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
     assert old in SMALL
     with pytest.raises(VehicleError) as raised:
         vehicle_from_file(small(tmp_path, SMALL.replace(old, new, 1)))
-    assert told in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_coefficients_go_through_a_file(tmp_path: Path) -> None:
@@ -145,7 +147,7 @@ def test_foreign_axes_become_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('velocity = ["u", "v", "w"]\n', "give time, or time_step_s"),
         ("time_step_s = 0\n", "time_step_s: Input should be greater than 0"),
@@ -154,12 +156,12 @@ def test_foreign_axes_become_ours(tmp_path: Path) -> None:
         ('time = "t"\nvelocity = ["u", "v", "w"]\n', "column v is missing"),
     ],
 )
-def test_faults_of_column_maps_are_named(tmp_path: Path, text: str, told: str) -> None:
+def test_faults_of_column_maps_are_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "map.toml").write_text(text)
     (tmp_path / "log.csv").write_text("t,u\n0,1\n")
     with pytest.raises(VehicleError) as raised:
         read_foreign_log(tmp_path / "log.csv", read_column_map(tmp_path / "map.toml"))
-    assert told in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_logs_without_what_a_fit_needs_are_refused() -> None:

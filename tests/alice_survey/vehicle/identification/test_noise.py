@@ -55,16 +55,16 @@ def test_information_is_that_of_the_written_out_matrix(count: int) -> None:
 
 def test_scores_of_one_push_count_together() -> None:
     rng = np.random.default_rng(5)
-    sums, told = [], []
+    sums, estimates = [], []
     for _ in range(300):
         push = rng.normal(size=(400, 1))
         # Each push is felt for five rows, by both scores alike.
         felt = np.apply_along_axis(np.convolve, 0, push, np.ones(5), mode="valid")
         scores = np.column_stack([felt, 2 * felt])
         sums.append(scores.sum(axis=0))
-        told.append(score_information([scores], 25))
-    expected, mean = np.cov(np.array(sums).T), np.mean(told, axis=0)
+        estimates.append(score_information([scores], 25))
+    expected, mean = np.cov(np.array(sums).T), np.mean(estimates, axis=0)
     np.testing.assert_allclose(mean, expected, rtol=0.25)
-    assert np.linalg.eigvalsh(told[0])[0] > -1e-9 * np.linalg.eigvalsh(told[0])[1]
+    assert np.linalg.eigvalsh(estimates[0])[0] > -1e-9 * np.linalg.eigvalsh(estimates[0])[1]
     white = rng.normal(size=(500, 3))
     np.testing.assert_allclose(score_information([white], 0), white.T @ white)

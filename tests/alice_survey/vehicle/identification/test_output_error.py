@@ -148,7 +148,7 @@ def test_a_coefficient_without_effect_stops_at_its_bound() -> None:
         assert abs(linear) < 3 * fit.sigma[1]
 
 
-def test_what_a_log_does_not_tell_is_named() -> None:
+def test_parameters_that_a_log_does_not_determine_are_named() -> None:
     rest = fly(hidden({}), duration_s=5.0, asked=lambda time_s: np.zeros(5))
     with pytest.raises(VehicleError, match="do not determine X_uu, gain_X: do not free them"):
         fitted(measured(rest, np.random.default_rng(0)), ("X_uu", "gain_X"))
@@ -160,7 +160,7 @@ def test_what_a_log_does_not_tell_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "message"),
     [
         ((), "no parameter is free"),
         (("X_zz",), "parameter 'X_zz' is not known"),
@@ -168,8 +168,8 @@ def test_what_a_log_does_not_tell_is_named() -> None:
         (("X_uu", "X_uu"), "are one parameter"),
     ],
 )
-def test_wrong_names_are_told(names: tuple[str, ...], told: str) -> None:
-    with pytest.raises(VehicleError, match=told):
+def test_wrong_names_are_refused(names: tuple[str, ...], message: str) -> None:
+    with pytest.raises(VehicleError, match=message):
         free_parameters(KNOWN, names)
 
 

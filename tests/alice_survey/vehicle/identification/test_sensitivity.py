@@ -135,18 +135,18 @@ def test_sensitivities_to_the_start_are_slopes_too() -> None:
         np.testing.assert_allclose(derivatives[:, :, k], difference, atol=2e-6)
 
 
-def test_observations_are_what_sensors_tell() -> None:
+def test_observations_are_what_sensors_measure() -> None:
     parameters, values, record, start = a_case()
     states, observed, _ = run(parameters, values, record, start)
     physics = parameters.physics(values)
     for row in (0, 7, ROWS - 1):
-        told = numpy_observation(
+        expected = numpy_observation(
             states[row], physics.current_ne, physics.bias, record.attitude[row]
         )
         # The length of the quaternion is left to the steps: 1 to some 1e-7.
-        np.testing.assert_allclose(observed[row, :6], told[:6], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(observed[row, :6], expected[:6], rtol=0, atol=1e-6)
         # Twice the sine of half the angle stands for the angle: 0.2 % apart at 0.2 rad.
-        np.testing.assert_allclose(observed[row, 6:], told[6:], rtol=0.01, atol=1e-6)
+        np.testing.assert_allclose(observed[row, 6:], expected[6:], rtol=0.01, atol=1e-6)
 
 
 def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:

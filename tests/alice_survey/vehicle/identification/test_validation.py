@@ -22,7 +22,7 @@ def test_the_fit_is_as_defined() -> None:
     assert np.isnan(fit_percent(np.ones((3, 1)), np.ones((3, 1)))[0])
 
 
-def test_the_truth_foretells_itself_and_a_wrong_model_does_not() -> None:
+def test_the_truth_predicts_itself_and_a_wrong_model_does_not() -> None:
     truth = hidden({"X_uu": -12.0, "N_rr": -70.0})
     log = fly(truth, duration_s=40.0, current=(0.1, 0.05))
     parameters = free_parameters(vehicle("alice"), ("X_uu", "N_rr", "current"))

@@ -137,9 +137,9 @@ def test_altitude_errs_as_the_beams_say(floor: FloorGrid, low: float, high: floa
         errors.append(error)
         sigmas.append(sigma)
     error, sigma = np.concatenate(errors), np.concatenate(sigmas)
-    told = np.isfinite(error)
-    assert told.mean() > 0.99
-    assert low < np.sqrt(np.mean((error[told] / sigma[told]) ** 2)) < high
+    known = np.isfinite(error)
+    assert known.mean() > 0.99
+    assert low < np.sqrt(np.mean((error[known] / sigma[known]) ** 2)) < high
 
 
 def test_altitude_is_carried_by_depth_and_given_up_in_time() -> None:

@@ -357,7 +357,7 @@ def true_velocity(truth: Array) -> Array:
     return velocity
 
 
-def test_a_disturbed_compass_is_refused_first_and_then_doubted() -> None:
+def test_a_disturbed_compass_is_rejected_first_and_then_widens_its_bias() -> None:
     sensors, truth = SensorSuite().pack(), straight(60.0, 0.2)
     rng = default_rng(2)
     nav = new_navigation(sensors, truth[0], rng)

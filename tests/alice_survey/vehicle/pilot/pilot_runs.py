@@ -221,14 +221,11 @@ def launch(
     heading_rad: float = 0.0,
     floor_m: float = 15.0,
     slope: float = 0.0,
-    look_ahead_m: float | None = None,
     following: bool = False,
 ) -> Flight:
     """A vehicle at rest over a plane; `following`: at depth, with the path begun."""
     craft, gains = vehicle(name), gains_of(name, path.speed_mps)
-    guidance = pilot_guidance(
-        gains, path, controller, most_depth_m=DEEPEST_M, look_ahead_m=look_ahead_m
-    )
+    guidance = pilot_guidance(gains, path, controller, most_depth_m=DEEPEST_M)
     pilot = new_pilot()
     if following:
         pilot.report[slot.PHASE] = slot.FOLLOW

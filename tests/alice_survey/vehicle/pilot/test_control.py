@@ -32,7 +32,7 @@ def test_wrench_is_that_of_the_matrices(name: str, demand: Array) -> None:
 
 @given(demand=DEMANDS)
 @settings(deadline=None)
-def test_what_is_cut_is_told(demand: Array) -> None:
+def test_saturated_axes_are_flagged(demand: Array) -> None:
     gains, pilot, wrench = gains_of("alice"), new_pilot(), np.zeros(6)
     pilot.demand[:8] = demand * np.array([1, 1, 1, 1, 5, 5, 5, 20])
     steering.write_wrench(gains, pilot, wrench)

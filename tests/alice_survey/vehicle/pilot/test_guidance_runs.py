@@ -1,6 +1,7 @@
 """Guidance in a closed loop: true state, exact wrench with its lag, full dynamics, currents."""
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -22,13 +23,10 @@ def rms(values: Array) -> float:
 @pytest.mark.parametrize(
     ("name", "speed_mps", "towards_deg"),
     [
-        ("sparus2", 0.1, 90.0),
-        ("sparus2", 0.05, 270.0),
-        ("sparus2", 0.1, 45.0),
-        ("sparus2", 0.1, 135.0),
-        ("alice", 0.1, 90.0),
+        ("sparus2", 0.1, 90.0), ("sparus2", 0.05, 270.0), ("sparus2", 0.1, 45.0),
+        ("sparus2", 0.1, 135.0), ("alice", 0.1, 90.0),
     ],
-)
+)  # fmt: skip
 def test_los_settles_at_the_offset_that_the_current_gives(
     name: str, speed_mps: float, towards_deg: float
 ) -> None:
@@ -43,17 +41,6 @@ def test_los_settles_at_the_offset_that_the_current_gives(
     assert np.ptp(settled) < 0.05 * abs(expected)
     crab = math.atan2(expected, flight.guidance.look_ahead_m)
     assert -rows.heading_error_rad[-1] == pytest.approx(crab, abs=0.01)
-
-
-def test_a_shorter_look_ahead_offsets_less() -> None:
-    offsets = []
-    for look_ahead_m in (2.4, 4.8):
-        flight = launch(
-            straight(100.0), "sparus2", "los", current=(0.1, 90.0), look_ahead_m=look_ahead_m,
-            following=True,
-        )  # fmt: skip
-        offsets.append(flight.fly(350.0).cross_m[-400:].mean())
-    assert offsets[1] / offsets[0] == pytest.approx(2.0, rel=0.02)
 
 
 @pytest.mark.parametrize("towards_deg", [90.0, 0.0, 225.0])
@@ -99,22 +86,23 @@ def test_surge_over_ground_is_held_against_a_head_current() -> None:
     assert rows.wrench[-200:, 0].mean() == pytest.approx(quadratic * 0.35**2, rel=0.05)
 
 
-@pytest.mark.parametrize("speed_mps", [0.2, 0.5, 1.0])
-def test_speed_is_reached_without_running_over(speed_mps: float) -> None:
-    flight = launch(straight(100.0, speed_mps=speed_mps), "alice", "sway", following=True)
+@pytest.mark.parametrize(
+    ("name", "speed_mps", "current"),
+    [
+        ("alice", 0.2, (0.0, 0.0)), ("alice", 0.5, (0.0, 0.0)), ("alice", 1.0, (0.0, 0.0)),
+        ("sparus2", 0.2, (0.05, 0.0)), ("sparus2", 0.2, (0.05, 180.0)),
+    ],
+)  # fmt: skip
+def test_speed_is_reached_without_overshoot(
+    name: str, speed_mps: float, current: tuple[float, float]
+) -> None:
+    path = straight(100.0, speed_mps=speed_mps)
+    controller: Literal["sway", "los"] = "sway" if name == "alice" else "los"
+    flight = launch(path, name, controller, current=current, following=True)
     surge = flight.fly(60.0).estimate[:, vector.U]
     assert surge.max() < 1.05 * speed_mps
-    assert surge[-200:].mean() == pytest.approx(speed_mps, rel=0.01)
-    assert np.argmax(surge > 0.9 * speed_mps) * 0.05 < 15.0
-
-
-@pytest.mark.parametrize("towards_deg", [0.0, 180.0])
-def test_a_current_does_not_make_the_speed_run_over(towards_deg: float) -> None:
-    path = straight(60.0)
-    flight = launch(path, "sparus2", "los", current=(0.05, towards_deg), following=True)
-    surge = flight.fly(60.0).estimate[:, vector.U]
-    assert surge.max() < 1.05 * 0.2
-    assert surge[-200:].mean() == pytest.approx(0.2, rel=0.02)
+    assert surge[-200:].mean() == pytest.approx(speed_mps, rel=0.01 if name == "alice" else 0.02)
+    assert name != "alice" or np.argmax(surge > 0.9 * speed_mps) * 0.05 < 15.0
 
 
 def test_far_off_the_path_it_heads_for_it_and_near_it_sways() -> None:
@@ -263,8 +251,3 @@ def test_mirrored_currents_mirror_the_flight() -> None:
         flight.guidance = flight.guidance._replace(point_body_m=np.array([0.55, 0.0, 0.08]))
         crossings.append(flight.fly(100.0).cross_m)
     np.testing.assert_allclose(crossings[0], -crossings[1], atol=1e-6)
-
-
-def test_the_same_flight_twice_is_the_same_to_the_last_bit() -> None:
-    tables = [launch(straight(20.0), current=(0.1, 60.0)).fly(120.0).table for _ in range(2)]
-    np.testing.assert_array_equal(tables[0], tables[1])

