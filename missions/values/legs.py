@@ -18,13 +18,11 @@ before, coming to rest after, and speeding up again.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 
@@ -135,25 +133,10 @@ class Route:
 
     def places(self, along_m: Array) -> Array:
         """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
-        result = np.empty((len(along_m), 2))
-        for leg, rows, within_m in self._by_leg(along_m):
-            result[rows] = leg.places(within_m)
-        return result
-
-    def headings_rad(self, along_m: Array) -> Array:
-        """Course of the route, (N,), at distances (N,); not wrapped within a leg."""
-        result = np.empty(len(along_m))
-        for leg, rows, within_m in self._by_leg(along_m):
-            result[rows] = leg.heading_rad + leg.curvature_per_m * within_m
-        return result
-
-    def _by_leg(self, along_m: Array) -> Iterator[tuple[Leg, NDArray[np.intp], Array]]:
-        """Each leg that is met, the indices of its distances, and these from its start."""
         starts = self.starts_m
         index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
-        order = np.argsort(index, kind="stable")
-        cuts = np.searchsorted(index[order], np.arange(len(self.legs) + 1))
-        for i, leg in enumerate(self.legs):
-            rows = order[cuts[i] : cuts[i + 1]]
-            if len(rows):
-                yield leg, rows, along_m[rows] - starts[i]
+        result = np.empty((len(along_m), 2))
+        for i in np.unique(index):
+            rows = index == i
+            result[rows] = self.legs[i].places(along_m[rows] - starts[i])
+        return result

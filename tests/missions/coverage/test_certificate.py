@@ -25,6 +25,7 @@ from tests.oracles_coverage import (
     lawnmower,
     middles_ne,
     pinhole_rig,
+    shifted,
     stations_at,
 )
 
@@ -177,7 +178,8 @@ def test_an_endless_pattern_is_seen_as_often_as_it_promises(
         return  # gaps are requested
     north_m, east_m = 2 * along_m, 2 * across_m
     lines = lawnmower(north_m, east_m, spacing_m, step_m, over_m=2 * across_m)
-    stations = stations_of_lines(lines, altitude_m).moved(shift * step_m, shift * spacing_m)
+    stations = stations_of_lines(lines, altitude_m)
+    stations = shifted(stations, shift * step_m, shift * spacing_m)
 
     seen = certificate(area_of(shapely.box(0, 0, north_m, east_m)), RIG, stations, asked)
 
@@ -195,7 +197,7 @@ def test_rectangles_are_seen_exactly_as_often_as_they_fit(spacing_m: float, step
     asked = sure_pattern(rig, 1.0, spacing_m, step_m)
     assert (asked.passes, asked.pictures) == (round(2 / spacing_m), round(1 / step_m))
     stations = stations_of_lines(lawnmower(3, 4, spacing_m, step_m, over_m=2.0), 1.0)
-    stations = stations.moved(0.0123, 0.0171)  # off the grid, so that no middle lies on an edge
+    stations = shifted(stations, 0.0123, 0.0171)  # off the grid, so that no middle lies on an edge
 
     seen = certificate(area_of(shapely.box(0, 0, 3, 4)), rig, stations, asked)
 

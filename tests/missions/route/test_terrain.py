@@ -47,8 +47,6 @@ def _floor(values: Array, cell_m: float = 0.5) -> Bathymetry:
         crs="EPSG:32636",
         from_pixel=(cell_m, 0.0, west, 0.0, -cell_m, north),
         depth_m=values,
-        vertical_datum="not named",
-        reading="depths",
     )
 
 
