@@ -293,7 +293,11 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         notes=tuple(notes),
         gaps=_gaps(nav),
     )
-    _tell(record)
+    # What was left out or assumed is in the caller's report.
+    for start_s, length_s in record.gaps[:8]:
+        warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
+    if len(record.gaps) > 8:
+        warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
     return record
 
 
@@ -382,14 +386,6 @@ def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
     steps = np.diff(nav.time_s)
     long = np.flatnonzero(steps > nav.longest_gap_s)
     return tuple((float(nav.time_s[i]), float(steps[i])) for i in long)
-
-
-def _tell(record: DiveRecord) -> None:
-    """Warn of gaps; what was left out or assumed is in the caller's report."""
-    for start_s, length_s in record.gaps[:8]:
-        warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
-    if len(record.gaps) > 8:
-        warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
 
 
 def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:

@@ -43,9 +43,9 @@ class Leg:
     """Course of the path at its start, from north."""
     length_m: float
     """0 of a turn on the spot."""
-    curvature_per_m: float
+    curvature_per_m: float = 0.0
     """Positive to starboard."""
-    line: int
+    line: int = -1
     """Index of the plan's line, or -1 between lines."""
     turn_rad: float = 0.0
     """How far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
@@ -100,19 +100,6 @@ class Leg:
         }
         data |= {key: value for key, value in rest.items() if value}
         return data | ({"line": self.line} if self.line >= 0 else {})
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> "Leg":
-        """The inverse of `to_json`."""
-        return cls(
-            start_ne_m=(float(data["start_ne_m"][0]), float(data["start_ne_m"][1])),
-            heading_rad=float(data["heading_rad"]),
-            length_m=float(data["length_m"]),
-            curvature_per_m=float(data.get("curvature_per_m", 0.0)),
-            line=int(data.get("line", -1)),
-            turn_rad=float(data.get("turn_rad", 0.0)),
-            side_rad=float(data.get("side_rad", 0.0)),
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

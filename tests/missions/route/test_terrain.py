@@ -151,7 +151,7 @@ def test_the_highest_floor_is_found_by_looking_everywhere(rough_m: float, off_m:
     exact = [
         highest_within(
             floor.depth_at, place.tolist(), heading, REACH.ahead_m, REACH.astern_m,
-            REACH.beside_m, 0.05,
+            REACH.aside_m, 0.05,
         )
         for place, heading in zip(places, headings, strict=True)
     ]  # fmt: skip
@@ -246,9 +246,9 @@ def test_the_reach_is_of_hull_or_pictures_whichever_is_farther() -> None:
         assert reach_of(hull, glass, 0.1, 0.1) == Reach(
             ahead_m=pytest.approx(ahead_m),
             astern_m=pytest.approx(astern_m),
-            beside_m=pytest.approx(0.276),
+            aside_m=pytest.approx(0.276),
         )
-    assert far == Reach(ahead_m=3.0, astern_m=3.0, beside_m=2.0)
+    assert far == Reach(ahead_m=3.0, astern_m=3.0, aside_m=2.0)
 
 
 def test_a_real_sea_floor_is_followed(shared_data: Path) -> None:
