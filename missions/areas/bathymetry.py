@@ -237,8 +237,8 @@ def _check_kind(path: Path) -> None:
         raise PlanError(f"{path}: cannot be read as a raster: {why(error)}") from None
     if start[:1] in (b"<", b"{"):
         raise PlanError(
-            f"{path}: is no raster but a description of other files: give those, or make one file "
-            "of them (gdal_translate)"
+            f"{path}: is not a raster but a description of other files: give those, or make one "
+            "file of them (gdal_translate)"
         )
 
 
@@ -293,7 +293,7 @@ def _flat_wkt(crs: str, path: Path) -> str:
     if system.is_compound:
         system = system.sub_crs_list[0]
     if not (system.is_projected or system.is_geographic):
-        raise PlanError(f"{path}: {system.name!r} is no map or geographic coordinate system")
+        raise PlanError(f"{path}: {system.name!r} is neither a map nor a geographic system")
     return str(system.to_wkt())
 
 

@@ -245,7 +245,7 @@ def usable_crs(crs: Any, origin: str) -> Any:
     flat = crs.to_2d()
     if not (flat.is_geographic or flat.is_projected):
         raise PlanError(
-            f"area: {origin}: {crs.name} ({crs.type_name}) is no map of the Earth: give a "
+            f"area: {origin}: {crs.name} ({crs.type_name}) is not a map of the Earth: give a "
             f"geographic or projected system, or crs = {LOCAL!r} for metres east and north of the "
             "datum"
         )

@@ -68,7 +68,7 @@ def read_area_file(
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise PlanError(
-            f"area: {path}: {suffix or 'no ending'!r} is no kind of file that is read; those are "
+            f"area: {path}: {suffix or 'no ending'!r} files are not read; those that are: "
             f"{', '.join(SUFFIXES)}"
         )
     if suffix == ".plan":
@@ -79,7 +79,7 @@ def read_area_file(
         try:
             text = read_bytes(path).decode("utf-8-sig")
         except UnicodeDecodeError:
-            raise PlanError(f"area: {path}: it is no text") from None
+            raise PlanError(f"area: {path}: it is not text") from None
         return read_wkt(path.name, text, crs)
     chosen = _choose(path, _layers(path, suffix), layer, role)
     return _placed(path, chosen, crs, role)
@@ -104,7 +104,7 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
             parse_crs(stated)
         except PlanError:
             raise PlanError(
-                f"area: {origin}: SRID={match.group(1)[:20]} is no coordinate system that is known"
+                f"area: {origin}: SRID={match.group(1)[:20]} is not a known coordinate system"
             ) from None
         if crs is not None and parse_crs(stated) != parse_crs(crs):
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")

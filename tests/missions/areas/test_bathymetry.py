@@ -84,7 +84,7 @@ def test_metadata_goes_before_the_sign(
     np.testing.assert_allclose(found.depth_m, sign * mixed)
 
 
-def test_a_shore_without_a_word_on_its_sign_is_asked_about(tmp_path: Path) -> None:
+def test_a_shore_without_a_word_on_its_sign_is_refused(tmp_path: Path) -> None:
     path = _written(tmp_path / "m.tif", _plane() - 15.5)
     with pytest.raises(PlanError, match=r"area\.bathymetry_values"):
         read_bathymetry(path, DATUM)

@@ -245,7 +245,7 @@ BOMB = (
         ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "cannot be read"),
         ("a.zip", b"PK no", "no zip archive"),
         ("a.kmz", b"", "empty"),
-        ("a.wkt", b"\xff", "no text"),
+        ("a.wkt", b"\xff", "not text"),
         ("a.wkt", b"POLYGON (0 0", "no well-known text"),
         ("a.dxf", b"0", "'.dxf'"),
     ],

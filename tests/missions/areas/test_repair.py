@@ -50,7 +50,7 @@ def box(north: float, east: float, height: float, width: float) -> tuple[tuple[f
         ),
         (((0, 0), (0, 0), (1, 1)), "2 distinct corners"),
         (((1, 1), (1, 1), (1, 1)), "1 distinct corners"),
-        (((0, 0), (5, 5), (10, 10)), "no size"),
+        (((0, 0), (5, 5), (10, 10)), "one line"),
         (((0, 0), (0, 1e-5), (1e-5, 0)), "distinct corner"),
         (((0, 0), (4, 0), (4, 4), (4, 0)), "near north 0.00 m, east 0.00 m"),
     ],

@@ -119,9 +119,9 @@ def test_a_line_that_fits_no_dive_is_named() -> None:
         _split(lines, 0.09)
     text = str(caught.value)
     alone = _of_dive(lines, 3, 3)[0] / 3600
-    told = re.match(r"line 3, 36 m long, takes ([\d.]+) Wh", text)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(alone, abs=1e-3)
+    found = re.match(r"line 3, 36 m long, takes ([\d.]+) Wh", text)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(alone, abs=1e-3)
     assert "a dive has 0.09 Wh" in text
     assert "home_ne_m" in text
     # battery_wh holds the reserve too: the number is not the one to set.

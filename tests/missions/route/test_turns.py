@@ -142,7 +142,7 @@ def uneven_costs(rng: np.random.Generator, sway_w: float) -> Costs:
 
 
 @pytest.mark.parametrize("turns", MODES)
-def test_turns_are_flown_as_asked(turns: Turns, capsys: pytest.CaptureFixture[str]) -> None:
+def test_turns_are_flown_as_requested(turns: Turns, capsys: pytest.CaptureFixture[str]) -> None:
     lines = lawn(6, 10.0, 1.0)
     route = route_through(lines, 0.5, 0.5, turns=turns)
 
@@ -179,7 +179,9 @@ def test_a_sway_step_keeps_the_heading_and_then_turns() -> None:
     check_joints(early)
 
 
-def test_what_has_no_room_is_flown_otherwise_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_has_no_room_is_flown_otherwise_with_a_warning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     lines = lawn(5, 10.0, 1.0)
     tight = Ways(multipolygon(box(0.0, -0.1, 10.0, 4.1)))
 
@@ -237,7 +239,7 @@ def test_home_is_left_towards_the_first_line_and_come_back_to() -> None:
     assert total_m([leg for leg in route.legs if leg.line < 0][:2]) == pytest.approx(5.0)
 
 
-def test_what_cannot_be_flown_is_told_in_one_line() -> None:
+def test_what_cannot_be_flown_is_refused() -> None:
     apart = multipolygon(box(-1, -1, 11, 3)).union(box(-1, 5, 11, 9))
     ways = Ways(multipolygon(apart))
     lines = [line((0.0, 0.0), (9.0, 0.0)), line((9.0, 6.0), (0.0, 6.0))]
