@@ -261,7 +261,7 @@ def terrain_report(
     """
     altitude = np.concatenate([profile.altitude_m for profile in profiles])
     low, high = float(altitude.min()), float(altitude.max())
-    floor_slopes = [_floor_slope(profile) for profile in profiles]
+    floor_slopes = [_steepest(np.arctan2(np.diff(p.floor_m), np.diff(p.along_m))) for p in profiles]
     slopes = [_steepest(profile.slopes_rad) for profile in profiles]
     climbing = [int(np.sum(p.clearance_m > limits.altitude_m + 1e-6)) for p in profiles]
     highest_on = int(np.argmax([profile.altitude_m.max() for profile in profiles]))
@@ -318,7 +318,3 @@ def _spread(low: float, high: float, finest: float) -> Array:
 
 def _steepest(slopes_rad: Array) -> float:
     return float(np.abs(slopes_rad).max(initial=0.0))
-
-
-def _floor_slope(profile: DepthProfile) -> float:
-    return _steepest(np.arctan2(np.diff(profile.floor_m), np.diff(profile.along_m)))
