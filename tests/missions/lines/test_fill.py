@@ -51,7 +51,7 @@ def test_what_a_pattern_leaves_unseen_is_found(
     assume(len(pieces) > 0)
     patches = unseen(to_uv(Site.of(area).survey, 0.0), pattern, offsets, pieces, cuts, 0.15)
 
-    points = points_in(survey, 8000)
+    points = points_in(survey, 60_000)
     lacking = ~seen_enough(pieces_as_lines(pieces, offsets), points, pattern)
     found = float((patches[:, LENGTH] * patches[:, WIDTH]).sum())
     # The points are as many as resolve this share of the area.
