@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon
 
+from alice_survey.base.frames import Array
+from missions.route.fence import point_inside
+from missions.route.ways import Ways
 from missions.values.costs import Costs, leg_costs, power_at
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
-
-Array = NDArray[np.float64]
 
 
 def shortest_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, float]) -> float:
@@ -139,3 +139,13 @@ def lawn(count: int, length_m: float, spacing_m: float) -> list[Line]:
 def total_m(legs: Sequence[Leg]) -> float:
     """Length of legs."""
     return sum(leg.length_m for leg in legs)
+
+
+def way_m(ways: Ways, a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Length of the shortest way between two places."""
+    return float(ways.lengths_m(np.array([a]), np.array([b]))[0])
+
+
+def inside(ways: Ways, places_ne: Array) -> list[bool]:
+    """Which places, (N, 2), are inside the allowed area."""
+    return [point_inside(ways.fence, north, east) for north, east in places_ne.tolist()]

@@ -51,10 +51,6 @@ class Bathymetry:
     centre of the first cell."""
     depth_m: Array
     """(rows, columns) below the vertical datum, positive down; NaN where it is not known."""
-    vertical_datum: str
-    """Vertical datum as the file names it."""
-    reading: str
-    """How the sign was determined, in words."""
 
     @cached_property
     def cell_m(self) -> float:
@@ -142,19 +138,8 @@ class Bathymetry:
         return _transformer(self.crs)
 
 
-@dataclass(frozen=True, kw_only=True)
-class AreaDepth:
-    """Depth of the sea floor over an area."""
-
-    mean_m: float
-    shallowest_m: float
-    deepest_m: float
-    known: float
-    """Share of the area where it is known."""
-
-
-def area_depth(bathymetry: Bathymetry, survey: MultiPolygon) -> AreaDepth:
-    """Mean and range of depth over an area, on a grid as fine as the raster's.
+def mean_depth_m(bathymetry: Bathymetry, survey: MultiPolygon) -> float:
+    """Mean depth over what is known of an area, on a grid as fine as the raster's.
 
     Raises:
         PlanError: the raster has no values there.
@@ -178,12 +163,7 @@ def area_depth(bathymetry: Bathymetry, survey: MultiPolygon) -> AreaDepth:
             f"{bathymetry.name}: knows no depth within the survey area; check area.bathymetry_file "
             "and the area's place"
         )
-    return AreaDepth(
-        mean_m=float(known.mean()),
-        shallowest_m=float(known.min()),
-        deepest_m=float(known.max()),
-        known=len(known) / len(depth),
-    )
+    return float(known.mean())
 
 
 def read_bathymetry(
@@ -221,10 +201,10 @@ def read_bathymetry(
                 raise PlanError(
                     f"{path}: names no coordinate system; give area.bathymetry_crs, as EPSG:32636"
                 )
-            flat, vertical = _systems(crs or file.crs.to_wkt(), file)
+            flat = _flat_wkt(crs or file.crs.to_wkt(), path)
             window = _window(path, file, flat, datum, bounds_ne)
             band = file.read(1, window=Window(*window), masked=True)
-            heights, reading = _sense(path, file, band, sense)
+            heights = sense == "heights" if sense != "auto" else _are_heights(path, file, band)
             scale, offset = file.scales[0], file.offsets[0]
             a, b, c, d, e, f = tuple(file.transform)[:6]
     except (RasterioError, OSError, ValueError, MemoryError) as error:
@@ -241,8 +221,6 @@ def read_bathymetry(
         crs=flat,
         from_pixel=(a, b, c + a * column + b * row, d, e, f + d * column + e * row),
         depth_m=-values if heights else values,
-        vertical_datum=vertical,
-        reading=reading,
     )
 
 
@@ -259,8 +237,8 @@ def _check_kind(path: Path) -> None:
         raise PlanError(f"{path}: cannot be read as a raster: {why(error)}") from None
     if start[:1] in (b"<", b"{"):
         raise PlanError(
-            f"{path}: is no raster but tells of other files: give those, or make one file of them "
-            "(gdal_translate)"
+            f"{path}: is not a raster but a description of other files: give those, or make one "
+            "file of them (gdal_translate)"
         )
 
 
@@ -303,8 +281,8 @@ def _transformer(crs: str) -> Any:
     return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
 
 
-def _systems(crs: str, file: Any) -> tuple[str, str]:
-    """WKT of the horizontal coordinate system, and the name of the vertical datum."""
+def _flat_wkt(crs: str, path: Path) -> str:
+    """WKT of the horizontal coordinate system."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -312,28 +290,11 @@ def _systems(crs: str, file: Any) -> tuple[str, str]:
         system = CRS.from_user_input(crs)
     except CRSError:
         raise PlanError(f"coordinate system {crs!r} is not known; give one as EPSG:32636") from None
-    vertical = "not named"
     if system.is_compound:
-        flat, height = system.sub_crs_list[:2]
-        vertical, system = str(height.name), flat
-    else:
-        vertical = _bag_vertical_datum(file) or vertical
+        system = system.sub_crs_list[0]
     if not (system.is_projected or system.is_geographic):
-        raise PlanError(f"{file.name}: {system.name!r} is no map or geographic coordinate system")
-    return system.to_wkt(), vertical
-
-
-def _bag_vertical_datum(file: Any) -> str | None:
-    """The code below `verticalDatum` in the metadata of a BAG."""
-    if "xml:BAG" not in file.tag_namespaces():
-        return None
-    import re
-
-    text = " ".join(str(value) for value in file.tags(ns="xml:BAG").values())
-    found = re.search(r"<(?:\w+:)?verticalDatum>.*?<(?:\w+:)?code>\s*([^<]+?)\s*<", text, re.S)
-    if found is None:
-        found = re.search(r'VERT_?(?:CS|CRS|DATUM|_DATUM)?\["([^"]+)"', text)
-    return found.group(1) if found else None
+        raise PlanError(f"{path}: {system.name!r} is neither a map nor a geographic system")
+    return str(system.to_wkt())
 
 
 def _window(
@@ -383,34 +344,31 @@ def _window(
     return window
 
 
-def _sense(path: Path, file: Any, band: Any, sense: Sense) -> tuple[bool, str]:
-    """Whether values are heights, and how that was determined."""
-    if sense != "auto":
-        return sense == "heights", f"{sense}, as requested"
+def _are_heights(path: Path, file: Any, band: Any) -> bool:
+    """Whether values are heights, as the file states it or as their signs show."""
     values = band.compressed()
     values = values[np.isfinite(values)]
     below = float(np.mean(values < 0)) if len(values) else 0.0
-    heights = _told_sense(file)
-    if heights is None:
+    stated = _stated_sense(file)
+    if stated is None:
         if _ONE_SIGN > below > 1 - _ONE_SIGN:
             raise PlanError(
                 f"{path}: {below:.0%} of its values are negative, so that it is not clear "
                 "whether they are heights or depths; set area.bathymetry_values to one of them"
             )
-        share = f"{below:.0%} of its values are negative"
-        return below >= _ONE_SIGN, f"{'heights' if below >= _ONE_SIGN else 'depths'}, since {share}"
-    as_heights, why = heights
-    dry = 1 - below if as_heights else below
+        return below >= _ONE_SIGN
+    heights, why = stated
+    dry = 1 - below if heights else below
     if len(values) and dry > _ONE_SIGN:
-        other = "depths" if as_heights else "heights"
+        other = "depths" if heights else "heights"
         warn(
             f"{path}: by its {why} nearly all of it ({dry:.0%}) is above water; if its values are "
             f"{other}, set area.bathymetry_values = '{other}'"
         )
-    return as_heights, f"{'heights' if as_heights else 'depths'}, by its {why}"
+    return heights
 
 
-def _told_sense(file: Any) -> tuple[bool, str] | None:
+def _stated_sense(file: Any) -> tuple[bool, str] | None:
     """Whether values are heights, and what says so."""
     if file.driver == "BAG":
         return True, "format (BAG: elevations)"

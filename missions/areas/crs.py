@@ -99,10 +99,15 @@ class LocalFrame:
         else:
             advice = "move the datum or check the corner"
         raise PlanError(
-            f"area: {raw.origin}: {name + ', ' if name else ''}corner {worst + 1}{where} is "
+            f"{corner_name(raw.origin, name, worst)}{where} is "
             f"{far.max() / 1e3:.0f} km from the datum {datum}; at most {FARTHEST_M / 1e3:.0f} km: "
             f"{advice}"
         )
+
+
+def corner_name(origin: str, name: str, index: int) -> str:
+    """Such as `area: reef.kml: polygon 2, corner 3`."""
+    return f"area: {origin}: {name + ', ' if name else ''}corner {index + 1}"
 
 
 def check_finite(corners: Array, origin: str, name: str) -> None:
@@ -116,8 +121,7 @@ def check_finite(corners: Array, origin: str, name: str) -> None:
         first = int(bad.argmax())
         values = ", ".join(f"{value:g}" for value in corners[first])
         raise PlanError(
-            f"area: {origin}: {name + ', ' if name else ''}corner {first + 1} is ({values}): "
-            "coordinates must be numbers"
+            f"{corner_name(origin, name, first)} is ({values}): coordinates must be numbers"
         )
 
 
@@ -159,7 +163,7 @@ def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
         if bad.any():
             first = int(bad.argmax())
             raise PlanError(
-                f"area: {raw.origin}: {name + ', ' if name else ''}corner {first + 1} at x "
+                f"{corner_name(raw.origin, name, first)} at x "
                 f"{yx[first, 1]:.10g}, y {yx[first, 0]:.10g} has no place in {crs.name}: check crs"
             )
         # PROJ reports no operation where there is nothing to change.
@@ -188,7 +192,7 @@ def check_latitudes(lat_lon: Array, origin: str, name: str) -> None:
     worst = int(np.abs(lat_lon[:, 0]).argmax())
     if abs(lat_lon[worst, 0]) > _HIGHEST_LATITUDE_DEG:
         raise PlanError(
-            f"area: {origin}: {name + ', ' if name else ''}corner {worst + 1} is at latitude "
+            f"{corner_name(origin, name, worst)} is at latitude "
             f"{lat_lon[worst, 0]:.6g}, longitude {lat_lon[worst, 1]:.6g}; areas are planned up to "
             f"{_HIGHEST_LATITUDE_DEG:g} degrees north and south: are the two swapped?"
         )
@@ -211,7 +215,7 @@ def _check_degrees(lat_lon: Array, origin: str, name: str, crs: Any) -> None:
         else "are latitude and longitude swapped?"
     )
     raise PlanError(
-        f"area: {origin}: {name + ', ' if name else ''}corner {first + 1} has longitude {lon:.10g} "
+        f"{corner_name(origin, name, first)} has longitude {lon:.10g} "
         f"and latitude {lat:.10g} in {crs.name}: {advice}"
     )
 
@@ -245,7 +249,7 @@ def usable_crs(crs: Any, origin: str) -> Any:
     flat = crs.to_2d()
     if not (flat.is_geographic or flat.is_projected):
         raise PlanError(
-            f"area: {origin}: {crs.name} ({crs.type_name}) is no map of the Earth: give a "
+            f"area: {origin}: {crs.name} ({crs.type_name}) is not a map of the Earth: give a "
             f"geographic or projected system, or crs = {LOCAL!r} for metres east and north of the "
             "datum"
         )

@@ -6,7 +6,7 @@ GDAL, through pyogrio, reads them; it is loaded only when a file is read. Height
 import re
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from alice_survey.base.config import sides_of
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import PlanError, warn
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
+from missions.areas.qgc_plan import read_qgc_plan
 from missions.areas.raw import RawShapes, from_geometries
 from missions.areas.safe import (
     check_kml,
@@ -67,19 +68,18 @@ def read_area_file(
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise PlanError(
-            f"area: {path}: {suffix or 'no ending'!r} is no kind of file that is read; those are "
+            f"area: {path}: {suffix or 'no ending'!r} files are not read; those that are: "
             f"{', '.join(SUFFIXES)}"
         )
     if suffix == ".plan":
-        from missions.areas.qgc_plan import read_qgc_plan
-
         return read_qgc_plan(path, layer, role)
     if suffix == ".wkt":
-        _no_layer(path, layer, role)
+        if layer is not None:
+            raise PlanError(f"area: {path}: it has no layers: leave out {_LAYER_SETTING[role]}")
         try:
             text = read_bytes(path).decode("utf-8-sig")
         except UnicodeDecodeError:
-            raise PlanError(f"area: {path}: it is no text") from None
+            raise PlanError(f"area: {path}: it is not text") from None
         return read_wkt(path.name, text, crs)
     chosen = _choose(path, _layers(path, suffix), layer, role)
     return _placed(path, chosen, crs, role)
@@ -104,7 +104,7 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
             parse_crs(stated)
         except PlanError:
             raise PlanError(
-                f"area: {origin}: SRID={match.group(1)[:20]} is no coordinate system that is known"
+                f"area: {origin}: SRID={match.group(1)[:20]} is not a known coordinate system"
             ) from None
         if crs is not None and parse_crs(stated) != parse_crs(crs):
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
@@ -112,12 +112,14 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
     if _depth(text) > _DEEPEST:
         raise PlanError(f"area: {origin}: no well-known text: it nests over {_DEEPEST} brackets")
     try:
-        with np.errstate(invalid="ignore"):  # NaN is reported with its corner later
-            geometry = shapely.from_wkt(text.strip())
-    except shapely.errors.ShapelyError as first:
-        geometry = _closed_wkt(origin, text.strip(), str(first))
+        geometry = _geometry(shapely.from_wkt, text.strip(), origin)
+    except shapely.errors.ShapelyError as error:
+        what = shown(str(error)) or "it cannot be read"
+        raise PlanError(
+            f"area: {origin}: no well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
+        ) from None
     shapes = from_geometries(origin, [geometry])
-    _check_count(shapes)
+    _refuse_corners(shapes.origin, len(shapes.coordinates))
     if shapes.is_empty:
         raise PlanError(f"area: {origin}: it is empty")
     if crs is None or crs == LOCAL:
@@ -134,23 +136,24 @@ def _depth(text: str) -> int:
     return deepest
 
 
-def _closed_wkt(origin: str, text: str, reason: str) -> BaseGeometry:
-    """Text that shapely refuses; read when only its rings are not closed."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        geometry = shapely.from_wkt(text, on_invalid="fix")
-    if geometry is None:
-        what = shown(reason) or "it cannot be read"
-        raise PlanError(
-            f"area: {origin}: no well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
-        )
-    warn(f"area: {origin}: a ring that is not closed is closed")
+def _geometry(read: Callable[..., Any], content: str | bytes, where: str) -> BaseGeometry:
+    """A geometry that shapely reads, if need be by closing its rings.
+
+    Raises:
+        ShapelyError: it cannot be read.
+    """
+    geometry: BaseGeometry | None
+    try:
+        with np.errstate(invalid="ignore"):  # NaN is reported with its corner later
+            geometry = read(content)
+    except shapely.errors.ShapelyError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            geometry = read(content, on_invalid="fix")
+        if geometry is None:
+            raise
+        warn(f"area: {where}: a ring that is not closed is closed")
     return geometry
-
-
-def _no_layer(path: Path, layer: str | None, role: Role) -> None:
-    if layer is not None:
-        raise PlanError(f"area: {path}: it has no layers: leave out {_LAYER_SETTING[role]}")
 
 
 def _layers(path: Path, suffix: str) -> list[_Layer]:
@@ -263,26 +266,14 @@ def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str
     for i, blob in enumerate(wkb, 1):
         if blob is None:
             continue
+        where = f"{origin}: feature {i}"
         try:
-            with np.errstate(invalid="ignore"):
-                geometry = shapely.from_wkb(blob)
+            geometries.append(_geometry(shapely.from_wkb, blob, where))
         except shapely.errors.ShapelyError as error:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                geometry = shapely.from_wkb(blob, on_invalid="fix")
-            if geometry is None:
-                raise PlanError(
-                    f"area: {origin}: feature {i}: {str(error).strip().splitlines()[0]}"
-                ) from None
-            warn(f"area: {origin}: feature {i}: a ring that is not closed is closed")
-        geometries.append(geometry)
+            raise PlanError(f"area: {where}: {str(error).strip().splitlines()[0]}") from None
     shapes = from_geometries(origin, geometries)
-    _check_count(shapes)
-    return shapes
-
-
-def _check_count(shapes: RawShapes) -> None:
     _refuse_corners(shapes.origin, len(shapes.coordinates))
+    return shapes
 
 
 def _refuse_corners(origin: str, count: int) -> None:

@@ -138,7 +138,7 @@ def from_geometries(origin: str, geometries: Iterable[BaseGeometry]) -> RawShape
         elif hasattr(geometry, "geoms"):
             waiting += list(geometry.geoms)[::-1]
         else:
-            raise PlanError(f"area: {origin}: a {geometry.geom_type} is no area")
+            raise PlanError(f"area: {origin}: a {geometry.geom_type} is not an area")
     return RawShapes(
         origin=origin,
         geographic=False,

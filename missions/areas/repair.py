@@ -154,7 +154,7 @@ def _ring_area(ring: Array, name: str, report: _Reporter) -> Polygon | MultiPoly
     if MultiPolygon([Polygon(corners)]).convex_hull.area < _NO_SIZE_M2:
         raise report.refuse(
             name,
-            f"{Polygon(corners).convex_hull.area:.2g} m2 is no size; its corners lie on one line "
+            f"{Polygon(corners).convex_hull.area:.2g} m2 is too small; its corners lie on one line "
             f"through {report.at(corners[0])}",
         )
     corners = _without_spikes(corners, name, report)

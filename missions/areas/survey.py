@@ -1,4 +1,4 @@
-"""From settings to the area to survey and the area where the vehicle may be."""
+"""From settings, shapes and files, to the area to survey and where the vehicle may be."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,8 @@ from alice_survey.base.config import AreaConfig
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
-from missions.areas.raw import RawShapes
+from missions.areas.files import read_area_file, read_wkt
+from missions.areas.raw import RawLine, RawShapes, from_rings, no_points
 from missions.areas.repair import (
     GRID_M,
     Repaired,
@@ -23,7 +24,6 @@ from missions.areas.repair import (
     widened,
     without_slivers,
 )
-from missions.areas.shapes import allowed_shapes, no_go_shapes, survey_shapes
 from missions.values.area import Area, multipolygon
 
 _SMALL_SHARE = 1e-6
@@ -45,10 +45,10 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     Raises:
         PlanError: a shape cannot be used; the message names the source and the place.
     """
-    raw = survey_shapes(settings)
-    no_go_raw = [*no_go_shapes(settings), *([raw.no_go] if raw.no_go is not None else [])]
-    allowed_raw = allowed_shapes(settings)
-    frame = local_frame(settings, raw)
+    raw = _survey_shapes(settings)
+    no_go_raw = [*_no_go_shapes(settings), *([raw.no_go] if raw.no_go is not None else [])]
+    allowed_raw = _allowed_shapes(settings)
+    frame = _local_frame(settings, raw)
     shape = _polygons(raw, frame, settings.corridor_width_m)
     clearance_m = settings.no_go_clearance_m
     zones = [(raw.origin, widened(shape.holes, clearance_m))]
@@ -81,7 +81,7 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     return area
 
 
-def local_frame(settings: AreaConfig, raw: RawShapes) -> LocalFrame:
+def _local_frame(settings: AreaConfig, raw: RawShapes) -> LocalFrame:
     """The frame that the area is planned in: at the datum that is set, else at the middle.
 
     Raises:
@@ -124,7 +124,7 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
         return shape
     widths_m = [line.width_m or corridor_width_m for line in local.lines]
     strips = [
-        corridor(line.points, width_m, local.origin, local.line_name(i))
+        _corridor(line.points, width_m, local.origin, local.line_name(i))
         for i, (line, width_m) in enumerate(zip(local.lines, widths_m, strict=True))
     ]
     if raw.polygons:
@@ -243,7 +243,7 @@ def _widest_gap_m(parts: Sequence[BaseGeometry]) -> float:
     return widest
 
 
-def corridor(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
+def _corridor(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
     """The strip along a line.
 
     Raises:
@@ -253,3 +253,71 @@ def corridor(points: Array, width_m: float, origin: str, name: str) -> BaseGeome
     if len(apart) < 2:
         raise PlanError(f"area: {origin}: {name}: {len(apart)} distinct points; it needs 2 or more")
     return buffered_line(apart, width_m)
+
+
+def _survey_shapes(settings: AreaConfig) -> RawShapes:
+    """The shape to survey, as it was given; a rectangle at the datum unless there is another.
+
+    Raises:
+        PlanError: a file or text cannot be read.
+    """
+    if settings.file is not None:
+        return read_area_file(settings.file, settings.layer, settings.crs)
+    if settings.wkt is not None:
+        return read_wkt("wkt", settings.wkt, settings.crs)
+    for name in ("corridor_ne_m", "corridor_latlon_deg"):
+        points = getattr(settings, name)
+        if points is not None:
+            line = RawLine(points=np.asarray(points, dtype=np.float64))
+            return RawShapes(
+                origin=name, geographic="latlon" in name, lines=(line,), points=no_points()
+            )
+    for name in ("polygon_ne_m", "polygon_latlon_deg"):
+        corners = getattr(settings, name)
+        if corners is not None:
+            return from_rings(name, [corners], geographic="latlon" in name)
+    return from_rings("rectangle", [_rectangle(settings)], geographic=False)
+
+
+def _no_go_shapes(settings: AreaConfig) -> list[RawShapes]:
+    """The zones to keep out of, by source.
+
+    Raises:
+        PlanError: a file cannot be read.
+    """
+    zones = []
+    for name in ("no_go_ne_m", "no_go_latlon_deg"):
+        rings = getattr(settings, name)
+        if rings:
+            zones.append(from_rings(name, rings, geographic="latlon" in name))
+    if settings.no_go_file is not None:
+        zones.append(
+            read_area_file(settings.no_go_file, settings.no_go_layer, settings.crs, role="no_go")
+        )
+    return zones
+
+
+def _allowed_shapes(settings: AreaConfig) -> RawShapes | None:
+    """Where the vehicle may be, or None where the settings do not say it.
+
+    Raises:
+        PlanError: a file cannot be read.
+    """
+    for name in ("allowed_ne_m", "allowed_latlon_deg"):
+        corners = getattr(settings, name)
+        if corners is not None:
+            return from_rings(name, [corners], geographic="latlon" in name)
+    if settings.allowed_file is None:
+        return None
+    return read_area_file(
+        settings.allowed_file, settings.allowed_layer, settings.crs, role="allowed"
+    )
+
+
+def _rectangle(settings: AreaConfig) -> Array:
+    """Corners (4, 2): the length along the heading, the width to the right of it."""
+    heading = math.radians(settings.heading_deg)
+    along = settings.length_m * np.array([math.cos(heading), math.sin(heading)])
+    right = settings.width_m * np.array([-math.sin(heading), math.cos(heading)])
+    corners: Array = np.array([0 * along, along, along + right, right])
+    return corners if settings.datum_at == "corner" else corners - (along + right) / 2

@@ -275,7 +275,8 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         time_s=time_s,
     )
     _check_place(path, plan, stations)
-    high, below = _unusable(stations, plan)
+    high = stations.altitude_m > MOST_ALTITUDES * plan.altitude_m
+    below = stations.altitude_m <= 0
     stations = stations.some(~(high | below))
     if triggers.line is None:
         stations = replace(stations, line=assign_lines(stations, plan))
@@ -293,7 +294,11 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         notes=tuple(notes),
         gaps=_gaps(nav),
     )
-    _tell(record)
+    # What was left out or assumed is in the caller's report.
+    for start_s, length_s in record.gaps[:8]:
+        warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
+    if len(record.gaps) > 8:
+        warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
     return record
 
 
@@ -359,11 +364,6 @@ def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
         )
 
 
-def _unusable(stations: Stations, plan: Plan) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(S,) whether stations are too high above the sea floor, and whether they are not above it."""
-    return stations.altitude_m > MOST_ALTITUDES * plan.altitude_m, stations.altitude_m <= 0
-
-
 def _outside_lines(time_s: Array, stations: Stations) -> NDArray[np.bool_]:
     """(N,) whether times are before the first or after the last station on a line."""
     if stations.time_s is None or not np.any(stations.line >= 0):
@@ -382,14 +382,6 @@ def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
     steps = np.diff(nav.time_s)
     long = np.flatnonzero(steps > nav.longest_gap_s)
     return tuple((float(nav.time_s[i]), float(steps[i])) for i in long)
-
-
-def _tell(record: DiveRecord) -> None:
-    """Warn of gaps; what was left out or assumed is in the caller's report."""
-    for start_s, length_s in record.gaps[:8]:
-        warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
-    if len(record.gaps) > 8:
-        warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
 
 
 def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
@@ -413,18 +405,11 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
         here &= across < nearest_m
         line[here] = index
         nearest_m[here] = across[here]
-    return _with_runs(line, stations, plan)
-
-
-def _with_runs(line: NDArray[np.intp], stations: Stations, plan: Plan) -> NDArray[np.intp]:
-    """Number straight runs of stations that belong to no line."""
-    result = line.copy()
-    following = len(plan.lines)
-    for run in _runs(line, stations, 3.0 * plan.station_spacing_m):
-        if len(run) >= _LEAST_RUN:
-            result[run] = following
-            following += 1
-    return result
+    runs = _runs(line, stations, 3.0 * step_m)
+    long = [run for run in runs if len(run) >= _LEAST_RUN]
+    for number, run in enumerate(long, len(plan.lines)):
+        line[run] = number
+    return line
 
 
 def _runs(line: NDArray[np.intp], stations: Stations, longest_m: float) -> list[list[int]]:

@@ -217,12 +217,7 @@ def _resampled(
     area: Area, grid: Grid, values: Array
 ) -> tuple[Any, tuple[float, float, float, float]]:
     places, extent = _pixels(area, grid.cell_m)
-    cells = np.floor(grid.cells_of(places)).astype(np.int64)
-    row, column = cells[..., 0], cells[..., 1]
-    on = (row >= 0) & (row < grid.rows) & (column >= 0) & (column < grid.columns)
-    found = np.full(on.shape, np.nan)
-    found[on] = values[row[on], column[on]]
-    return np.ma.masked_invalid(found), extent
+    return np.ma.masked_invalid(grid.sampled(values, places, math.nan)), extent
 
 
 def _pixels(area: Area, cell_m: float) -> tuple[Array, tuple[float, float, float, float]]:

@@ -85,15 +85,9 @@ def sampled(
     certificate: Certificate, values: NDArray[np.uint16], places_ne: Array
 ) -> NDArray[np.uint16]:
     """Values of the cells that hold places (..., 2); `NO_DATA` outside of the area."""
-    grid = certificate.grid
-    cells = np.floor(grid.cells_of(places_ne)).astype(np.int64)
-    row, column = cells[..., 0], cells[..., 1]
-    on = (row >= 0) & (row < grid.rows) & (column >= 0) & (column < grid.columns)
-    found = np.full(on.shape, NO_DATA, np.uint16)
-    row, column = row[on], column[on]
-    known = np.minimum(values[row, column], NO_DATA - 1)
-    found[on] = np.where(certificate.inside[row, column], known, NO_DATA)
-    return found
+    inside = certificate.grid.sampled(certificate.inside, places_ne, False)
+    found = certificate.grid.sampled(values, places_ne, NO_DATA)
+    return np.where(inside, np.minimum(found, NO_DATA - 1), np.uint16(NO_DATA))
 
 
 def _between(corners: Array, rows: int, columns: int) -> Array:

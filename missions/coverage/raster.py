@@ -8,6 +8,7 @@ that holds a circle of 0.71 cells radius cannot be missed.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import shapely
@@ -56,6 +57,15 @@ class Grid:
         """The inverse of `cells_of`."""
         places: Array = np.array(self.origin_ne) + self.cell_m * (cells @ self.axes)
         return places
+
+    def sampled(self, values: NDArray[Any], places_ne: Array, outside: float) -> NDArray[Any]:
+        """Values, (rows, columns), of the cells that hold places (..., 2), or a value outside."""
+        cells = np.floor(self.cells_of(places_ne)).astype(np.int64)
+        row, column = cells[..., 0], cells[..., 1]
+        on = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        found = np.full(on.shape, outside, values.dtype)
+        found[on] = values[row[on], column[on]]
+        return found
 
     def part(self, row: int, column: int, rows: int, columns: int) -> "Grid":
         """Some of its cells, from a row and a column on; what is beyond its ends is left out."""

@@ -66,20 +66,6 @@ class Stations:
             time_s=None if self.time_s is None else self.time_s[chosen],
         )
 
-    def and_then(self, other: "Stations") -> "Stations":
-        """These stations and those of a later dive; its lines count on, its times are not kept."""
-        after = int(self.line.max(initial=-1)) + 1
-        return Stations(
-            glass_ne=np.concatenate([self.glass_ne, other.glass_ne]),
-            altitude_m=np.concatenate([self.altitude_m, other.altitude_m]),
-            attitude_rad=np.concatenate([self.attitude_rad, other.attitude_rad]),
-            line=np.concatenate([self.line, np.where(other.line < 0, -1, other.line + after)]),
-        )
-
-    def moved(self, north_m: float, east_m: float) -> "Stations":
-        """The same stations elsewhere."""
-        return replace(self, glass_ne=self.glass_ne + np.array([north_m, east_m]))
-
 
 def stations_of_lines(lines: Sequence[Line], altitude_m: Array | float) -> Stations:
     """The stations of lines flown exactly, by a level vehicle.

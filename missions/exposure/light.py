@@ -339,7 +339,7 @@ def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: fl
     signal = floor_radiance(rig, imaging, water, altitude_m, centre)
     share = veil / (veil + signal)
     return Scatter(
-        veil_share=(float(share[0]), float(share[1]), float(share[2])),
+        veil_share=_triple(share),
         lit_from_m=min(
             max(0.0, _reach(strobe) / math.tan(half_beam) + strobe[2] - glass_z)
             for strobe in strobes

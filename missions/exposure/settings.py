@@ -14,6 +14,7 @@ from alice_survey.base.config import (
     WaterConfig,
 )
 from alice_survey.base.errors import PlanError, warn
+from camera_calib.fov.table import json_row
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from missions.exposure.focus import Focus, focus_rows, plan_focus, too_open
@@ -127,7 +128,7 @@ class ImagingSettings:
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON values."""
         data = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rows"}
-        plain = {k: v if isinstance(v, float) else _finite(asdict(v)) for k, v in data.items()}
+        plain = {k: v if isinstance(v, float) else json_row(asdict(v)) for k, v in data.items()}
         return {**plain, "rows": [row.to_json() for row in self.rows]}
 
 
@@ -262,11 +263,3 @@ def _slow_cable(storage: Storage, interval_s: float) -> str:
         f"{1 / interval_s:.3g} triggers a second are more than the {storage.shared_link_hz:.3g} "
         "that one Gigabit cable carries of all cameras: give each a cable of its own"
     )
-
-
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with inf and NaN, which JSON does not know, as None."""
-    return {
-        key: None if isinstance(value, float) and not abs(value) < float("inf") else value
-        for key, value in values.items()
-    }

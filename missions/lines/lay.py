@@ -258,18 +258,10 @@ def _connected_m(leave: Array, enter: Array, ways: Ways) -> Array:
 
 def _ends_ne(pieces: Array, offsets: Array, heading_rad: float) -> Array:
     """North and east of begin and end of every piece, (P, 4)."""
-    c, s = math.cos(heading_rad), math.sin(heading_rad)
     across = offsets[pieces[:, 0].astype(np.intp)]
-    begin, end = pieces[:, 1], pieces[:, 2]
-    return np.stack(
-        [
-            begin * c - across * s,
-            begin * s + across * c,
-            end * c - across * s,
-            end * s + across * c,
-        ],
-        axis=1,
-    )
+    ends = np.stack([pieces[:, 1], across, pieces[:, 2], across], axis=1)
+    turned: Array = rows.to_uv(ends, -heading_rad)
+    return turned
 
 
 def _linked(
@@ -311,15 +303,8 @@ def _cross(
         max(1, pattern.pictures - 1),
         count,
     )
-    c, s = math.cos(heading_rad), math.sin(heading_rad)
-    along, low, high = found[:, 0], found[:, 1], found[:, 2]
-    ends = [
-        along * c - low * s,
-        along * s + low * c,
-        along * c - high * s,
-        along * s + high * c,
-    ]
-    return np.stack(ends, axis=1), found[:, 3].astype(np.int64)
+    ends = rows.to_uv(np.ascontiguousarray(found[:, [0, 1, 0, 2]]), -heading_rad)
+    return ends, found[:, 3].astype(np.int64)
 
 
 def _piece_at(begins: NDArray[np.int64], listed: NDArray[np.int64]) -> NDArray[np.int64]:

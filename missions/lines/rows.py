@@ -80,8 +80,8 @@ def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, pa
         passes: least number of rows.
     """
     steps = max(math.ceil((high_m - low_m + 2 * edge_m) / spacing_m - _EVEN), passes - 1, 0)
-    offsets: Array = (low_m + high_m) / 2 + spacing_m * (np.arange(steps + 1) - steps / 2)
-    return offsets
+    places = np.arange(steps + 1, dtype=np.float64) - steps / 2
+    return (low_m + high_m) / 2 + spacing_m * places
 
 
 @compiled

@@ -70,8 +70,6 @@ class Sweep:
     """Heading for which the total width of all cells is least."""
     width_m: float
     """Total width of all cells: how many lines are needed, times their spacing."""
-    candidates: tuple[tuple[float, float], ...]
-    """Heading, rad, and full cost, J, wherever that was taken, by heading."""
 
 
 @step("look for the best heading")
@@ -140,7 +138,6 @@ def best_heading(
         cost_j=found[best],
         width_heading_rad=width_heading,
         width_m=width,
-        candidates=tuple(sorted(found.items())),
     )
 
 

@@ -19,7 +19,7 @@ from alice_survey.base.errors import PlanError, heard, warn
 from alice_survey.vehicle.hull import Hull
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
-from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
+from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import (
@@ -255,15 +255,15 @@ def _depth_m(settings: AreaConfig, area: Area, bathymetry: Bathymetry | None) ->
     set_m = settings.seafloor_depth_m
     if bathymetry is None:
         return set_m
-    found = area_depth(bathymetry, area.survey)
+    mean_m = mean_depth_m(bathymetry, area.survey)
     is_set = "seafloor_depth_m" in settings.model_fields_set
-    if is_set and abs(found.mean_m - set_m) > max(0.5, 0.05 * set_m):
+    if is_set and abs(mean_m - set_m) > max(0.5, 0.05 * set_m):
         warn(
-            f"{bathymetry.name}: the sea floor of the area is {found.mean_m:.2f} m deep in the "
-            f"mean, area.seafloor_depth_m is {set_m:g}: the plan uses {found.mean_m:.2f}; set "
+            f"{bathymetry.name}: the sea floor of the area is {mean_m:.2f} m deep in the "
+            f"mean, area.seafloor_depth_m is {set_m:g}: the plan uses {mean_m:.2f}; set "
             "area.seafloor_depth_m to it, for light and refraction"
         )
-    return found.mean_m
+    return mean_m
 
 
 @dataclass(frozen=True, kw_only=True)

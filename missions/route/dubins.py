@@ -10,51 +10,13 @@ import math
 import numpy as np
 
 from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
-from missions.route.fence import OPEN_WATER, Fence, arc_inside
-from missions.values.legs import Leg
+from missions.route.fence import Fence, arc_inside
 
 _SAME_M = 1e-6
 _TINY = 1e-9
 _SAME_RAD = 1e-9
 _FULL = 2 * math.pi
-
-
-def turn(
-    start_ne_m: tuple[float, float],
-    start_heading_rad: float,
-    goal_ne_m: tuple[float, float],
-    goal_heading_rad: float,
-    radius_m: float,
-    fence: Fence = OPEN_WATER,
-) -> list[Leg]:
-    """The shortest path between two places with headings, of straights and arcs of one radius.
-
-    Raises:
-        PlanError: each of the six kinds leaves the fence.
-    """
-    start = np.array([*start_ne_m, start_heading_rad])
-    goal = np.array([*goal_ne_m, goal_heading_rad])
-    pieces = shortest_turn(fence, start, goal, radius_m)
-    if math.isinf(pieces[0, 1]):
-        raise PlanError(
-            f"no turn of radius {radius_m:g} m from {start_ne_m} to {goal_ne_m} stays inside the "
-            "allowed area"
-        )
-    legs: list[Leg] = []
-    place, heading = start_ne_m, start_heading_rad
-    for curvature, length in pieces.tolist():
-        leg = Leg(
-            start_ne_m=place,
-            heading_rad=heading,
-            length_m=length,
-            curvature_per_m=curvature,
-            line=-1,
-        )
-        legs.append(leg)
-        place, heading = leg.end_ne_m, leg.end_heading_rad
-    return legs
 
 
 @compiled_ieee

@@ -277,15 +277,15 @@ def motion(courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: 
     north, east = np.broadcast_to(current_ne_mps, (len(courses_rad), 2)).T
     sine, cosine = np.sin(courses_rad), np.cos(courses_rad)
     ahead = speed_mps - (north * cosine + east * sine)
-    beside = -(east * cosine - north * sine)
+    across = -(east * cosine - north * sine)
     nu = np.zeros((len(courses_rad), 6))
     if manner == "held":
-        nu[:, 0], nu[:, 1] = ahead, beside
+        nu[:, 0], nu[:, 1] = ahead, across
         return Motion(nu=nu, crab_rad=np.zeros(len(nu)), possible=np.ones(len(nu)))
-    nu[:, 0] = np.hypot(ahead, beside)
+    nu[:, 0] = np.hypot(ahead, across)
     return Motion(
         nu=nu,
-        crab_rad=np.arctan2(beside, ahead),
+        crab_rad=np.arctan2(across, ahead),
         possible=np.where(ahead > 0.0, 1.0, np.nan),
     )
 
@@ -343,12 +343,12 @@ def _turning(
     ahead = -(np.cos(headings) * current[0] + np.sin(headings) * current[1])
     nu[:, 0], nu[:, 5] = speed_mps + ahead, rate_rad_s
     if conditions.manner == "held":
-        beside = np.sin(headings) * current[0] - np.cos(headings) * current[1]
+        across = np.sin(headings) * current[0] - np.cos(headings) * current[1]
         forward_m, right_m, _ = conditions.glass_body_m
         nu[:, 0] += rate_rad_s * right_m
-        nu[:, 1] = beside - rate_rad_s * forward_m
+        nu[:, 1] = across - rate_rad_s * forward_m
         # The current, fixed over ground, turns in the body.
-        nu_rate[:, 0], nu_rate[:, 1] = rate_rad_s * beside, -rate_rad_s * ahead
+        nu_rate[:, 0], nu_rate[:, 1] = rate_rad_s * across, -rate_rad_s * ahead
     return nu, nu_rate
 
 

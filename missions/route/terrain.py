@@ -37,7 +37,7 @@ class Reach:
 
     ahead_m: float
     astern_m: float
-    beside_m: float
+    aside_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ def reach_of(
     return Reach(
         ahead_m=max(hull.nose_m - forward_m, half_along_m),
         astern_m=max(hull.tail_m + forward_m, half_along_m),
-        beside_m=max(hull.half_breadth_m + abs(right_m), half_swath_m),
+        aside_m=max(hull.half_breadth_m + abs(right_m), half_swath_m),
     )
 
 
@@ -146,8 +146,8 @@ def highest_floor(
     """
     finest = max(bathymetry.cell_m / _PER_CELL, _FINEST_M)
     ahead = _spread(-reach.astern_m, reach.ahead_m, finest)
-    beside = _spread(-reach.beside_m, reach.beside_m, finest)
-    offsets = np.stack(np.meshgrid(ahead, beside, indexing="ij"), axis=-1).reshape(-1, 2)
+    across = _spread(-reach.aside_m, reach.aside_m, finest)
+    offsets = np.stack(np.meshgrid(ahead, across, indexing="ij"), axis=-1).reshape(-1, 2)
     highest = np.empty(len(points_ne))
     rows = max(_CHUNK // len(offsets), 1)
     for start in range(0, len(points_ne), rows):
@@ -187,7 +187,7 @@ def depth_profile(
     reach = Reach(
         ahead_m=max(reach.ahead_m, gap),
         astern_m=max(reach.astern_m, gap),
-        beside_m=reach.beside_m,
+        aside_m=reach.aside_m,
     )
     highest = highest_floor(bathymetry, points_ne, headings_rad, reach)
     unknown = np.flatnonzero(np.isnan(highest))
@@ -261,7 +261,7 @@ def terrain_report(
     """
     altitude = np.concatenate([profile.altitude_m for profile in profiles])
     low, high = float(altitude.min()), float(altitude.max())
-    floor_slopes = [_floor_slope(profile) for profile in profiles]
+    floor_slopes = [_steepest(np.arctan2(np.diff(p.floor_m), np.diff(p.along_m))) for p in profiles]
     slopes = [_steepest(profile.slopes_rad) for profile in profiles]
     climbing = [int(np.sum(p.clearance_m > limits.altitude_m + 1e-6)) for p in profiles]
     highest_on = int(np.argmax([profile.altitude_m.max() for profile in profiles]))
@@ -318,7 +318,3 @@ def _spread(low: float, high: float, finest: float) -> Array:
 
 def _steepest(slopes_rad: Array) -> float:
     return float(np.abs(slopes_rad).max(initial=0.0))
-
-
-def _floor_slope(profile: DepthProfile) -> float:
-    return _steepest(np.arctan2(np.diff(profile.floor_m), np.diff(profile.along_m)))

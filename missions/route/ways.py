@@ -42,12 +42,6 @@ class Ways:
         self.fence: Fence = fence_of(allowed)
         self._from_node: dict[int, tuple[Array, NDArray[np.int32]]] = {}
 
-    def contains(self, points_ne: Array) -> NDArray[np.bool_]:
-        """Which places (N, 2) are inside, (N,)."""
-        points = np.ascontiguousarray(points_ne, dtype=np.float64).reshape(-1, 2)
-        result: NDArray[np.bool_] = _points_inside(self.fence, points)
-        return result
-
     def free(self, a: Place, b: Place) -> bool:
         """Whether the straight between two places is inside."""
         return bool(straight_inside(self.fence, a[0], a[1], b[0], b[1]))
@@ -60,12 +54,6 @@ class Ways:
             raise ValueError(f"{len(starts)} starts for {len(ends)} ends")
         result: NDArray[np.bool_] = _straights_inside(self.fence, starts, ends)
         return result
-
-    def distance_m(self, a: Place, b: Place) -> float:
-        """Length of the shortest way; inf if there is none."""
-        if self.free(a, b):
-            return math.dist(a, b)
-        return float(self.distances_m(np.array([a]), np.array([b]))[0, 0])
 
     def distances_m(self, a_ne: Array, b_ne: Array) -> Array:
         """Lengths of the shortest ways from places (N, 2) to (M, 2), (N, M); inf where none is."""
@@ -177,14 +165,6 @@ class Ways:
         """(N, V) distances to the corners that can be seen and passed; inf of the others."""
         seen: Array = _seen(self.fence, self._nodes, np.ascontiguousarray(points_ne))
         return seen
-
-
-@compiled_ieee
-def _points_inside(fence: Fence, points: Array) -> NDArray[np.bool_]:
-    result = np.empty(points.shape[0], dtype=np.bool_)
-    for i in range(points.shape[0]):
-        result[i] = point_inside(fence, points[i, 0], points[i, 1])
-    return result
 
 
 @compiled_ieee

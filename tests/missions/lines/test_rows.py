@@ -103,7 +103,7 @@ def test_a_piece_without_room_has_shorter_steps() -> None:
     assert len(cuts) == 0
 
 
-def test_a_no_go_zone_parts_a_piece_and_is_told() -> None:
+def test_a_no_go_zone_parts_a_piece_and_leaves_a_cut() -> None:
     allowed = box(-5, -5, 20, 5).difference(box(4, -1, 6, 2))
     pieces, cuts = lay(box(0, 0, 10, 1), allowed)
     assert len(pieces) == 2
@@ -125,7 +125,7 @@ def test_the_least_piece_is_as_long_as_its_pictures_ask_for() -> None:
     np.testing.assert_allclose(pieces, [[0, 0.05 - 0.75, 0.05 + 0.75, 3]], atol=1e-9)
 
 
-def test_a_wish_for_a_single_place_that_cannot_be_met_is_told() -> None:
+def test_a_wish_for_a_single_place_that_cannot_be_met_is_a_cut() -> None:
     """Two spots, each to be seen by one picture; one of them lies in a no-go zone."""
     survey = box(0, 0, 0.2, 1).union(box(8, 0, 8.2, 1))
     allowed = box(-5, -5, 20, 5).difference(box(-2, -5, 2, 5))

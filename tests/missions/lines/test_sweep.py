@@ -53,7 +53,6 @@ def test_no_sampled_heading_is_much_better(shape: Polygon, costs: Costs) -> None
         for h in (np.arange(400) + 0.123) * math.pi / 400
     ]
     assert sweep.cost_j <= 1.005 * min(sampled)
-    assert sweep.cost_j == min(cost for _, cost in sweep.candidates)
     again = full_cost_j(
         area, sweep.heading_rad, STEREO, ways, costs, home, cross_lines=1, closing_line=True
     )

@@ -256,8 +256,6 @@ def test_contours_of_a_plane_are_straight_and_where_they_should_be() -> None:
         crs=epsg.to_wkt(),
         from_pixel=(1.0, 0.0, x - 30, 0.0, -1.0, y + 30),
         depth_m=(15.0 + 0.1 * north).reshape(cells, cells),
-        vertical_datum="none",
-        reading="depths",
     )
     contours = layers_of(plan, bathymetry)["contours"]
 

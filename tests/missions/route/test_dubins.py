@@ -8,14 +8,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import box
 
-from alice_survey.base.errors import PlanError
-from missions.route.dubins import turn
+from missions.route.dubins import moved, shortest_turn
+from missions.route.fence import OPEN_WATER, Fence
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
 from missions.values.legs import Leg
 
 places = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
 angles = st.floats(-math.pi, math.pi)
+
+
+def turn(
+    start: tuple[float, float],
+    first: float,
+    goal: tuple[float, float],
+    last: float,
+    radius_m: float,
+    fence: Fence = OPEN_WATER,
+) -> list[Leg]:
+    pieces = shortest_turn(fence, np.array([*start, first]), np.array([*goal, last]), radius_m)
+    legs, heading = [], first
+    for curvature, length_m in pieces.tolist():
+        leg = Leg(
+            start_ne_m=start, heading_rad=heading, length_m=length_m, curvature_per_m=curvature,
+            line=-1,
+        )  # fmt: skip
+        legs.append(leg)
+        *_, heading = moved(*start, heading, curvature, length_m)
+        start = leg.end_ne_m
+    return legs
 
 
 def length(legs: list[Leg]) -> float:
@@ -111,5 +132,5 @@ def test_a_turn_keeps_out_of_forbidden_water() -> None:
     assert math.dist(other[-1].end_ne_m, (0.0, 2.0)) < 1e-9
 
     tight = Ways(multipolygon(box(-0.5, -0.5, 0.5, 2.5))).fence
-    with pytest.raises(PlanError, match="no turn of radius 1 m"):
-        turn((0.0, 0.0), 0.0, (0.0, 2.0), math.pi, 1.0, tight)
+    none = shortest_turn(tight, np.zeros(3), np.array([0.0, 2.0, math.pi]), 1.0)
+    assert np.isinf(none[:, 1]).all()

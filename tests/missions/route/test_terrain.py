@@ -47,8 +47,6 @@ def _floor(values: Array, cell_m: float = 0.5) -> Bathymetry:
         crs="EPSG:32636",
         from_pixel=(cell_m, 0.0, west, 0.0, -cell_m, north),
         depth_m=values,
-        vertical_datum="not named",
-        reading="depths",
     )
 
 
@@ -153,7 +151,7 @@ def test_the_highest_floor_is_found_by_looking_everywhere(rough_m: float, off_m:
     exact = [
         highest_within(
             floor.depth_at, place.tolist(), heading, REACH.ahead_m, REACH.astern_m,
-            REACH.beside_m, 0.05,
+            REACH.aside_m, 0.05,
         )
         for place, heading in zip(places, headings, strict=True)
     ]  # fmt: skip
@@ -248,9 +246,9 @@ def test_the_reach_is_of_hull_or_pictures_whichever_is_farther() -> None:
         assert reach_of(hull, glass, 0.1, 0.1) == Reach(
             ahead_m=pytest.approx(ahead_m),
             astern_m=pytest.approx(astern_m),
-            beside_m=pytest.approx(0.276),
+            aside_m=pytest.approx(0.276),
         )
-    assert far == Reach(ahead_m=3.0, astern_m=3.0, beside_m=2.0)
+    assert far == Reach(ahead_m=3.0, astern_m=3.0, aside_m=2.0)
 
 
 def test_a_real_sea_floor_is_followed(shared_data: Path) -> None:
