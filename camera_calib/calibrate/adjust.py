@@ -108,8 +108,8 @@ class _Solver(CalibrationProblem):
         if not np.all(np.isfinite(length)):
             return math.inf
         loss = np.where(length <= HUBER, 0.5 * length**2, HUBER * (length - 0.5 * HUBER))
-        surprise = self.surprise(state)
-        return float(loss.sum() + 0.5 * surprise @ self.prior_information @ surprise)
+        off = self.prior_residuals(state)
+        return float(loss.sum() + 0.5 * off @ self.prior_information @ off)
 
     @property
     def spare(self) -> int:

@@ -161,7 +161,7 @@ def plot_profiles(judged: Judgement) -> bytes:
     def draw(figure: Sheet) -> None:
         grid = _axes_grid(figure, 2, 2)
         for c, (name, camera) in enumerate(judged.cameras.items()):
-            for column, found in enumerate((camera.profiles.radius, camera.profiles.incidence)):
+            for column, found in enumerate((camera.by_radius, camera.by_incidence)):
                 _draw_profile(grid[0][column], grid[1][column], found, c, name)
         noise = judged.calibration.noise_px
         for column, label in enumerate(

@@ -83,8 +83,8 @@ def _camera_numbers(camera: CameraJudgement) -> dict[str, Any]:
             "corner_reach": coverage.corner_reach,
             "uncovered": coverage.uncovered,
         },
-        "residuals_by_radius": camera.profiles.radius,
-        "residuals_by_incidence_deg": camera.profiles.incidence,
+        "residuals_by_radius": camera.by_radius,
+        "residuals_by_incidence_deg": camera.by_incidence,
         "projection_sigma": camera.by_range,
         "homography": test
         and {

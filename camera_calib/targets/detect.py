@@ -40,8 +40,6 @@ from camera_calib.targets.target import (
     aruco_dictionary,
 )
 
-__all__ = ["Detection", "as_grey", "chessboard_size", "detect", "detect_with_reasons"]
-
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _FEWEST_POINTS = 6

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.errors import AliceError, ConfigError, PlanError
 from alice_survey.base.text_table import text_table
 from alice_survey.vehicle.limits import spot_rate_rad_s
-from camera_calib.fov.table import json_row
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
@@ -83,7 +83,7 @@ def solve_report(
     if resolution_mm is not None:
         options = lenses_for_resolution(setup, seafloor_depth_m, resolution_mm, lenses)
         parts.append(_lens_text(options, resolution_mm))
-        data["lenses"] = [json_row(asdict(option)) for option in options]
+        data["lenses"] = json_values(options)
         dived = with_lens(setup, options[0])
     if dive_s is not None:
         area = area_for_dive(dived, seafloor_depth_m, dive_s)
@@ -92,7 +92,7 @@ def solve_report(
     if rate_hz is not None:
         rates = speeds_for_rate(setup, rate_hz, lenses)
         parts.append(_rate_text(rates, rate_hz, setup.plan.speed_mps))
-        data["rates"] = [json_row(asdict(option)) for option in rates]
+        data["rates"] = json_values(rates)
     if not parts:
         raise ConfigError("say what is given: a resolution (mm), a dive (s) or a rate (Hz)")
     return "\n\n".join(parts), data
