@@ -96,7 +96,7 @@ def triangulate(
     sigmas = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(cameras),))
     if measured.ndim != 3 or measured.shape[::2] != (len(cameras), 2):
         raise CalibrationError(
-            f"triangulation: pixels {measured.shape} of {len(cameras)} cameras; (C, N, 2) wanted"
+            f"triangulation: pixels {measured.shape} of {len(cameras)} cameras; (C, N, 2) expected"
         )
     if len(cam_from_world) != len(cameras) or len(cameras) < 2:
         raise CalibrationError(

@@ -17,7 +17,7 @@ from camera_calib.flat_port import FlatPortCamera
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualPinhole:
-    """An ideal pinhole in water, with the axes of its camera and a centre of its own."""
+    """An ideal pinhole in water, with the axes of its camera and another centre."""
 
     width_px: int
     height_px: int

@@ -315,7 +315,7 @@ def _check_output(output: Path, start: Path | None) -> None:
         WorkspaceError: it cannot be written or would take something with it.
     """
     if not output.name or output.name == "..":
-        raise WorkspaceError(f"-o {output}: name a folder of its own, such as -o air")
+        raise WorkspaceError(f"-o {output}: name a new folder, such as -o air")
     if not output.exists():
         return
     if not output.is_dir():

@@ -137,7 +137,7 @@ def calibrate(
 
 
 def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibration:
-    """The same calibration from other views, such as some of its own."""
+    """The same calibration from other views, such as a part of those it used."""
     freedom, source = calibration.freedom, "calibration"
     return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
 

@@ -100,7 +100,7 @@ class Fields:
             raise self.fault(key, "holds something that is not a finite number")
         if len(flat) not in counts:
             wanted = " or ".join(map(str, counts))
-            raise self.fault(key, f"holds {len(flat)} numbers; {wanted} wanted")
+            raise self.fault(key, f"holds {len(flat)} numbers; {wanted} expected")
         return np.array(flat)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:

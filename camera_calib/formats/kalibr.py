@@ -73,10 +73,10 @@ def write_kalibr(path: Path, rig: Rig) -> list[Path]:
 
 def _camera(fields: Fields) -> FlatPortCamera:
     if fields.text("camera_model") != "pinhole":
-        raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole wanted")
+        raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole expected")
     model = fields.text("distortion_model")
     if model not in ("radtan", "none"):
-        raise fields.fault("distortion_model", f"is {model}; radtan or none wanted")
+        raise fields.fault("distortion_model", f"is {model}; radtan or none expected")
     k = fields.numbers("distortion_coeffs", 4) if model == "radtan" else ()
     fx, fy, cx, cy = fields.numbers("intrinsics", 4)
     width, height = fields.numbers("resolution", 2)

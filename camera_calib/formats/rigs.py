@@ -103,7 +103,7 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
     """
     if len(names) != len(rig.cameras) or len(set(names)) != len(names):
         raise CalibrationError(
-            f"--names {','.join(names)}: {len(rig.cameras)} different names wanted, "
+            f"--names {','.join(names)}: {len(rig.cameras)} different names expected, "
             f"for {', '.join(rig.cameras)}"
         )
     new = {

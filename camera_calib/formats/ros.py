@@ -40,7 +40,7 @@ def read_ros(path: Path, reading: ReadOptions) -> Rig:
         return assemble(path, reading, "ROS", [_name(fields, 0, 1)], [_camera(fields)], _ONE)
     files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
     if not 1 <= len(files) <= 2:
-        raise CalibrationError(f"{path}: {len(files)} .yaml files; 1, or 2 of a pair, wanted")
+        raise CalibrationError(f"{path}: {len(files)} .yaml files; 1, or 2 of a pair, expected")
     every = [read_yaml(file) for file in files]
     if len(every) == 1:
         return read_ros(files[0], reading)
@@ -118,7 +118,7 @@ _ONE = (RigidTransform.identity(),)
 def _camera(fields: Fields) -> FlatPortCamera:
     model = fields.text("distortion_model") if "distortion_model" in fields else "plumb_bob"
     if model not in _MODELS:
-        raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} wanted")
+        raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} expected")
     key = "distortion_coefficients"
     k = fields.vector(key, 0, *_MODELS[model])
     size = (fields.size("image_width"), fields.size("image_height"))

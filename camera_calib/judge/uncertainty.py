@@ -30,8 +30,7 @@ def covariance_of(rig: Rig) -> Covariance:
     """
     if rig.covariance is None:
         raise CalibrationError(
-            f"the rig ({rig.source}) has no covariance, so nothing can be said of its uncertainty: "
-            "calibrate it"
+            f"the rig ({rig.source}) has no covariance, so its uncertainty is unknown: calibrate it"
         )
     for name in rig.covariance.parameters:
         camera, _, field = name.rpartition(".")

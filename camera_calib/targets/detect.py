@@ -278,7 +278,7 @@ def reduced(grey: Grey, longest_px: int) -> Reduced:
     if scale < 1.0:
         small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     if small.dtype != np.uint8:
-        # Detectors want the middle tones that the eye wants.
+        # Detectors need the middle tones that the eye needs.
         small = np.rint(255.0 * np.sqrt(small)).astype(np.uint8)
     return Reduced(picture=small, scale=np.array([width / size[0], height / size[1]]))
 

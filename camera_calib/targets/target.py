@@ -204,7 +204,7 @@ class Target:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the points cannot be numbered for certain: two cameras may number unlike."""
+        """Whether the numbering is not unique: two cameras may number points differently."""
         return bool(self.symmetries)
 
     @property
