@@ -270,7 +270,7 @@ def read_rig(path: str | Path) -> Rig:
             },
             body_from_rig=file.body_from_rig.value("body_from_rig"),
             source=file.source,
-            covariance=file.covariance and file.covariance.value(),
+            covariance=None if file.covariance is None else file.covariance.value(),
         )
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"{path}: {one_line(error)}") from None

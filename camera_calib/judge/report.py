@@ -27,7 +27,6 @@ def write_report(
     folder: Path,
     calibration: Calibration,
     held_out: HeldOut | None,
-    working_range_m: float | None = None,
 ) -> None:
     """Write `report.html` and `report.json` into a folder.
 
@@ -35,12 +34,11 @@ def write_report(
         folder: an existing folder.
         calibration: with its rig's covariance.
         held_out: from `validation.hold_out`; None if no views could be held out.
-        working_range_m: where the rig will work, for maps and stereo (see `judge`).
 
     Raises:
         CalibrationError: the rig has no covariance.
     """
-    judged = judge(calibration, held_out, working_range_m)
+    judged = judge(calibration, held_out)
     found = verdicts(judged)
     CalibrationReportRecord.save(folder / "report.json", report_json(judged, found))
     with atomic_path(folder / "report.html") as path:
