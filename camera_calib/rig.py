@@ -199,13 +199,13 @@ def write_rig(path: str | Path, rig: Rig) -> None:
     write_json(path, body)
 
 
-class _Part(BaseModel):
+class _FilePart(BaseModel):
     """A part of `rig.json`, whose values are of the stated types."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
 
 
-class _Pose(_Part):
+class _StoredPose(_FilePart):
     translation_m: tuple[float, float, float]
     quaternion_xyzw: tuple[float, float, float, float]
 
@@ -216,12 +216,12 @@ class _Pose(_Part):
         return pose_from_json(self.model_dump())
 
 
-class _Camera(_Part):
-    cam_from_rig: _Pose
+class _StoredCamera(_FilePart):
+    cam_from_rig: _StoredPose
     """All other values are those of `FlatPortCamera`."""
 
 
-class _Covariance(_Part):
+class _StoredCovariance(_FilePart):
     parameters: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
 
@@ -231,11 +231,11 @@ class _Covariance(_Part):
         return Covariance(parameters=self.parameters, matrix=np.array(self.matrix, ndmin=2))
 
 
-class _Rig(_Part):
-    cameras: dict[str, _Camera]
-    body_from_rig: _Pose
+class _RigFile(_FilePart):
+    cameras: dict[str, _StoredCamera]
+    body_from_rig: _StoredPose
     source: str
-    covariance: _Covariance | None = None
+    covariance: _StoredCovariance | None = None
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -261,7 +261,7 @@ def read_rig(path: str | Path) -> Rig:
                 f"is a rig file of version {data.get('version')}; this program reads version "
                 f"{_FORMAT['version']}: calibrate again, or change the file by docs/formats.md"
             )
-        file = checked(_Rig, data)
+        file = checked(_RigFile, data)
         return Rig(
             cameras={name: _camera(name, one) for name, one in file.cameras.items()},
             cam_from_rig={
@@ -276,7 +276,7 @@ def read_rig(path: str | Path) -> Rig:
         raise CalibrationError(f"{path}: {one_line(error)}") from None
 
 
-def _camera(name: str, stored: _Camera) -> FlatPortCamera:
+def _camera(name: str, stored: _StoredCamera) -> FlatPortCamera:
     try:
         return camera_from_json(dict(stored.model_extra or {}))
     except CalibrationError as error:
