@@ -35,6 +35,13 @@ _RANGES = (
 )
 """Largest port distance or thickness; the wall of a tank may be some metres away."""
 
+IN_AIR: Mapping[str, Any] = {
+    "port_distance_m": 0.0,
+    "glass_thickness_m": 0.0,
+    "n_water": 1.0,
+    "normal": _FORWARD,
+}
+"""Values of a camera without a port."""
 PARAMETERS = (*_LENS, *_PORT, *_NORMAL)
 """Parameters that can be calibrated, ordered as in `project_jacobian`. The unit normal has
 two: its first two components, sines of the port's tilt about the camera's y and x axes."""

@@ -9,9 +9,9 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.flat_port import IN_AIR, FlatPortCamera
 from camera_calib.formats.fields import camera_name
-from camera_calib.formats.opencv_model import IN_AIR, distorts
+from camera_calib.formats.opencv_model import distorts
 from camera_calib.formats.registry import (
     COVARIANCE,
     K3,
