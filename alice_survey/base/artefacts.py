@@ -7,6 +7,7 @@ while all of these are unchanged; also the resources used and the versions of th
 
 import contextlib
 import csv
+import functools
 import hashlib
 import json
 import os
@@ -347,6 +348,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+_adapter: Callable[[Any], TypeAdapter[Any]] = functools.cache(TypeAdapter)
+
+
 def checked(kind: type[T], data: Any) -> T:
     """A value of a type from JSON values, which its fields must match.
 
@@ -354,7 +358,8 @@ def checked(kind: type[T], data: Any) -> T:
         ValueError: names the first value that is wrong or missing.
     """
     try:
-        return TypeAdapter(kind).validate_json(json.dumps(data))
+        value: T = _adapter(kind).validate_json(json.dumps(data))
+        return value
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"])) or "the content"
