@@ -261,8 +261,6 @@ class Spread:
     """(V,) distance of the target's middle along the axis."""
     tilt_xy_deg: Array
     """(V, 2) tilt of the target about the camera's x and y axes."""
-    roll_deg: Array
-    """(V,) turn of the target about its own normal, from the camera's right."""
 
 
 def spread(rig: Rig, camera: str, calibration: Calibration) -> Spread:
@@ -276,5 +274,4 @@ def spread(rig: Rig, camera: str, calibration: Calibration) -> Spread:
     return Spread(
         range_m=np.array([pose.apply(middle)[2] for pose in poses]),
         tilt_xy_deg=tilts,
-        roll_deg=np.degrees(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])),
     )

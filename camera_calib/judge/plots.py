@@ -541,7 +541,7 @@ def _mark_corner(axes: Axes, corner: str, size: tuple[int, int]) -> None:
 
 
 def plot_spread(judged: Judgement) -> bytes:
-    """Poses of the target: tilts, and distance against turn."""
+    """Poses of the target: tilts about both axes, and tilt against distance."""
 
     def draw(figure: Sheet) -> None:
         left, right = _axes_grid(figure, 2)[0]
