@@ -67,7 +67,7 @@ class Calibration:
         if self.residuals_px.shape != shape or self.weights.shape != shape[:3]:
             raise CalibrationError(
                 f"calibration: residuals {self.residuals_px.shape}, weights {self.weights.shape}; "
-                f"{shape} wanted"
+                f"{shape} expected"
             )
 
     @property

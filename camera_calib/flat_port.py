@@ -10,12 +10,14 @@ from the outer corner of the first pixel, whose centre is (0.5, 0.5).
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict
 
+from alice_survey.base.artefacts import checked
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib import lens, refraction
@@ -33,6 +35,13 @@ _RANGES = (
 )
 """Largest port distance or thickness; the wall of a tank may be some metres away."""
 
+IN_AIR: Mapping[str, Any] = {
+    "port_distance_m": 0.0,
+    "glass_thickness_m": 0.0,
+    "n_water": 1.0,
+    "normal": _FORWARD,
+}
+"""Values of a camera without a port."""
 PARAMETERS = (*_LENS, *_PORT, *_NORMAL)
 """Parameters that can be calibrated, ordered as in `project_jacobian`. The unit normal has
 two: its first two components, sines of the port's tilt about the camera's y and x axes."""
@@ -56,6 +65,8 @@ class FlatPortCamera:
                [1315.9,  806.4],
                [   nan,    nan]])
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
 
     width_px: int
     height_px: int
@@ -251,36 +262,10 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
     Raises:
         CalibrationError: a key is missing or unknown, or a value is out of range.
     """
-    known = {field.name: field.default for field in fields(FlatPortCamera)}
-    missing = [name for name, default in known.items() if default is MISSING and name not in data]
-    unknown = [name for name in data if name not in known]
-    if missing or unknown:
-        what = f"lacks {', '.join(missing)}" if missing else f"{', '.join(unknown)} is unknown"
-        raise CalibrationError(f"camera: {what}")
-    for name, value in data.items():
-        if name == "normal":
-            numbers(value, 3, "camera: normal")
-        elif isinstance(value, bool) or not isinstance(value, int | float):
-            raise CalibrationError(f"camera: {name} = {value!r} is not a number")
-    for name in ("width_px", "height_px"):
-        if not float(data[name]).is_integer():
-            raise CalibrationError(f"camera: {name} = {data[name]:g} is not a whole number")
-    return FlatPortCamera(**(data | {"normal": tuple(data.get("normal", _FORWARD))}))
-
-
-def numbers(value: Any, count: int, what: str) -> Array:
-    """A list of a given count of finite numbers from a JSON file.
-
-    Raises:
-        CalibrationError: it is not; `what` names its place.
-    """
-    plain = isinstance(value, list | tuple) and all(
-        isinstance(one, int | float) and not isinstance(one, bool) and math.isfinite(one)
-        for one in value
-    )
-    if not plain or len(value) != count:
-        raise CalibrationError(f"{what} = {value!r:.60}: {count} finite numbers wanted")
-    return np.array(value, dtype=np.float64)
+    try:
+        return checked(FlatPortCamera, data)
+    except ValueError as error:
+        raise CalibrationError(f"camera: {error}") from None
 
 
 def pose_jacobian(by_point: Array, points_cam: Array) -> Array:

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.artefacts import checked, read_json, write_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
-from camera_calib.flat_port import FlatPortCamera, camera_from_json, numbers
+from camera_calib.flat_port import FlatPortCamera, camera_from_json
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}
 _NORM_TOLERANCE = 1e-3
@@ -198,6 +199,45 @@ def write_rig(path: str | Path, rig: Rig) -> None:
     write_json(path, body)
 
 
+class _FilePart(BaseModel):
+    """A part of `rig.json`, whose values are of the stated types."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
+
+
+class _StoredPose(_FilePart):
+    translation_m: tuple[float, float, float]
+    quaternion_xyzw: tuple[float, float, float, float]
+
+    def value(self, what: str) -> RigidTransform:
+        length = float(np.linalg.norm(self.quaternion_xyzw))
+        if abs(length - 1.0) > _NORM_TOLERANCE:
+            raise CalibrationError(f"{what}.quaternion_xyzw has the norm {length:g}, not 1")
+        return pose_from_json(self.model_dump())
+
+
+class _StoredCamera(_FilePart):
+    cam_from_rig: _StoredPose
+    """All other values are those of `FlatPortCamera`."""
+
+
+class _StoredCovariance(_FilePart):
+    parameters: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    def value(self) -> Covariance:
+        if any(len(row) != len(self.parameters) for row in self.matrix):
+            raise CalibrationError("covariance: as many columns of matrix as parameters are needed")
+        return Covariance(parameters=self.parameters, matrix=np.array(self.matrix, ndmin=2))
+
+
+class _RigFile(_FilePart):
+    cameras: dict[str, _StoredCamera]
+    body_from_rig: _StoredPose
+    source: str
+    covariance: _StoredCovariance | None = None
+
+
 def read_rig(path: str | Path) -> Rig:
     """Read `rig.json`.
 
@@ -214,64 +254,30 @@ def read_rig(path: str | Path) -> Rig:
     path = Path(path)
     data = read_json(path)
     try:
-        data = _mapping(data, "the file")
-        if data.get("format") != _FORMAT["format"]:
+        if not isinstance(data, dict) or data.get("format") != _FORMAT["format"]:
             raise CalibrationError(f'is not a rig file: "format" is not "{_FORMAT["format"]}"')
         if data.get("version") != _FORMAT["version"]:
             raise CalibrationError(
                 f"is a rig file of version {data.get('version')}; this program reads version "
                 f"{_FORMAT['version']}: calibrate again, or change the file by docs/formats.md"
             )
-        given = _mapping(data["cameras"], "cameras")
-        cameras, poses = {}, {}
-        for name, values in given.items():
-            rest = dict(_mapping(values, name))
-            poses[name] = _pose(rest.pop("cam_from_rig"), f"{name}: cam_from_rig")
-            cameras[name] = _camera(rest, name)
+        file = checked(_RigFile, data)
         return Rig(
-            cameras=cameras,
-            cam_from_rig=poses,
-            body_from_rig=_pose(data["body_from_rig"], "body_from_rig"),
-            source=str(data["source"]),
-            covariance=_covariance_from_json(data.get("covariance")),
+            cameras={name: _camera(name, one) for name, one in file.cameras.items()},
+            cam_from_rig={
+                name: one.cam_from_rig.value(f"{name}: cam_from_rig")
+                for name, one in file.cameras.items()
+            },
+            body_from_rig=file.body_from_rig.value("body_from_rig"),
+            source=file.source,
+            covariance=None if file.covariance is None else file.covariance.value(),
         )
-    except (KeyError, TypeError, ValueError, ArithmeticError, CalibrationError) as error:
-        what = f"lacks {one_line(error)}" if isinstance(error, KeyError) else one_line(error)
-        raise CalibrationError(f"{path}: {what}") from None
+    except (ValueError, CalibrationError) as error:
+        raise CalibrationError(f"{path}: {one_line(error)}") from None
 
 
-def _mapping(data: Any, what: str) -> dict[str, Any]:
-    if not isinstance(data, dict):
-        raise CalibrationError(f"{what} is not an object of names and values")
-    return data
-
-
-def _camera(data: dict[str, Any], name: str) -> FlatPortCamera:
+def _camera(name: str, stored: _StoredCamera) -> FlatPortCamera:
     try:
-        return camera_from_json(data)
+        return camera_from_json(dict(stored.model_extra or {}))
     except CalibrationError as error:
         raise CalibrationError(f"{name}: {str(error).removeprefix('camera: ')}") from None
-
-
-def _pose(data: Any, what: str) -> RigidTransform:
-    pose = _mapping(data, what)
-    numbers(pose["translation_m"], 3, f"{what}.translation_m")
-    quaternion = numbers(pose["quaternion_xyzw"], 4, f"{what}.quaternion_xyzw")
-    length = float(np.linalg.norm(quaternion))
-    if abs(length - 1.0) > _NORM_TOLERANCE:
-        raise CalibrationError(f"{what}.quaternion_xyzw has the norm {length:g}, not 1")
-    return pose_from_json(pose)
-
-
-def _covariance_from_json(data: dict[str, Any] | None) -> Covariance | None:
-    if data is None:
-        return None
-    names, rows = _mapping(data, "covariance")["parameters"], data["matrix"]
-    if not isinstance(names, list) or not isinstance(rows, list) or len(names) != len(rows):
-        raise CalibrationError("covariance: as many rows of matrix as parameters are wanted")
-    matrix = [
-        numbers(row, len(names), f"covariance: the row of {names[i]}") for i, row in enumerate(rows)
-    ]
-    return Covariance(
-        parameters=tuple(map(str, names)), matrix=np.array(matrix).reshape(len(names), len(names))
-    )

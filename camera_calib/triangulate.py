@@ -96,7 +96,7 @@ def triangulate(
     sigmas = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(cameras),))
     if measured.ndim != 3 or measured.shape[::2] != (len(cameras), 2):
         raise CalibrationError(
-            f"triangulation: pixels {measured.shape} of {len(cameras)} cameras; (C, N, 2) wanted"
+            f"triangulation: pixels {measured.shape} of {len(cameras)} cameras; (C, N, 2) expected"
         )
     if len(cam_from_world) != len(cameras) or len(cameras) < 2:
         raise CalibrationError(
@@ -141,7 +141,7 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
     Returns:
         (N, 3); NaN where fewer than two rays count or they are parallel.
     """
-    known = np.isfinite(origins).all(axis=-1) & np.isfinite(directions).all(axis=-1)
+    known = np.asarray(np.isfinite(origins + directions).all(axis=-1))
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     across = np.where(known[..., None, None], across, 0.0)
     right = (across @ np.where(known[..., None], origins, 0.0)[..., None]).sum(axis=0)
@@ -204,7 +204,7 @@ def _in_water(
     points_world: Array,
 ) -> Array:
     """Points, (N, 3), of which those not beyond every port that sees them are moved just inside."""
-    seen = np.isfinite(pixels).all(axis=-1)
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     points = points_world
     for _ in range(20):
         before = points

@@ -11,7 +11,7 @@ The index of refraction is that of `alice_survey.base.seawater` (Quan and Fry 19
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,20 +21,6 @@ from alice_survey.base.errors import ConfigError
 from alice_survey.base.frames import Array
 from alice_survey.base.seawater import n_water, pressure_dbar
 from alice_survey.base.text_table import text_table
-
-__all__ = [
-    "ASYMMETRY",
-    "CHANNELS",
-    "WAVELENGTH_NM",
-    "WaterOptics",
-    "WaterRow",
-    "diffuse_attenuation_per_m",
-    "n_water",
-    "phase_per_sr",
-    "water_optics",
-    "water_report",
-    "water_table",
-]
 
 CHANNELS = ("red", "green", "blue")
 WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])
@@ -123,55 +109,6 @@ def phase_per_sr(cosine: Array, asymmetry: float = ASYMMETRY) -> Array:
     return phase
 
 
-@dataclass(frozen=True, kw_only=True)
-class WaterRow:
-    """Water for light of one wavelength."""
-
-    channel: str
-    """red, green or blue; empty for another wavelength."""
-    wavelength_nm: float
-    n_water: float
-    diffuse_per_m: float
-    """Jerlov's K_d of daylight."""
-    absorption_per_m: float
-    scattering_per_m: float
-    beam_per_m: float
-    """Attenuation of a strobe's beam: absorption and scattering."""
-
-
-def water_table(
-    temperature_c: float,
-    salinity_psu: float,
-    depth_m: float,
-    jerlov: Jerlov,
-    wavelengths_nm: Sequence[float] | None = None,
-) -> list[WaterRow]:
-    """Index and attenuation by wavelength; the camera's three channels when none are given.
-
-    Raises:
-        ConfigError: the water or a wavelength is out of range.
-    """
-    nm = WAVELENGTH_NM if wavelengths_nm is None else np.asarray(wavelengths_nm, dtype=np.float64)
-    index = n_water(temperature_c, salinity_psu, depth_m, nm)
-    diffuse, optics = diffuse_attenuation_per_m(jerlov, nm), water_optics(jerlov, nm)
-    names = dict(zip(WAVELENGTH_NM.tolist(), CHANNELS, strict=True))
-    columns = (index, diffuse, optics.absorption_per_m, optics.scattering_per_m)
-    return [
-        WaterRow(
-            channel=names.get(wave, ""),
-            wavelength_nm=wave,
-            n_water=n,
-            diffuse_per_m=kd,
-            absorption_per_m=a,
-            scattering_per_m=b,
-            beam_per_m=a + b,
-        )
-        for wave, n, kd, a, b in zip(
-            nm.tolist(), *(column.tolist() for column in columns), strict=True
-        )
-    ]
-
-
 def water_report(
     temperature_c: float,
     salinity_psu: float,
@@ -179,27 +116,44 @@ def water_report(
     jerlov: str,
     wavelengths_nm: Sequence[float] | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """`water_table` as text and as JSON values.
+    """Index and attenuation by wavelength, as text and as JSON values.
+
+    Rows are the camera's three channels when no wavelengths are given. `diffuse_per_m` is Jerlov's
+    K_d of daylight; `beam_per_m`, the attenuation of a strobe's beam, absorption and scattering.
 
     Raises:
-        ConfigError: as `water_table`, or the Jerlov type is unknown.
+        ConfigError: the water or a wavelength is out of range, or the Jerlov type is unknown.
     """
     kind = next((name for name in _DIFFUSE_PER_M if name == jerlov), None)
     if kind is None:
         raise ConfigError(f"no Jerlov type {jerlov!r}: known are {', '.join(_DIFFUSE_PER_M)}")
-    rows = water_table(temperature_c, salinity_psu, depth_m, kind, wavelengths_nm)
+    nm = WAVELENGTH_NM if wavelengths_nm is None else np.asarray(wavelengths_nm, dtype=np.float64)
+    optics = water_optics(kind, nm)
+    columns = {
+        "wavelength_nm": nm,
+        "n_water": n_water(temperature_c, salinity_psu, depth_m, nm),
+        "diffuse_per_m": diffuse_attenuation_per_m(kind, nm),
+        "absorption_per_m": optics.absorption_per_m,
+        "scattering_per_m": optics.scattering_per_m,
+        "beam_per_m": optics.attenuation_per_m,
+    }
+    names = dict(zip(WAVELENGTH_NM.tolist(), CHANNELS, strict=True))
+    rows: list[dict[str, Any]] = [
+        {"channel": names.get(wave, "")} | {key: float(found[i]) for key, found in columns.items()}
+        for i, wave in enumerate(nm.tolist())
+    ]
     pressure = float(pressure_dbar(depth_m))
     table = text_table(
         ("channel", "wavelength", "n_water", "daylight K_d", "absorption", "scattering", "beam c"),
         [
             (
-                row.channel or "-",
-                f"{row.wavelength_nm:g} nm",
-                f"{row.n_water:.5f}",
-                f"{row.diffuse_per_m:.3f} /m",
-                f"{row.absorption_per_m:.3f} /m",
-                f"{row.scattering_per_m:.3f} /m",
-                f"{row.beam_per_m:.3f} /m",
+                row["channel"] or "-",
+                f"{row['wavelength_nm']:g} nm",
+                f"{row['n_water']:.5f}",
+                f"{row['diffuse_per_m']:.3f} /m",
+                f"{row['absorption_per_m']:.3f} /m",
+                f"{row['scattering_per_m']:.3f} /m",
+                f"{row['beam_per_m']:.3f} /m",
             )
             for row in rows
         ],
@@ -218,6 +172,6 @@ def water_report(
         "depth_m": depth_m,
         "pressure_dbar": pressure,
         "jerlov": jerlov,
-        "rows": [asdict(row) for row in rows],
+        "rows": rows,
     }
     return "\n".join([head, table, sources]), data

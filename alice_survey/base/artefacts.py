@@ -7,6 +7,7 @@ while all of these are unchanged; also the resources used and the versions of th
 
 import contextlib
 import csv
+import functools
 import hashlib
 import json
 import os
@@ -16,14 +17,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.run import progress
 from alice_survey.base.run.resources import Meter, Spent, versions, watched
+
+T = TypeVar("T")
 
 STAGE_FILE = "stage.json"
 _SPENT_FILE = ".spent"
@@ -343,6 +346,25 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+_adapter: Callable[[Any], TypeAdapter[Any]] = functools.cache(TypeAdapter)
+
+
+def checked(kind: type[T], data: Any) -> T:
+    """A value of a type from JSON values, which its fields must match.
+
+    Raises:
+        ValueError: names the first value that is wrong or missing.
+    """
+    try:
+        value: T = _adapter(kind).validate_json(json.dumps(data))
+        return value
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the content"
+        given = "" if isinstance(first["input"], dict) else f" = {first['input']!r:.60}"
+        raise ValueError(f"{where}{given}: {first['msg']}") from None
 
 
 def json_values(data: Any) -> Any:

@@ -19,9 +19,10 @@ from scipy.interpolate import RectBivariateSpline
 from alice_survey.base.artefacts import json_values
 from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
 from alice_survey.base.frames import Array
+from alice_survey.base.seawater import n_water
 from alice_survey.base.text_table import text_table
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.water import CHANNELS, WAVELENGTH_NM, n_water
+from camera_calib.water import CHANNELS, WAVELENGTH_NM
 
 _REFERENCE = "green"
 _NODES_PX = 64

@@ -14,10 +14,12 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 
+_GRID = 15
+
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualPinhole:
-    """An ideal pinhole in water, with the axes of its camera and a centre of its own."""
+    """An ideal pinhole in water, with the axes of its camera and another centre."""
 
     width_px: int
     height_px: int
@@ -96,21 +98,18 @@ def best_pinhole(
     return at(float(best.x))
 
 
-def residual_px(
-    camera: FlatPortCamera, pinhole: VirtualPinhole, depths_m: Array, grid: int = 15
-) -> Array:
+def residual_px(camera: FlatPortCamera, pinhole: VirtualPinhole, depths_m: Array) -> Array:
     """Distance of a warped picture's pixels from where the pinhole would see each point.
 
     Args:
         camera: the flat-port camera.
         pinhole: its stand-in.
         depths_m: (D,) distances along the axis from the entrance pupil.
-        grid: number of pixels a side of the frame.
 
     Returns:
-        (D, grid, grid) distances in pixels of the pinhole.
+        (D, 15, 15) distances over the frame in pixels of the pinhole.
     """
-    pixels = camera.frame_grid(grid, grid)
+    pixels = camera.frame_grid(_GRID, _GRID)
     ideal = pinhole.project(camera.at_depth(pixels, pinhole.working_range_m))
     rows = [
         np.linalg.norm(pinhole.project(camera.at_depth(pixels, d)) - ideal, axis=-1)

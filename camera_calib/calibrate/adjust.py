@@ -52,7 +52,6 @@ class Adjustment:
     """Standard deviation of one coordinate of a measured point, over all pictures."""
     blur: Array
     """(V, cameras) noise of each picture over that."""
-    steps: int
     is_settled: bool
     """Whether the last step was as short as requested."""
 
@@ -108,8 +107,8 @@ class _Solver(CalibrationProblem):
         if not np.all(np.isfinite(length)):
             return math.inf
         loss = np.where(length <= HUBER, 0.5 * length**2, HUBER * (length - 0.5 * HUBER))
-        surprise = self.surprise(state)
-        return float(loss.sum() + 0.5 * surprise @ self.prior_information @ surprise)
+        off = self.prior_residuals(state)
+        return float(loss.sum() + 0.5 * off @ self.prior_information @ off)
 
     @property
     def spare(self) -> int:
@@ -145,7 +144,7 @@ class _Solver(CalibrationProblem):
                     "start from values nearer to the truth, or choose a simpler lens"
                 )
         damping, noise_px = 1e-3, self.spread(residuals)
-        for step in range(1, (at_most or _STEPS) + 1):
+        for _ in range(at_most or _STEPS):
             weights = self.weights(residuals, noise_px)
             equations = self.equations(state, weights / (noise_px * self.blur) ** 2)
             cost = self.cost(state, residuals, noise_px)
@@ -166,11 +165,11 @@ class _Solver(CalibrationProblem):
             noise_before, noise_px = noise_px, self.spread(residuals)
             same_noise = abs(noise_px / noise_before - 1) < settled or noise_px == _LEAST_NOISE_PX
             if gain < settled**2 and same_noise and (damping <= least or drop < 0):
-                return self.result(state, residuals, noise_px, step, is_settled=True)
+                return self.result(state, residuals, noise_px, is_settled=True)
             good = drop > 0.25 * gain or gain < settled**2
             damping = max(damping * (0.01 if good else 0.5), 0.1 * _LEAST_DAMPING)
         if at_most is not None:
-            return self.result(state, residuals, noise_px, at_most, is_settled=False)
+            return self.result(state, residuals, noise_px, is_settled=False)
         self.covariance(equations)  # names what the views leave open, if that is the reason
         raise CalibrationError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
@@ -184,7 +183,7 @@ class _Solver(CalibrationProblem):
         return weights
 
     def result(
-        self, state: State, residuals: Array, spread: float, steps: int, *, is_settled: bool
+        self, state: State, residuals: Array, spread: float, *, is_settled: bool
     ) -> Adjustment:
         """The adjusted rig and poses, with the covariance at this guess."""
         weights = self.weights(residuals, spread)
@@ -209,7 +208,6 @@ class _Solver(CalibrationProblem):
             weights=np.where(self.seen, weights, np.nan),
             noise_px=noise_px,
             blur=np.broadcast_to(self.blur[..., 0], self.seen.shape[:2]),
-            steps=steps,
             is_settled=is_settled,
         )
 

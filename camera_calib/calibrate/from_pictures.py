@@ -29,7 +29,7 @@ from camera_calib.calibrate.solve import (
 )
 from camera_calib.calibrate.start import same_numbering
 from camera_calib.calibration import Calibration
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.flat_port import IN_AIR, FlatPortCamera
 from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Rig, read_rig, write_rig
@@ -211,12 +211,12 @@ def _first(
 ) -> dict[str, FlatPortCamera]:
     """Cameras of the start, or blank ones, in air or behind the port that the user names."""
     if start is not None:
-        given = _matching(start, sizes).cameras
-        prepare = _behind_port if settings.water else _bare
-        return {name: prepare(camera, settings) for name, camera in given.items()}
+        return {
+            name: _behind_port(camera, settings) if settings.water else replace(camera, **IN_AIR)
+            for name, camera in _matching(start, sizes).cameras.items()
+        }
     if not settings.water:
-        bare = {"n_water": 1.0, "port_distance_m": 0.0, "glass_thickness_m": 0.0}
-        return {name: blank_camera(size, **bare) for name, size in sizes.items()}
+        return {name: blank_camera(size, **IN_AIR) for name, size in sizes.items()}
     port_m, thickness_m = _metres(settings.port_distance_mm), _metres(settings.glass_mm)
     return {
         name: blank_camera(
@@ -232,13 +232,6 @@ def _first(
 
 def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
-
-
-def _bare(camera: FlatPortCamera, _: CalibrateOptions) -> FlatPortCamera:
-    """A camera out of its housing."""
-    return replace(
-        camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
-    )
 
 
 def _behind_port(camera: FlatPortCamera, settings: CalibrateOptions) -> FlatPortCamera:
@@ -315,7 +308,7 @@ def _check_output(output: Path, start: Path | None) -> None:
         WorkspaceError: it cannot be written or would take something with it.
     """
     if not output.name or output.name == "..":
-        raise WorkspaceError(f"-o {output}: name a folder of its own, such as -o air")
+        raise WorkspaceError(f"-o {output}: name a new folder, such as -o air")
     if not output.exists():
         return
     if not output.is_dir():

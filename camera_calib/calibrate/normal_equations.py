@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
-from camera_calib.freedom import POSE, Freedom, Prior
+from camera_calib.freedom import POSE, Freedom
 from camera_calib.rig import Covariance, Rig
 
 Flags = NDArray[np.bool_]
@@ -174,14 +174,26 @@ class CalibrationProblem:
             view_slope[v] += square[:, p:-1, -1]
         at = self.prior_at
         rig[np.ix_(at, at)] += self.prior_information
-        rig_slope[at] += self.prior_information @ self.surprise(state)
+        rig_slope[at] += self.prior_information @ self.prior_residuals(state)
         return Equations(
             rig=rig, between=between, view=view, rig_slope=rig_slope, view_slope=view_slope
         )
 
-    def surprise(self, state: State) -> Array:
+    def prior_residuals(self, state: State) -> Array:
         """(K,) parameters minus the prior's mean; a turn counts from the mean's rotation."""
-        return _surprise(self.prior, self.values(state)[self.prior_at], self.rig, state)
+        prior = self.prior
+        out = self.values(state)[self.prior_at] - prior.mean
+        at = {name: i for i, name in enumerate(prior.parameters)}
+        for c, camera in enumerate(self.rig.cameras):
+            for j, field in enumerate(POSE):
+                i = at.get(f"{camera}.{field}")
+                if i is not None and j >= _TURNS:
+                    out[i] = state.shifts[c, j - _TURNS] - prior.mean[i]
+            turns = [at[n] for f in POSE[:_TURNS] if (n := f"{camera}.{f}") in at]
+            if turns:
+                mean = Rotation.from_rotvec(prior.mean[turns])
+                out[turns] = (Rotation.from_matrix(state.rotations[c]) * mean.inv()).as_rotvec()
+        return out
 
     def information(self, equations: Equations) -> Array:
         """Information of the rig's parameters, (P, P), with the target's poses marginalised."""
@@ -215,18 +227,3 @@ class CalibrationProblem:
             )
         inverse = (vectors / values) @ vectors.T
         return Covariance(parameters=self.names, matrix=inverse * np.outer(scale, scale))
-
-
-def _surprise(prior: Prior, values: Array, rig: Rig, state: State) -> Array:
-    out = values - prior.mean
-    at = {name: i for i, name in enumerate(prior.parameters)}
-    for c, camera in enumerate(rig.cameras):
-        for j, field in enumerate(POSE):
-            i = at.get(f"{camera}.{field}")
-            if i is not None and j >= _TURNS:
-                out[i] = state.shifts[c, j - _TURNS] - prior.mean[i]
-        turns = [at[n] for f in POSE[:_TURNS] if (n := f"{camera}.{f}") in at]
-        if turns:
-            mean = Rotation.from_rotvec(prior.mean[turns])
-            out[turns] = (Rotation.from_matrix(state.rotations[c]) * mean.inv()).as_rotvec()
-    return out

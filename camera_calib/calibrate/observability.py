@@ -21,7 +21,7 @@ from camera_calib.flat_port import FlatPortCamera
 from camera_calib.freedom import Freedom, of_cameras, value
 from camera_calib.rig import Covariance, Rig
 
-TAKEN_FOR_GRANTED: Mapping[str, float] = {
+_TAKEN_FOR_GRANTED: Mapping[str, float] = {
     "n_water": 0.001,
     "n_glass": 0.01,
     "glass_thickness_m": 0.0005,
@@ -64,18 +64,14 @@ class HeldEffect:
     """By adjusted parameter: how far it moves for each unit of an error of the held one."""
 
 
-def unobservable(
-    calibration: Calibration, errors: Mapping[str, float] = TAKEN_FOR_GRANTED
-) -> tuple[str, ...]:
+def unobservable(calibration: Calibration) -> tuple[str, ...]:
     """A line for each held parameter whose likely error matters and that the views leave open.
 
     Args:
         calibration: through ports.
-        errors: held parameters of a camera, and the error each may have.
     """
-    return tuple(
-        line for name, error in errors.items() if (line := _line(calibration, name, error))
-    )
+    lines = (_line(calibration, name, error) for name, error in _TAKEN_FOR_GRANTED.items())
+    return tuple(line for line in lines if line)
 
 
 def held_effect(calibration: Calibration, name: str) -> HeldEffect:

@@ -7,7 +7,7 @@ multiple of the noise are then left out, and named.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -26,7 +26,7 @@ from camera_calib.calibration import (
     residuals_px,
     stack_views,
 )
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.flat_port import IN_AIR, FlatPortCamera
 from camera_calib.freedom import (
     PINHOLE,
     PORT,
@@ -137,7 +137,7 @@ def calibrate(
 
 
 def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibration:
-    """The same calibration from other views, such as some of its own."""
+    """The same calibration from other views, such as a part of those it used."""
     freedom, source = calibration.freedom, "calibration"
     return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
 
@@ -164,10 +164,7 @@ def calibrate_in_air(
     """
     names = intrinsics(lens)
     if start is None:
-        blank = {
-            name: blank_camera(size, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0)
-            for name, size in sizes.items()
-        }
+        blank = {name: blank_camera(size, **IN_AIR) for name, size in sizes.items()}
         start = first_rig(views, points, blank, lens)
     free = (*of_cameras(start, names), *pose_names(start))
     return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
@@ -235,15 +232,13 @@ def calibrate_in_water_alone(
     return replace(found, warnings=(*found.warnings, *unobservable(found)))
 
 
-def blank_camera(
-    size: tuple[int, int],
-    *,
-    n_water: float,
-    port_distance_m: float,
-    glass_thickness_m: float,
-    n_glass: float = 1.52,
-) -> FlatPortCamera:
-    """A camera of which only its port and the size of its pictures are known."""
+def blank_camera(size: tuple[int, int], **port: Any) -> FlatPortCamera:
+    """A camera of which only its port and the size of its pictures are known.
+
+    Args:
+        size: width and height of its pictures.
+        **port: fields of `FlatPortCamera`; `IN_AIR` without a port.
+    """
     width, height = size
     return FlatPortCamera(
         width_px=width,
@@ -252,10 +247,7 @@ def blank_camera(
         fy_px=float(width),
         cx_px=width / 2.0,
         cy_px=height / 2.0,
-        port_distance_m=port_distance_m,
-        glass_thickness_m=glass_thickness_m,
-        n_glass=n_glass,
-        n_water=n_water,
+        **port,
     )
 
 

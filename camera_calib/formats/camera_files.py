@@ -174,7 +174,7 @@ def _read_text(path: Path) -> list[CameraRecord]:
             continue
         where = f"{path}: line {row}"
         if len(items) < 5:
-            raise CalibrationError(f"{where}: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] wanted")
+            raise CalibrationError(f"{where}: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] expected")
         model = _known(where, items[1])
         count = len(MODELS[model][1])
         params, port = items[4 : 4 + count], items[4 + count :]

@@ -252,7 +252,7 @@ def _entries(path: Path) -> list[Fields]:
     """Cameras of a rig configuration, the reference first."""
     rigs = read_json_fields(path).get("list")
     if len(rigs) != 1 or not isinstance(rigs[0], dict):
-        raise CalibrationError(f"{path}: a list of one rig wanted, {len(rigs)} found")
+        raise CalibrationError(f"{path}: a list of one rig expected, {len(rigs)} found")
     rig = Fields(path=path, values=rigs[0])
     cameras = rig.get("cameras")
     if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
@@ -266,7 +266,7 @@ def _entries(path: Path) -> list[Fields]:
         or (first is not None and entry.number("camera_id") == first)
     ]
     if len(references) != 1:
-        raise rig.fault("cameras", f"has {len(references)} reference cameras; 1 wanted")
+        raise rig.fault("cameras", f"has {len(references)} reference cameras; 1 expected")
     return [references[0], *(entry for entry in entries if entry is not references[0])]
 
 

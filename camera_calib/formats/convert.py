@@ -9,9 +9,9 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.flat_port import IN_AIR, FlatPortCamera
 from camera_calib.formats.fields import camera_name
-from camera_calib.formats.opencv_model import IN_AIR, distorts
+from camera_calib.formats.opencv_model import distorts
 from camera_calib.formats.registry import (
     COVARIANCE,
     K3,
@@ -130,7 +130,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     rig, notes = fitted(referenced(rig), target, task)
     existing = [path for path in target.targets(task.target, rig) if path.is_file()]
     if existing and not task.overwrite:
-        raise CalibrationError(f"{existing[0]}: exists: name another, or say --overwrite")
+        raise CalibrationError(f"{existing[0]}: exists: name another, or add --overwrite")
     written = target.write(task.target, rig)
     for note in notes:
         warn(note)
@@ -166,14 +166,14 @@ def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, 
         if bent and terms not in target.holds:
             raise CalibrationError(
                 f"{where} the distortion {' '.join(names)} of {', '.join(bent)}: "
-                "choose another format, or say --water NEAR FAR (m) for the best fit"
+                "choose another format, or add --water NEAR FAR (m) for the best fit"
             )
     behind = [name for name, camera in rig.cameras.items() if has_port(camera)]
     if task.drop_port or (behind and PORT not in target.holds):
         if behind and not task.drop_port:
             raise CalibrationError(
                 f"{where} the port of {', '.join(behind)} ({_port_words(rig.cameras[behind[0]])}): "
-                "say --water NEAR FAR (m) for the best fit under water, --drop-port for the "
+                "add --water NEAR FAR (m) for the best fit under water, --drop-port for the "
                 "cameras in air"
             )
         if behind:
@@ -198,7 +198,7 @@ def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, 
 
 def _may_lose_covariance(rig: Rig, task: Conversion, why: str) -> None:
     if rig.covariance is not None and not task.drop_covariance:
-        raise CalibrationError(f"{why} {_covariance_words(rig)}: say --drop-covariance")
+        raise CalibrationError(f"{why} {_covariance_words(rig)}: add --drop-covariance")
 
 
 def _covariance_words(rig: Rig) -> str:
@@ -267,7 +267,7 @@ def in_water(rig: Rig, near_m: float, far_m: float, model: str) -> tuple[Rig, Ma
         ConfigError: the interval is empty or reaches into a port.
     """
     if model not in MODELS:
-        raise CalibrationError(f"model {model}: {' or '.join(MODELS)} wanted")
+        raise CalibrationError(f"model {model}: {' or '.join(MODELS)} expected")
     found = {
         name: _of_model(approximations(camera, near_m, far_m), model)
         for name, camera in rig.cameras.items()

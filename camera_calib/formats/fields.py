@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 
@@ -100,7 +101,7 @@ class Fields:
             raise self.fault(key, "holds something that is not a finite number")
         if len(flat) not in counts:
             wanted = " or ".join(map(str, counts))
-            raise self.fault(key, f"holds {len(flat)} numbers; {wanted} wanted")
+            raise self.fault(key, f"holds {len(flat)} numbers; {wanted} expected")
         return np.array(flat)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
@@ -241,6 +242,13 @@ def read_yaml(path: Path) -> Fields:
         what = getattr(error, "problem", None) or type(error).__name__
         raise CalibrationError(f"{path}: not valid YAML{where}: {_one_line(what)}") from None
     return _mapping(path, value)
+
+
+def write_yaml(path: Path, document: Any) -> None:
+    """Write a YAML file, lists of numbers on one line each."""
+    with atomic_path(path) as temporary:
+        text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
+        temporary.write_text(text, encoding="utf-8")
 
 
 def read_json_fields(path: Path) -> Fields:

@@ -9,13 +9,11 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.formats.fields import Fields, read_yaml
+from camera_calib.formats.fields import Fields, read_yaml, write_yaml
 from camera_calib.formats.opencv_model import HALF_PIXEL, camera_in_air
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
@@ -65,18 +63,16 @@ def write_kalibr(path: Path, rig: Rig) -> list[Path]:
         entry["resolution"] = [camera.width_px, camera.height_px]
         entry["rostopic"] = f"/{name}/image_raw"
         chain[f"cam{i}"] = entry
-    with atomic_path(path) as temporary:
-        text = yaml.safe_dump(chain, sort_keys=False, default_flow_style=None, width=1000)
-        temporary.write_text(text, encoding="utf-8")
+    write_yaml(path, chain)
     return [path]
 
 
 def _camera(fields: Fields) -> FlatPortCamera:
     if fields.text("camera_model") != "pinhole":
-        raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole wanted")
+        raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole expected")
     model = fields.text("distortion_model")
     if model not in ("radtan", "none"):
-        raise fields.fault("distortion_model", f"is {model}; radtan or none wanted")
+        raise fields.fault("distortion_model", f"is {model}; radtan or none expected")
     k = fields.numbers("distortion_coeffs", 4) if model == "radtan" else ()
     fx, fy, cx, cy = fields.numbers("intrinsics", 4)
     width, height = fields.numbers("resolution", 2)

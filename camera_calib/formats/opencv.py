@@ -115,14 +115,7 @@ def _numbered(fields: Fields, number: str, reading: ReadOptions) -> FlatPortCame
         wanted = f"camera_matrix, or M{number} of a stereo pair"
         raise CalibrationError(f"{fields.path}: lacks {wanted}: is it a calibration?")
     every = _PAIR_DISTORTION if number else _DISTORTION
-    return _camera(
-        fields, matrix, fields.first(*(k.format(number) for k in every)), number, reading
-    )
-
-
-def _camera(
-    fields: Fields, matrix: str, k: str | None, number: str, reading: ReadOptions
-) -> FlatPortCamera:
+    k = fields.first(*(key.format(number) for key in every))
     camera = read_camera(fields, matrix, k, _size(fields, number, reading))
     if f"port{number}" not in fields:
         return camera

@@ -4,7 +4,6 @@ OpenCV, ROS and Kalibr count pixels from the centre of the first one, this proje
 its outer corner: principal points differ by 0.5 and nothing else does.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,18 +11,11 @@ import numpy as np
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.flat_port import IN_AIR, FlatPortCamera
 from camera_calib.formats.fields import Fields
 from camera_calib.lens import COEFFICIENTS
 
 HALF_PIXEL = 0.5
-IN_AIR: Mapping[str, Any] = {
-    "port_distance_m": 0.0,
-    "glass_thickness_m": 0.0,
-    "n_water": 1.0,
-    "normal": (0.0, 0.0, 1.0),
-}
-"""Values of a camera without a port."""
 
 
 def camera_matrix(camera: FlatPortCamera) -> Array:

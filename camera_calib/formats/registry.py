@@ -126,7 +126,7 @@ def detect(path: Path) -> CalibrationFormat:
         raise CalibrationError(f"{path}: no such file or folder")
     name = _of_folder(path) if path.is_dir() else _of_file(path)
     if name is None:
-        raise CalibrationError(f"{path}: of no known format: say which with --from")
+        raise CalibrationError(f"{path}: of no known format: name it with --from")
     return FORMATS[name]
 
 
@@ -140,7 +140,7 @@ def of_target(path: Path) -> CalibrationFormat:
         return FORMATS["colmap"]
     by_suffix = {".json": "rig", ".xml": "opencv"}
     if path.suffix.lower() not in by_suffix:
-        raise CalibrationError(f"{path}: say the format with --to: {', '.join(FORMATS)}")
+        raise CalibrationError(f"{path}: name the format with --to: {', '.join(FORMATS)}")
     return FORMATS[by_suffix[path.suffix.lower()]]
 
 

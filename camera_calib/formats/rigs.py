@@ -12,6 +12,7 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import Fields, camera_name
+from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig
 
 UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
@@ -84,7 +85,7 @@ def only(rig: Rig, camera: str) -> Rig:
         raise CalibrationError(f"no camera {camera!r}; there are {', '.join(rig.cameras)}")
     kept = [name for name in _parameters(rig) if name.startswith(f"{camera}.")]
     # The pose in the rig was a parameter of this camera; alone it is the reference.
-    kept = [name for name in kept if name.rsplit(".", 1)[1] not in POSE_PARAMETERS]
+    kept = [name for name in kept if name.rsplit(".", 1)[1] not in POSE]
     return replace(
         rig,
         cameras={camera: rig.cameras[camera]},
@@ -92,9 +93,6 @@ def only(rig: Rig, camera: str) -> Rig:
         body_from_rig=_mount(rig, camera),
         covariance=_part(rig.covariance, kept),
     )
-
-
-POSE_PARAMETERS = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 
 
 def renamed(rig: Rig, names: Sequence[str]) -> Rig:
@@ -105,7 +103,7 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
     """
     if len(names) != len(rig.cameras) or len(set(names)) != len(names):
         raise CalibrationError(
-            f"--names {','.join(names)}: {len(rig.cameras)} different names wanted, "
+            f"--names {','.join(names)}: {len(rig.cameras)} different names expected, "
             f"for {', '.join(rig.cameras)}"
         )
     new = {

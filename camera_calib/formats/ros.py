@@ -11,14 +11,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.formats.fields import Fields, read_yaml
+from camera_calib.formats.fields import Fields, read_yaml, write_yaml
 from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
@@ -40,7 +38,7 @@ def read_ros(path: Path, reading: ReadOptions) -> Rig:
         return assemble(path, reading, "ROS", [_name(fields, 0, 1)], [_camera(fields)], _ONE)
     files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
     if not 1 <= len(files) <= 2:
-        raise CalibrationError(f"{path}: {len(files)} .yaml files; 1, or 2 of a pair, wanted")
+        raise CalibrationError(f"{path}: {len(files)} .yaml files; 1, or 2 of a pair, expected")
     every = [read_yaml(file) for file in files]
     if len(every) == 1:
         return read_ros(files[0], reading)
@@ -75,7 +73,7 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
     if len(names) == 1:
         camera = rig.cameras[names[0]]
         projection = np.hstack([camera_matrix(camera), np.zeros((3, 1))])
-        _write(path, _document(names[0], camera, np.eye(3), projection))
+        write_yaml(path, _document(names[0], camera, np.eye(3), projection))
         return [path]
     files = ros_files(path, rig)
     first, second = rig.cameras.values()
@@ -95,7 +93,7 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
     p2[:, 3] = p2[axis, axis] * line
     pieces = zip(files, names, (first, second), (r1, r2), (p1, p2), strict=True)
     for file, name, camera, rotation, projection in pieces:
-        _write(file, _document(name, camera, rotation, projection))
+        write_yaml(file, _document(name, camera, rotation, projection))
     return files
 
 
@@ -118,7 +116,7 @@ _ONE = (RigidTransform.identity(),)
 def _camera(fields: Fields) -> FlatPortCamera:
     model = fields.text("distortion_model") if "distortion_model" in fields else "plumb_bob"
     if model not in _MODELS:
-        raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} wanted")
+        raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} expected")
     key = "distortion_coefficients"
     k = fields.vector(key, 0, *_MODELS[model])
     size = (fields.size("image_width"), fields.size("image_height"))
@@ -189,9 +187,3 @@ def _document(name: str, camera: FlatPortCamera, rotation: Array, projection: Ar
 def _matrix(values: Array) -> dict[str, Any]:
     rows, columns = values.shape
     return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
-
-
-def _write(path: Path, document: Any) -> None:
-    with atomic_path(path) as temporary:
-        text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
-        temporary.write_text(text, encoding="utf-8")

@@ -179,26 +179,21 @@ def _angles(angles: tuple[AngleRow, ...]) -> list[PaperClaim]:
 
 def _focus() -> list[PaperClaim]:
     readings = ((_row(12.5), _IN_PAPER), (_row(12.5, in_sea=True), _IN_SEA))
-    focus = [
+    claims = (
+        ("focused at 2 m in water, 1.5 m in air",
+         "near the axis, distance in air from the entrance pupil; ", "focus_air_m", 1.4, 1.6),
+        ("F/4 gives a depth of field of 2 m at 2 m",
+         "circle of confusion of the diagonal/1500; 12.5 mm, ", "depth_of_field_m", 1.9, 2.1),
+    )  # fmt: skip
+    return [
         PaperClaim(
-            claim="focused at 2 m in water, 1.5 m in air",
-            assumption=f"near the axis, distance in air from the entrance pupil; {setup}",
-            computed=row.focus_air_m,
+            claim=claim,
+            assumption=assumption + setup,
+            computed=getattr(row, field),
             unit="m",
-            least=1.4,
-            most=1.6,
+            least=least,
+            most=most,
         )
+        for claim, assumption, field, least, most in claims
         for row, setup in readings
     ]
-    depth = [
-        PaperClaim(
-            claim="F/4 gives a depth of field of 2 m at 2 m",
-            assumption=f"circle of confusion of the diagonal/1500; 12.5 mm, {setup}",
-            computed=row.depth_of_field_m,
-            unit="m",
-            least=1.9,
-            most=2.1,
-        )
-        for row, setup in readings
-    ]
-    return [*focus, *depth]

@@ -63,8 +63,18 @@ def draw_fov(
 
     figure = new_figure(9.4, 15.0)
     panels = figure.subplots(2, 3)
-    _footprints(panels[0, 0], curves, marked, paper=paper)
-    _pixels(panels[0, 1], curves, marked, paper=paper)
+    for axes, title, unit, series, printed in (
+        (panels[0, 0], "Footprint", "m", (("horizontal_m", "wide"), ("vertical_m", "high")),
+         ("horizontal", "vertical")),
+        (panels[0, 1], "Pixel on the sea floor", "mm",
+         (("pixel_centre_mm", "centre"), ("pixel_corner_mm", "corner")), ("pixel",)),
+    ):  # fmt: skip
+        _curves(axes, curves, marked, series)
+        if paper:
+            _paper(axes, printed, curves)
+        axes.set_title(title)
+        axes.set_ylabel(unit)
+        axes.legend(fontsize=9)
     _depth_of_field(panels[0, 2], curves, soft, choices)
     _precision(panels[1, 0], curves, marked)
     _blur(panels[1, 1], marked, speeds_mps, exposures_s, allowed_px)
@@ -96,23 +106,26 @@ def _values(rows: Sequence[FovRow], name: str) -> list[float]:
     return [getattr(row, name) for row in rows]
 
 
-def _curve_pair(
+def _curves(
     axes: Axes,
     curves: dict[float, list[FovRow]],
     marked: dict[float, list[FovRow]],
-    solid: tuple[str, str],
-    dashed: tuple[str, str],
+    series: Sequence[tuple[str, str]],
 ) -> None:
+    """Fields of all lenses against altitude, each with a style of line; the marked ones as dots.
+
+    Args:
+        axes: where to draw.
+        curves: rows by lens, along the altitude.
+        marked: rows by lens, at altitudes of interest.
+        series: name of the field, and what it is called in the legend.
+    """
     for i, (lens, rows) in enumerate(curves.items()):
-        altitude = _values(rows, "altitude_m")
-        axes.plot(
-            altitude, _values(rows, solid[0]), color=_colour(i), label=f"{lens:.4g} mm {solid[1]}"
-        )
-        axes.plot(
-            altitude, _values(rows, dashed[0]), "--", color=_colour(i),
-            label=f"{lens:.4g} mm {dashed[1]}",
-        )  # fmt: skip
-        for name in (solid[0], dashed[0]):
+        for (name, called), style in zip(series, _STYLES, strict=False):
+            axes.plot(
+                _values(rows, "altitude_m"), _values(rows, name), style, color=_colour(i),
+                label=f"{lens:.4g} mm {called}".rstrip(),
+            )  # fmt: skip
             axes.plot(
                 _values(marked[lens], "altitude_m"), _values(marked[lens], name),
                 "o", ms=4, color=_colour(i),
@@ -133,28 +146,6 @@ def _paper(axes: Axes, quantities: Sequence[str], lenses: Collection[float]) -> 
             [2.0] * len(printed), printed, "x", ms=7, mew=1.6, color="black", label="paper",
             zorder=5,
         )  # fmt: skip
-
-
-def _footprints(
-    axes: Axes, curves: dict[float, list[FovRow]], marked: dict[float, list[FovRow]], *, paper: bool
-) -> None:
-    _curve_pair(axes, curves, marked, ("horizontal_m", "wide"), ("vertical_m", "high"))
-    if paper:
-        _paper(axes, ("horizontal", "vertical"), curves)
-    axes.set_title("Footprint")
-    axes.set_ylabel("m")
-    axes.legend(fontsize=9)
-
-
-def _pixels(
-    axes: Axes, curves: dict[float, list[FovRow]], marked: dict[float, list[FovRow]], *, paper: bool
-) -> None:
-    _curve_pair(axes, curves, marked, ("pixel_centre_mm", "centre"), ("pixel_corner_mm", "corner"))
-    if paper:
-        _paper(axes, ("pixel",), curves)
-    axes.set_title("Pixel on the sea floor")
-    axes.set_ylabel("mm")
-    axes.legend(fontsize=9)
 
 
 def _depth_of_field(
@@ -201,19 +192,8 @@ def _precision(
         f"Depth precision of the {first.baseline_m * 1e3:.0f} mm pair,\n"
         f"{first.match_sigma_px:g} px of disparity noise"
     )
-    for i, (lens, rows) in enumerate(curves.items()):
-        axes.plot(
-            _values(rows, "altitude_m"), _values(rows, "depth_sigma_mm"), color=_colour(i),
-            label=f"{lens:.4g} mm",
-        )  # fmt: skip
-        axes.plot(
-            _values(marked[lens], "altitude_m"), _values(marked[lens], "depth_sigma_mm"), "o",
-            ms=4, color=_colour(i),
-        )  # fmt: skip
-    axes.set_xlabel("altitude of the outer glass, m")
+    _curves(axes, curves, marked, (("depth_sigma_mm", ""),))
     axes.set_ylabel("one sigma, mm")
-    axes.set_xlim(left=0)
-    axes.set_ylim(bottom=0)
     axes.legend(fontsize=9)
 
 

@@ -154,15 +154,11 @@ def fov_table(
     check_range("lens", lenses_mm, 0.5, 500.0, "mm")
     check_range("altitude", altitudes_m, 0.01, 1000.0, "m")
     check_range("n_water", [n_water], 1.0, 1.4, "")
-    water = WaterConfig(n_water=n_water)
     rows = []
-    for lens_mm in lenses_mm:
-        config = camera_config.model_copy(update={"focal_mm": float(lens_mm)})
-        rig = design_rig(config, water)
-        rows += [
-            _row(rig, config, float(altitude), choices or FovChoices(), float(lens_mm) * 1e-3)
-            for altitude in altitudes_m
-        ]
+    for lens_mm in map(float, lenses_mm):
+        config = camera_config.model_copy(update={"focal_mm": lens_mm})
+        rig = design_rig(config, WaterConfig(n_water=n_water))
+        rows += rig_fov_table(rig, altitudes_m, config, choices, lens_mm * 1e-3)
     return rows
 
 
@@ -171,6 +167,7 @@ def rig_fov_table(
     altitudes_m: Sequence[float],
     camera_config: CameraConfig,
     choices: FovChoices | None = None,
+    focal_m: float | None = None,
 ) -> list[FovRow]:
     """The same of a calibrated rig, with its lens distortion, port tilt and relative pose.
 
@@ -179,6 +176,7 @@ def rig_fov_table(
         altitudes_m: of the first camera's outer glass, where the normal of its pupil meets it.
         camera_config: `pixel_um` and `f_number`, which a rig does not have; the rest is not used.
         choices: circle of confusion, focus, matching noise.
+        focal_m: focal length of the lens; from its image distance when not given.
 
     Returns:
         One row per altitude.
@@ -188,7 +186,7 @@ def rig_fov_table(
     """
     check_range("altitude", altitudes_m, 0.01, 1000.0, "m")
     return [
-        _row(rig, camera_config, float(altitude), choices or FovChoices(), None)
+        _row(rig, camera_config, float(altitude), choices or FovChoices(), focal_m)
         for altitude in altitudes_m
     ]
 

@@ -57,27 +57,26 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
 
 def validation_csv_rows(validation: PaperValidation) -> list[dict[str, Any]]:
     """Every check and claim, flat."""
-    checks = [
-        {
-            "claim": f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}",
-            "verdict": _verdict(c),
-            "computed": f"{c.computed:.4f} {c.unit}",
-            "assumption": PAPER_RULE.partition(";")[0],
-            "rule": f"within {c.tolerance:g} {c.unit}",
-        }
+    stated: list[tuple[PaperCheck | PaperClaim, str, str, str]] = [
+        (
+            c,
+            f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}",
+            PAPER_RULE.partition(";")[0],
+            f"within {c.tolerance:g} {c.unit}",
+        )
         for c in validation.table
     ]
-    claims = [
+    stated += [(c, c.claim, c.assumption, _bounds(c)) for c in validation.claims]
+    return [
         {
-            "claim": c.claim,
+            "claim": claim,
             "verdict": _verdict(c),
             "computed": f"{c.computed:.4f} {c.unit}",
-            "assumption": c.assumption,
-            "rule": _bounds(c),
+            "assumption": assumption,
+            "rule": rule,
         }
-        for c in validation.claims
+        for c, claim, assumption, rule in stated
     ]
-    return checks + claims
 
 
 def fov_tables(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> list[TextTable]:

@@ -205,23 +205,15 @@ def largest_radius_px(camera: FlatPortCamera) -> float:
     return float(radius_px(camera, camera.border(1)).max())
 
 
-def residual_profiles(camera: FlatPortCamera, seen: CameraResiduals) -> "Profiles":
+def residual_profiles(camera: FlatPortCamera, seen: CameraResiduals) -> tuple[Profile, Profile]:
     """Residuals against the radius and against the angle at the port."""
     corner_deg = incidence_deg(camera, camera.border(1))
     steepest = float(np.nanmax(np.append(corner_deg, seen.incidence_deg)))
     by = (seen.residuals_px, seen.outward_px, seen.sigma_px)
-    return Profiles(
-        radius=profile(seen.radius_px, *by, largest_radius_px(camera)),
-        incidence=profile(seen.incidence_deg, *by, steepest),
+    return (
+        profile(seen.radius_px, *by, largest_radius_px(camera)),
+        profile(seen.incidence_deg, *by, steepest),
     )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Profiles:
-    """Residual profiles of one camera."""
-
-    radius: Profile
-    incidence: Profile
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,8 +261,6 @@ class Spread:
     """(V,) distance of the target's middle along the axis."""
     tilt_xy_deg: Array
     """(V, 2) tilt of the target about the camera's x and y axes."""
-    roll_deg: Array
-    """(V,) turn of the target about its own normal, from the camera's right."""
 
 
 def spread(rig: Rig, camera: str, calibration: Calibration) -> Spread:
@@ -284,5 +274,4 @@ def spread(rig: Rig, camera: str, calibration: Calibration) -> Spread:
     return Spread(
         range_m=np.array([pose.apply(middle)[2] for pose in poses]),
         tilt_xy_deg=tilts,
-        roll_deg=np.degrees(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])),
     )

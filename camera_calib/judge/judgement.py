@@ -15,7 +15,7 @@ from camera_calib.judge.fit_quality import (
     CameraResiduals,
     Coverage,
     PictureFit,
-    Profiles,
+    Profile,
     Spread,
     camera_residuals,
     coverage,
@@ -87,7 +87,9 @@ class CameraJudgement:
     """Measures of one camera."""
 
     seen: CameraResiduals
-    profiles: Profiles
+    by_radius: Profile
+    by_incidence: Profile
+    """Residuals against the radius and against the angle to the port's normal in water, deg."""
     coverage: Coverage
     spread: Spread
     homography: HomographyTest | None
@@ -233,6 +235,7 @@ def _camera(
 ) -> CameraJudgement:
     rig, model = calibration.rig, calibration.rig.cameras[name]
     seen = camera_residuals(calibration, name)
+    by_radius, by_incidence = residual_profiles(model, seen)
     anchors = anchors_cam(calibration, name)
     pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
     halves = None
@@ -242,7 +245,8 @@ def _camera(
     coarse, compensating = pixels[::2, ::2], compensation(rig, name, anchors)
     return CameraJudgement(
         seen=seen,
-        profiles=residual_profiles(model, seen),
+        by_radius=by_radius,
+        by_incidence=by_incidence,
         coverage=coverage(model, seen.pixels),
         spread=spread(rig, name, calibration),
         homography=homography_test(calibration, name),

@@ -1,7 +1,7 @@
 """Figures of a calibration report, as PNG files: its fit, its uncertainty, its tests, coverage."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -87,9 +87,8 @@ def plot_vectors(judged: Judgement) -> bytes:
     """Residuals over the frame: each one thin, the mean of each cell bold."""
 
     def draw(figure: Sheet) -> None:
-        for c, (axes, (name, camera)) in enumerate(
-            zip(_axes_grid(figure, len(judged.cameras))[0], judged.cameras.items(), strict=True)
-        ):
+        for c, axes, name in _by_camera(_axes_grid(figure, len(judged.cameras))[0], judged):
+            camera = judged.cameras[name]
             model = judged.calibration.rig.cameras[name]
             seen, noise = camera.seen, judged.calibration.noise_px
             px_per_px = 0.025 * model.width_px / noise
@@ -124,12 +123,10 @@ def plot_vectors(judged: Judgement) -> bytes:
             if len(out):
                 axes.plot(*out.T, "x", color="#b3261e", ms=5, mew=1.2, label="rejected")
                 axes.legend(loc="upper right", facecolor="white", frameon=True, framealpha=0.8)
-            axes.set_title(plain_name(name), color=_colour(c))
             _draw_frame(axes, judged, name)
             axes.set_xlabel(
                 f"x (px);  thin lines {px_per_px:.0f} times enlarged, arrows {4 * px_per_px:.0f}"
             )
-            axes.set_ylabel("y (px)" if c == 0 else "")
 
     return _png(_frame_height(judged), draw)
 
@@ -161,7 +158,7 @@ def plot_profiles(judged: Judgement) -> bytes:
     def draw(figure: Sheet) -> None:
         grid = _axes_grid(figure, 2, 2)
         for c, (name, camera) in enumerate(judged.cameras.items()):
-            for column, found in enumerate((camera.profiles.radius, camera.profiles.incidence)):
+            for column, found in enumerate((camera.by_radius, camera.by_incidence)):
                 _draw_profile(grid[0][column], grid[1][column], found, c, name)
         noise = judged.calibration.noise_px
         for column, label in enumerate(
@@ -184,9 +181,8 @@ def plot_histogram(judged: Judgement) -> bytes:
         edges = np.linspace(-6, 6, 61)
         middle = (edges[1:] + edges[:-1]) / 2
         normal = np.exp(-0.5 * middle**2) / np.sqrt(2 * np.pi)
-        for c, (axes, name) in enumerate(
-            zip(_axes_grid(figure, len(judged.cameras))[0], judged.cameras, strict=True)
-        ):
+        row = _axes_grid(figure, len(judged.cameras))[0]
+        for c, axes, _ in _by_camera(row, judged, "density"):
             every = judged.calibration.residuals_px[:, c] / sigma_px[:, c]
             values = every[np.isfinite(every)]
             inside = values[np.abs(values) < edges[-1]]
@@ -200,13 +196,11 @@ def plot_histogram(judged: Judgement) -> bytes:
             )
             axes.plot(middle, normal, color=INK, lw=1.4, label="normal law")
             beyond = float((np.abs(values) > 3).mean())
-            axes.set_title(plain_name(name), color=_colour(c))
             axes.set(
                 xlabel=f"residual / noise;  {beyond:.2%} beyond 3 (normal law: 0.27%)",
                 ylim=(1e-5, 1),
                 xlim=(-6, 6),
             )
-            axes.set_ylabel("density" if c == 0 else "")
             axes.legend(loc="upper right")
 
     return _png(3.2, draw)
@@ -269,12 +263,9 @@ def plot_projection(judged: Judgement) -> bytes:
         ):
             maps = [getattr(camera.sigma, field) for camera in judged.cameras.values()]
             levels = _shared_levels(maps)
-            for c, (axes, name, values) in enumerate(
-                zip(grid[row], judged.cameras, maps, strict=True)
-            ):
-                image = _draw_map(axes, judged, name, values, levels)
+            for c, axes, name in _by_camera(grid[row], judged):
+                image = _draw_map(axes, judged, name, maps[c], levels)
                 axes.set_title(f"{plain_name(name)}: {kind}", color=_colour(c))
-                axes.set_ylabel("y (px)" if c == 0 else "")
             _level_bar(image, grid[row], levels, "sigma (px)")
 
     return _png(_frame_height(judged, 2), draw)
@@ -505,9 +496,8 @@ def plot_coverage(judged: Judgement) -> bytes:
     def draw(figure: Sheet) -> None:
         grid = _axes_grid(figure, len(judged.cameras))
         largest = max(int(c.coverage.counts.max()) for c in judged.cameras.values())
-        for c, (axes, (name, camera)) in enumerate(
-            zip(grid[0], judged.cameras.items(), strict=True)
-        ):
+        for _, axes, name in _by_camera(grid[0], judged):
+            camera = judged.cameras[name]
             model = judged.calibration.rig.cameras[name]
             size = (model.width_px, model.height_px)
             image = axes.imshow(
@@ -522,9 +512,7 @@ def plot_coverage(judged: Judgement) -> bytes:
             axes.plot(*camera.seen.pixels.T, ".", ms=1.3, color=INK, alpha=0.45)
             for corner in camera.coverage.uncovered:
                 _mark_corner(axes, corner, size)
-            axes.set_title(plain_name(name), color=_colour(c))
             _draw_frame(axes, judged, name)
-            axes.set_ylabel("y (px)" if c == 0 else "")
         colour_bar(image, grid[0], "points in a cell")
 
     return _png(_frame_height(judged), draw)
@@ -541,7 +529,7 @@ def _mark_corner(axes: Axes, corner: str, size: tuple[int, int]) -> None:
 
 
 def plot_spread(judged: Judgement) -> bytes:
-    """Poses of the target: tilts, and distance against turn."""
+    """Poses of the target: tilts about both axes, and tilt against distance."""
 
     def draw(figure: Sheet) -> None:
         left, right = _axes_grid(figure, 2)[0]
@@ -597,6 +585,16 @@ def _axes_grid(figure: Sheet, count: int, rows: int = 1) -> list[list[Axes]]:
     """Axes by row and column."""
     grid = figure.subplots(rows, count, squeeze=False)
     return [list(row) for row in grid]
+
+
+def _by_camera(
+    row: Sequence[Axes], judged: Judgement, label: str = "y (px)"
+) -> Iterator[tuple[int, Axes, str]]:
+    """Number, titled axes and name of each camera; the first axes carry the label of y."""
+    for c, (axes, name) in enumerate(zip(row, judged.cameras, strict=True)):
+        axes.set_title(plain_name(name), color=_colour(c))
+        axes.set_ylabel(label if c == 0 else "")
+        yield c, axes, name
 
 
 def _draw_frame(axes: Axes, judged: Judgement, camera: str) -> None:

@@ -27,7 +27,6 @@ def write_report(
     folder: Path,
     calibration: Calibration,
     held_out: HeldOut | None,
-    working_range_m: float | None = None,
 ) -> None:
     """Write `report.html` and `report.json` into a folder.
 
@@ -35,12 +34,11 @@ def write_report(
         folder: an existing folder.
         calibration: with its rig's covariance.
         held_out: from `validation.hold_out`; None if no views could be held out.
-        working_range_m: where the rig will work, for maps and stereo (see `judge`).
 
     Raises:
         CalibrationError: the rig has no covariance.
     """
-    judged = judge(calibration, held_out, working_range_m)
+    judged = judge(calibration, held_out)
     found = verdicts(judged)
     CalibrationReportRecord.save(folder / "report.json", report_json(judged, found))
     with atomic_path(folder / "report.html") as path:
@@ -83,8 +81,8 @@ def _camera_numbers(camera: CameraJudgement) -> dict[str, Any]:
             "corner_reach": coverage.corner_reach,
             "uncovered": coverage.uncovered,
         },
-        "residuals_by_radius": camera.profiles.radius,
-        "residuals_by_incidence_deg": camera.profiles.incidence,
+        "residuals_by_radius": camera.by_radius,
+        "residuals_by_incidence_deg": camera.by_incidence,
         "projection_sigma": camera.by_range,
         "homography": test
         and {
@@ -216,7 +214,7 @@ def _residuals_section(judged: Judgement) -> Section:
     return Section(
         title="Residuals",
         text=(
-            "A residual is where the model sees a point less where it was measured. Means and "
+            "A residual is where the model sees a point minus where it was measured. Means and "
             f"profiles leave out outliers (longer than {GATE_SIGMAS:g} times the noise, of "
             f"{noise:.3f} px unless a picture has its own); bars and histogram do not.",
         ),
@@ -254,7 +252,7 @@ def _residuals_section(judged: Judgement) -> Section:
             Figure(
                 png=plots.plot_histogram(judged),
                 title="Against the normal law",
-                alt="Histogram of residuals over noise beside the normal law, by camera",
+                alt="Histogram of residuals over noise against the normal law, by camera",
                 shows="Both coordinates of all residuals over the noise; logarithmic.",
                 good="The bars follow the curve.",
                 otherwise="Fat tails are badly found corners (robust weights bear some); a "
@@ -284,7 +282,7 @@ def _correlations_section(judged: Judgement) -> Section:
                 "(red).",
                 good="Pale outside of the diagonal. Some pairs always go together: fx with fy, "
                 "the centre with p1, p2 and the port's tilt, k1 to k3.",
-                otherwise="A pair near 1 is not told apart by these views: its errors cancel "
+                otherwise="These views cannot separate a pair near 1: its errors cancel "
                 "where the views were, and return elsewhere. Nearer views, more tilts "
                 "and turned targets part them; or hold one.",
             )
@@ -315,7 +313,7 @@ def _uncertainty_section(judged: Judgement) -> Section:
             "the views were. "
             + (
                 "Right: a triangulated point's distance and lengths, from the calibration alone, "
-                "beside what a point's own noise gives; noise averages out over many points, "
+                "next to what a point's own noise gives; noise averages out over many points, "
                 "calibration errors do not."
                 if judged.stereo
                 else ""
@@ -361,7 +359,7 @@ def _stereo_table(judged: Judgement) -> Table:
         for s in judged.stereo
     ]
     return Table(
-        title="Stereo: sigmas in mm, from the calibration alone unless said otherwise",
+        title="Stereo: sigmas in mm, from the calibration alone unless stated otherwise",
         header=(
             "distance m",
             "point right",

@@ -30,8 +30,7 @@ def covariance_of(rig: Rig) -> Covariance:
     """
     if rig.covariance is None:
         raise CalibrationError(
-            f"the rig ({rig.source}) has no covariance, so nothing can be said of its uncertainty: "
-            "calibrate it"
+            f"the rig ({rig.source}) has no covariance, so its uncertainty is unknown: calibrate it"
         )
     for name in rig.covariance.parameters:
         camera, _, field = name.rpartition(".")
@@ -183,15 +182,20 @@ def _triangulation(rig: Rig, points_rig: Array) -> tuple[Array, Array]:
     return -gain @ j, gain
 
 
+def _sigmas(rig: Rig, slopes: Array) -> Array:
+    """Standard deviations (...) of what follows the rig's parameters by slopes (..., P)."""
+    variance = np.einsum("...p,pq,...q->...", slopes, covariance_of(rig).matrix, slopes)
+    sigmas: Array = np.sqrt(np.maximum(variance, 0.0))
+    return sigmas
+
+
 def point_sigmas_m(rig: Rig, points_rig: Array) -> Array:
     """Standard deviations of triangulated points by calibration alone, (N, 3) along the rig's axes.
 
     NaN where fewer than two cameras have a point in their frames.
     """
     follow, _ = _triangulation(rig, points_rig)
-    variance = np.einsum("nap,pq,naq->na", follow, covariance_of(rig).matrix, follow)
-    sigmas: Array = np.sqrt(np.maximum(variance, 0.0))
-    return sigmas
+    return _sigmas(rig, follow)
 
 
 def shape_sigmas_m(rig: Rig, points_rig: Array) -> Array:
@@ -208,8 +212,7 @@ def shape_sigmas_m(rig: Rig, points_rig: Array) -> Array:
     motion = pose_jacobian(np.broadcast_to(np.eye(3), (len(centred), 3, 3)), centred).reshape(-1, 6)
     moved = follow[known].reshape(len(motion), -1)
     left = (moved - motion @ taken_up(motion, moved)).reshape(-1, 3, moved.shape[1])
-    variance = np.einsum("nap,pq,naq->na", left, covariance_of(rig).matrix, left)
-    shape[known] = np.sqrt(np.maximum(variance, 0.0))
+    shape[known] = _sigmas(rig, left)
     return shape
 
 
@@ -225,10 +228,7 @@ def length_sigmas_m(rig: Rig, starts_rig: Array, ends_rig: Array) -> Array:
     along = ends_rig - starts_rig
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     follow = _triangulation(rig, ends_rig)[0] - _triangulation(rig, starts_rig)[0]
-    slopes = np.einsum("na,nap->np", along, follow)
-    variance = np.einsum("np,pq,nq->n", slopes, covariance_of(rig).matrix, slopes)
-    sigmas: Array = np.sqrt(np.maximum(variance, 0.0))
-    return sigmas
+    return _sigmas(rig, np.einsum("na,nap->np", along, follow))
 
 
 def overlap_points(rig: Rig, range_m: float) -> Array:
@@ -255,17 +255,17 @@ class StereoSigma:
     """Stereo uncertainty at one distance; NaN where no two cameras see the same."""
 
     range_m: float
-    point_m: tuple[float, float, float]
+    point_m: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     """Sigmas right, down, forward of a point mid-overlap, by calibration alone."""
-    worst_point_m: float
+    worst_point_m: float = math.nan
     """Largest sigma forward in the overlap, by calibration alone."""
-    worst_shape_m: float
+    worst_shape_m: float = math.nan
     """Largest sigma forward in the overlap, after the best rigid motion."""
-    noise_m: tuple[float, float, float]
+    noise_m: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     """Sigmas of the same point as `point_m`, by the noise of its pixels alone."""
-    length_m: float
+    length_m: float = math.nan
     """A length across the overlap: 1 m, or what fits."""
-    length_sigma_m: float
+    length_sigma_m: float = math.nan
     """Sigma of the length, by calibration alone."""
 
 
@@ -277,18 +277,9 @@ def stereo_sigma(rig: Rig, range_m: float, noise_px: float) -> StereoSigma:
         range_m: from the reference camera's entrance pupil along its axis.
         noise_px: standard deviation of one measured coordinate, for comparison.
     """
-    nothing = (np.nan, np.nan, np.nan)
     points = overlap_points(rig, range_m)
     if len(points) < 2:
-        return StereoSigma(
-            range_m=range_m,
-            point_m=nothing,
-            worst_point_m=np.nan,
-            worst_shape_m=np.nan,
-            noise_m=nothing,
-            length_m=np.nan,
-            length_sigma_m=np.nan,
-        )
+        return StereoSigma(range_m=range_m)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     centre = points[np.argmin(np.linalg.norm(points - middle, axis=1))]
     reach = min(centre[0] - points[:, 0].min(), points[:, 0].max() - centre[0])
@@ -320,4 +311,4 @@ def baseline_sigma_m(rig: Rig, camera: str) -> float:
         owner, _, field = name.rpartition(".")
         if owner == camera and field in POSE[3:]:
             slopes[column] = along[POSE[3:].index(field)]
-    return math.sqrt(max(float(slopes @ covariance.matrix @ slopes), 0.0))
+    return float(_sigmas(rig, slopes))

@@ -35,6 +35,9 @@ from camera_calib.judge.uncertainty import (
 from camera_calib.rig import Rig
 from camera_calib.triangulate import triangulate
 
+_EVERY = 5
+"""One view in this many is held out."""
+
 Calibrate = Callable[[Sequence[TargetView]], Calibration]
 Locate = Callable[[Rig, TargetView, Array], RigidTransform]
 
@@ -56,23 +59,20 @@ class HeldOut:
 
 
 @progress.step("hold views out")
-def hold_out(
-    views: Sequence[TargetView], calibrate: Calibrate, locate: Locate, every: int = 5
-) -> HeldOut | None:
+def hold_out(views: Sequence[TargetView], calibrate: Calibrate, locate: Locate) -> HeldOut | None:
     """Calibrate without every n-th view and pose those; calibrate from either half of the views.
 
     Args:
         views: those that the calibration kept.
         calibrate: the calibration to be tested.
         locate: finds `rig_from_target` of one view in a rig, from the target's points.
-        every: one view in this many is held out.
 
     Returns:
         None, with a warning, where too few views are left to calibrate from.
     """
     # The middle of each run, so that first and last views, often the odd ones, are used.
-    held = tuple(view for i, view in enumerate(views) if i % every == every // 2)
-    rest = [view for i, view in enumerate(views) if i % every != every // 2]
+    held = tuple(view for i, view in enumerate(views) if i % _EVERY == _EVERY // 2)
+    rest = [view for i, view in enumerate(views) if i % _EVERY != _EVERY // 2]
     try:
         used = calibrate(rest)
     except CalibrationError as error:

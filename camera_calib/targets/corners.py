@@ -7,8 +7,9 @@ shape of its squares, and to a cross along the edges where markers or bits stand
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Self
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -62,22 +63,17 @@ class Corners:
 
     def take(self, order: NDArray[np.intp]) -> Self:
         """These corners in another order."""
-        return replace(
-            self,
-            pixels=self.pixels[order],
-            sigma_px=self.sigma_px[order],
-            contrast=self.contrast[order],
-            states=self.states[order],
-        )
+        return self._changed(lambda values: values[order])
 
     def joined(self, more: Self) -> Self:
         """These corners and then more."""
+        return self._changed(lambda *both: np.concatenate(both), more)
+
+    def _changed(self, change: Callable[..., Any], *others: Self) -> Self:
+        """All fields changed in the same way."""
+        names = [field.name for field in fields(self)]
         return replace(
-            self,
-            pixels=np.concatenate([self.pixels, more.pixels]),
-            sigma_px=np.concatenate([self.sigma_px, more.sigma_px]),
-            contrast=np.concatenate([self.contrast, more.contrast]),
-            states=np.concatenate([self.states, more.states]),
+            self, **{n: change(*(getattr(one, n) for one in (self, *others))) for n in names}
         )
 
     def without(self, which: NDArray[np.bool_], state: int) -> Self:

@@ -40,8 +40,6 @@ from camera_calib.targets.target import (
     aruco_dictionary,
 )
 
-__all__ = ["Detection", "as_grey", "chessboard_size", "detect", "detect_with_reasons"]
-
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _FEWEST_POINTS = 6
@@ -280,7 +278,7 @@ def reduced(grey: Grey, longest_px: int) -> Reduced:
     if scale < 1.0:
         small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     if small.dtype != np.uint8:
-        # Detectors want the middle tones that the eye wants.
+        # Detectors need the middle tones that the eye needs.
         small = np.rint(255.0 * np.sqrt(small)).astype(np.uint8)
     return Reduced(picture=small, scale=np.array([width / size[0], height / size[1]]))
 

@@ -70,7 +70,7 @@ def lay_out(target: Target, paper: str | None = None) -> Sheet:
     """
     left, top, right, bottom = (1e3 * side for side in target.outline)
     width, height = right - left, bottom - top
-    # On a page of its own a board gets half a square of white all around.
+    # On a page made for it a board gets half a square of white all around.
     margin = max(_MARGIN_MM, -0.5 * left) if paper is None else _MARGIN_MM
     needed = max(width, BAR_MM) + 2.0 * margin, height + _STRIP_MM + 2.0 * margin
     page = needed if paper is None else _on_paper(target, needed, paper)
@@ -270,8 +270,8 @@ def print_target(
     if target.is_ambiguous:
         lines.append(
             "this chessboard looks the same when turned by half a turn, so that cameras that are "
-            "turned against each other may number its corners unlike: better take an odd and an "
-            "even count, such as 9x6"
+            "turned against each other may number its corners differently: use an odd and an even "
+            "count, such as 9x6"
         )
     data = {
         "file": str(path),

@@ -16,7 +16,6 @@ the top left, as the board is read when it hangs upright.
   camera: its point in row r of R is ours in row R - 1 - r.)
 """
 
-import json
 import re
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -26,9 +25,9 @@ from typing import Any, Literal, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
-from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.artefacts import checked, read_json, write_json
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
@@ -205,7 +204,7 @@ class Target:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the points cannot be numbered for certain: two cameras may number unlike."""
+        """Whether the numbering is not unique: two cameras may number points differently."""
         return bool(self.symmetries)
 
     @property
@@ -257,11 +256,9 @@ class Target:
             raise CalibrationError(f"target: version {data.get('version')}; {VERSION} is known")
         values = {key: value for key, value in data.items() if key not in ("format", "version")}
         try:
-            return TypeAdapter(cls).validate_json(json.dumps(values))
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            key = ".".join(map(str, first["loc"]))
-            raise CalibrationError(f"target: its file is wrong: {key}: {first['msg']}") from None
+            return checked(cls, values)
+        except ValueError as error:
+            raise CalibrationError(f"target: its file is wrong: {error}") from None
 
 
 _COUNTED = {"chessboard": "inner corners", "charuco": "squares", "apriltag": "tags"}

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.calibration import TargetView
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.flat_port import IN_AIR
 from camera_calib.rig import Rig, design_rig
 
 Array = NDArray[np.float64]
@@ -56,12 +56,8 @@ def built_rig() -> Rig:
 
 
 def in_air(rig: Rig) -> Rig:
-    def bare(camera: FlatPortCamera) -> FlatPortCamera:
-        return replace(
-            camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
-        )
-
-    return replace(rig, cameras={name: bare(camera) for name, camera in rig.cameras.items()})
+    cameras = {name: replace(camera, **IN_AIR) for name, camera in rig.cameras.items()}
+    return replace(rig, cameras=cameras)
 
 
 def with_values(rig: Rig, values: Mapping[str, float]) -> Rig:

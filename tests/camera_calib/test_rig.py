@@ -151,7 +151,7 @@ def test_every_camera_needs_a_pose(rig: Rig) -> None:
         (("cameras", "left", "glass_thickness_m"), 1e9, "0 to 10 m"),
         (("cameras", "left", "normal"), [0.0, 1.0], "normal"),
         (("cameras", "left", "normal"), [0.0, 0.0, 1.0, 0.0], "normal"),
-        (("cameras", "right", "cam_from_rig"), 5, "right: cam_from_rig"),
+        (("cameras", "right", "cam_from_rig"), 5, "right.cam_from_rig"),
         (("cameras", "right", "cam_from_rig", "translation_m"), [0, 0, float("nan")], "right"),
         (
             ("cameras", "right", "cam_from_rig", "quaternion_xyzw"),
@@ -160,7 +160,7 @@ def test_every_camera_needs_a_pose(rig: Rig) -> None:
         ),
         (("cameras",), [], "cameras"),
         (("version",), 1, "version"),
-        (("covariance", "matrix"), [[0.1, 0.0], [0.0]], "left.k1"),
+        (("covariance", "matrix"), [[0.1, 0.0], [0.0]], "covariance"),
         (("covariance", "parameters"), ["left.fx_px"], "covariance"),
         (("format",), "something", "format"),
         (("cameras", "left", "fx_px"), -1, "fx_px"),

@@ -10,14 +10,13 @@ from hypothesis import strategies as st
 
 from alice_survey.base.config import Jerlov
 from alice_survey.base.errors import ConfigError
+from alice_survey.base.seawater import n_water
 from camera_calib.water import (
     CHANNELS,
     WAVELENGTH_NM,
     diffuse_attenuation_per_m,
-    n_water,
     water_optics,
     water_report,
-    water_table,
 )
 
 JERLOV_1976_PER_M = {
@@ -76,16 +75,16 @@ def test_attenuation_beyond_the_table_is_not_made_up(nm: float) -> None:
 
 
 def test_the_table_holds_the_three_channels() -> None:
-    rows = water_table(20.0, 35.0, 15.0, "III")
+    rows = water_report(20.0, 35.0, 15.0, "III")[1]["rows"]
 
-    assert tuple(row.channel for row in rows) == CHANNELS
+    assert tuple(row["channel"] for row in rows) == CHANNELS
     optics = water_optics("III")
     for i, row in enumerate(rows):
-        assert row.wavelength_nm == WAVELENGTH_NM[i]
-        assert row.n_water == float(n_water(20.0, 35.0, 15.0, WAVELENGTH_NM[i]))
-        assert row.beam_per_m == pytest.approx(optics.attenuation_per_m[i], rel=1e-12)
-        assert row.absorption_per_m + row.scattering_per_m == row.beam_per_m
-        assert row.beam_per_m > 0.9 * row.diffuse_per_m
+        assert row["wavelength_nm"] == WAVELENGTH_NM[i]
+        assert row["n_water"] == float(n_water(20.0, 35.0, 15.0, WAVELENGTH_NM[i]))
+        assert row["beam_per_m"] == pytest.approx(optics.attenuation_per_m[i], rel=1e-12)
+        assert row["absorption_per_m"] + row["scattering_per_m"] == row["beam_per_m"]
+        assert row["beam_per_m"] > 0.9 * row["diffuse_per_m"]
 
 
 def test_the_report_says_what_the_table_holds() -> None:

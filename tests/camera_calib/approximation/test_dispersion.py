@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import shift as shift_picture
 
 from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
+from alice_survey.base.seawater import n_water
 from camera_calib.approximation.dispersion import (
     channel_cameras,
     channel_maps,
@@ -20,7 +21,7 @@ from camera_calib.approximation.dispersion import (
     undisperse,
 )
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.water import CHANNELS, n_water
+from camera_calib.water import CHANNELS
 
 ALICE = FlatPortCamera(
     width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,

@@ -321,7 +321,7 @@ def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path)
 def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine")
     settings = CalibrateOptions(pictures=str(tmp_path), target=BOARD)
-    for output, said in ((tmp_path / "taken", "is a file"), (Path(), "folder of its own")):
+    for output, said in ((tmp_path / "taken", "is a file"), (Path(), "new folder")):
         with pytest.raises(AliceError, match=said):
             calibrate_pictures(replace(settings, output=output), executor=SERIAL)
     assert (tmp_path / "taken").read_text() == "mine"
