@@ -8,6 +8,7 @@ import numpy as np
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.base.config import SurveyConfig
+from alice_survey.base.frames import Datum
 from alice_survey.seafloor.terrain import Terrain, survey_terrain
 from alice_survey.vehicle.floor import FloorGrid, level_floor
 from camera_calib.rig import design_rig
@@ -58,6 +59,7 @@ def plan_of(routes: Sequence[Route], stations: int = 6, turn_radius_m: float = 0
     plan = exported_plan(
         lines,
         [(min(own), max(own)) for own in indices],
+        datum=Datum(latitude_deg=32.8, longitude_deg=34.9),
         routes=list(routes),
         home=routes[0].legs[0].start_ne_m,
         seafloor_depth_m=6.0,
