@@ -152,10 +152,10 @@ def read_tide(text: str, *, dated: bool) -> "float | Signal":
             heights.append(float(row["height_m"] or ""))
         except ValueError:
             raise NavigationError(
-                f"{path} line {line}: {row[column]!r}, {row['height_m']!r} is no moment and height"
+                f"{path} line {line}: {row[column]!r}, {row['height_m']!r}: not a time and a height"
             ) from None
     if not times or not np.all(np.isfinite([*times, *heights])):
-        raise NavigationError(f"{path}: holds no tides, or heights that are no numbers")
+        raise NavigationError(f"{path}: holds no tides, or heights that are not numbers")
     if not np.all(np.diff(times) > 0):
         raise NavigationError(f"{path}: the times must increase")
     return Signal(source=text, time_s=np.array(times), values=np.array(heights)[:, None])

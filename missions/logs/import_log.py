@@ -70,29 +70,29 @@ def import_log(
     Raises:
         NavigationError: the log cannot be read, holds no position, or an option does not fit it.
     """
-    asked = options or ImportOptions()
-    written = [file for file in (out, asked.vehicle_log) if file is not None]
+    options = options or ImportOptions()
+    written = [file for file in (out, options.vehicle_log) if file is not None]
     for file in written:
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
-    dive = read_dive(path, asked)
-    dated = dive.dated or asked.start_utc is not None
-    if asked.start_utc is not None:
-        dive = _dated(dive, asked.start_utc)
+    dive = read_dive(path, options)
+    dated = dive.dated or options.start_utc is not None
+    if options.start_utc is not None:
+        dive = _dated(dive, options.start_utc)
     corrections = Corrections(
-        declination_deg=asked.declination_deg,
-        tide=read_tide(asked.tide, dated=dated),
-        clock_offset_s=asked.clock_offset_s,
-        lever_body_m=asked.lever_body_m,
-        altitude_offset_m=asked.altitude_offset_m,
+        declination_deg=options.declination_deg,
+        tide=read_tide(options.tide, dated=dated),
+        clock_offset_s=options.clock_offset_s,
+        lever_body_m=options.lever_body_m,
+        altitude_offset_m=options.altitude_offset_m,
     )
-    _warn_of_declination(dive, asked.declination_deg)
-    time_s, columns = navigation_table(_trimmed(dive, asked.start_s, asked.end_s), corrections)
+    _warn_of_declination(dive, options.declination_deg)
+    time_s, columns = navigation_table(_trimmed(dive, options.start_s, options.end_s), corrections)
     complete = np.isfinite(columns["latitude_deg"] + columns["depth_m"])
     lost = Counter(dict(dive.lost))
     if not complete.all():
         reason = "positions without a depth" + (
-            " or an attitude for the lever arm" if any(asked.lever_body_m) else ""
+            " or an attitude for the lever arm" if any(options.lever_body_m) else ""
         )
         lost[reason] += int((~complete).sum())
     if not complete.any():
@@ -105,8 +105,8 @@ def import_log(
     try:
         texts = [_date(t) if dated else f"{t:.6f}" for t in time_s.tolist()]
         write_navigation_rows(out, texts, columns, "time_utc" if dated else "time_s")
-        if asked.vehicle_log is not None:
-            _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
+        if options.vehicle_log is not None:
+            _write_vehicle_log(options.vehicle_log, dive, corrections, options)
     except OSError as error:
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     tidal = isinstance(corrections.tide, Signal) or corrections.tide != 0.0
@@ -125,21 +125,21 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
-    asked = _roles(options.topics)
+    chosen = _roles(options.topics)
     suffix = path.suffix.lower()
     if suffix not in ("", ".bag", ".mcap", ".db3") and options.datum_deg is not None:
         raise NavigationError("--datum is for the odometry of a bag of ROS: leave it out")
     if path.is_dir() or is_bag(path):
         datum = None if options.datum_deg is None else Datum(*options.datum_deg)
-        return read_ros_bag(path, asked, datum)
+        return read_ros_bag(path, chosen, datum)
     if suffix in (".bin", ".log"):
-        return read_ardusub_bin(path, asked)
+        return read_ardusub_bin(path, chosen)
     if suffix == ".tlog":
-        return read_ardusub_tlog(path, asked)
+        return read_ardusub_tlog(path, chosen)
     if suffix == ".csv":
-        return read_qgc_csv(path, asked, options.time_zone)
+        return read_qgc_csv(path, chosen, options.time_zone)
     raise NavigationError(
-        f"{path}: no log that is known: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
+        f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
         ".log or .tlog, or QGroundControl's .csv"
     )
 
@@ -151,17 +151,17 @@ def _date(time_s: float) -> str:
 
 
 def _roles(topics: Sequence[str]) -> dict[str, str]:
-    asked: dict[str, str] = {}
+    chosen: dict[str, str] = {}
     for text in topics:
         role, mark, name = text.partition("=")
         if not mark or role not in ROLES or not name:
             raise NavigationError(
                 f"--topic {text!r}: give ROLE=NAME with a role of {', '.join(ROLES)}"
             )
-        if role in asked:
+        if role in chosen:
             raise NavigationError(f"--topic {role} is given twice")
-        asked[role] = name
-    return asked
+        chosen[role] = name
+    return chosen
 
 
 def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
@@ -172,7 +172,7 @@ def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
         start_s = utc_date(start_utc).timestamp()
     except ValueError:
         raise NavigationError(
-            f"--start-utc {start_utc!r} is no date such as 2024-05-01T12:00:00Z"
+            f"--start-utc {start_utc!r} is not a date such as 2024-05-01T12:00:00Z"
         ) from None
     shift = start_s - float(dive.position.time_s[0])
     moved: dict[str, Any] = {
@@ -206,12 +206,12 @@ def _trimmed(dive: LoggedDive, start_s: float | None, end_s: float | None) -> Lo
     )
 
 
-def _warn_of_declination(dive: LoggedDive, asked_deg: float) -> None:
+def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
     known = dive.declination_in_log_deg
-    if known is None or not asked_deg:
+    if known is None or not declination_deg:
         return
     if math.isnan(known):
-        warn("the vehicle added a declination of its own (COMPASS_AUTODEC): yours comes on top")
+        warn("the vehicle added a declination itself (COMPASS_AUTODEC): yours comes on top")
     elif known:
         warn(
             f"the vehicle added a declination of {known:.2f} degrees (COMPASS_DEC): yours comes on "
@@ -323,7 +323,7 @@ def _report(
         lines.append(f"  {len(gaps)} gaps, the longest {max(g[1] for g in gaps):.1f} s")
     if tidal:
         lines.append(
-            "  depths count from the level that --tide refers to: tell import-images its name by "
+            "  depths count from the level that --tide refers to: give import-images its name by "
             "--vertical-datum"
         )
     if not dated:
