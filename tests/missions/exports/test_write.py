@@ -128,7 +128,7 @@ from pathlib import Path
 from missions.exports.format import Export, ExportFile, ExportFormat
 
 
-def write_lengths(path: Path, export: Export, _dive: int = 0) -> None:
+def write_lengths(path: Path, export: Export, _dive: int) -> None:
     """Write a length a row."""
     path.write_text("\\n".join(f"{line.length_m:.3f}" for line in export.plan.lines))
 
