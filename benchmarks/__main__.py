@@ -23,12 +23,12 @@ from typing import Any
 
 from benchmarks.machine import machine
 from benchmarks.parts import PARTS, SHORT_REPEATS, Part, Settings, chosen
-from benchmarks.runs import run, tell
+from benchmarks.runs import report, run
 from benchmarks.table import Outcome, left_out, outcome, write
 
 
 def main() -> int:
-    """Run what is asked for, write the table, tell whether all is well."""
+    """Run what is requested, write the table, return whether all is well."""
     options = _options()
     settings = Settings(
         work=options.work / "work",
@@ -53,39 +53,39 @@ def main() -> int:
             outcomes.append(_outcome(part, settings, options, where))
             write(options.work, about, outcomes)
     except KeyboardInterrupt:
-        tell(f"broken off; {len(outcomes)} of {len(options.parts)} parts are in {options.work}")
+        report(f"broken off; {len(outcomes)} of {len(options.parts)} parts are in {options.work}")
         return 130
     print(options.work / "table.md")
     return 0 if all(part.good for part in outcomes) else 1
 
 
 def _outcome(part: Part, settings: Settings, options: argparse.Namespace, where: str) -> Outcome:
-    """Run a part as often as is asked for, up to the first time that it fails."""
+    """Run a part as often as requested, up to the first time that it fails."""
     command = part.command(settings)
     alone = shlex.join(["python", *command])
     reason = part.reason_to_leave_out(settings)
     if reason is not None:
-        tell(f"{where}: left out: {reason}")
+        report(f"{where}: left out: {reason}")
         return left_out(part.name, alone, reason)
     (settings.work / part.name).mkdir(parents=True, exist_ok=True)
     repeats = options.repeat or (1 if settings.quick else part.repeats)
     runs = []
     for repeat in range(1, repeats + 1):
         label = f"{where}, run {repeat} of {repeats}"
-        tell(f"{label}: begun", passing=True)
-        heed = partial(_say_how_long, label)
-        runs.append(run(command, options.work / "logs", f"{part.name}-{repeat}", heed))
-        tell(f"{label}: ended after {runs[-1].wall_s:.0f} s")
+        report(f"{label}: begun", passing=True)
+        on_wait = partial(_say_how_long, label)
+        runs.append(run(command, options.work / "logs", f"{part.name}-{repeat}", on_wait))
+        report(f"{label}: ended after {runs[-1].wall_s:.0f} s")
         if runs[-1].trouble is not None:
             break
     found = outcome(part.name, alone, runs)
     reason = "" if found.reason is None else f": {found.reason}"
-    tell(f"{where}: {found.state}{reason}")
+    report(f"{where}: {found.state}{reason}")
     return found
 
 
 def _say_how_long(label: str, seconds: float) -> None:
-    tell(f"{label}: {seconds:.0f} s so far", passing=True)
+    report(f"{label}: {seconds:.0f} s so far", passing=True)
 
 
 def _commit() -> str | None:

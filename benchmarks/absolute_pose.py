@@ -5,7 +5,7 @@ Through a flat port no two rays meet in one centre, so each pixel is a ray of it
 1. The exact rays of all pixels go to COLMAP's generalised absolute pose (RANSAC on three points).
 2. From there the exact reprojection error is minimised (Levenberg-Marquardt), first under
    Cauchy's loss, which forgives outliers among the first inliers, then as plain least squares.
-3. Inliers are chosen anew by the noise that the residuals themselves show, until they stay.
+3. Inliers are chosen again by the noise that the residuals themselves show, until they stay.
 
 Least squares over the inliers reaches the Cramer-Rao bound when noise is normal; what the cut at
 `_CUT` sigmas throws away of good points is one in 3,000.
@@ -220,7 +220,7 @@ def _start(
 def _settle(
     pose: RigidTransform, sightings: Sequence[Sighting], start_error_px: float
 ) -> tuple[RigidTransform, Mask, float]:
-    """Refine, choosing inliers anew by their own noise until they stay the same."""
+    """Refine, choosing inliers again by their own noise until they stay the same."""
     limit_px, loss_px = start_error_px, 0.0
     inliers: Mask = np.zeros(0, dtype=np.bool_)
     for turn in range(_ROUNDS):

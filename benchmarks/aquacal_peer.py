@@ -1,7 +1,7 @@
 """AquaCal's batch projection, timed from outside: it needs an environment of its own.
 
 AquaCal pins `opencv-python`, whose files overwrite those of this project's OpenCV. `camera.py`
-therefore runs this file with another interpreter, and asks it for one run at a time, so that both
+therefore runs this file with another interpreter, and requests one run at a time, so that both
 programs are measured in turns. This file imports nothing of the project.
 
     PYTHON aquacal_peer.py CASE.npz

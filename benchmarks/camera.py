@@ -1,4 +1,4 @@
-"""The camera beside its peers and beside what theory allows: speed, absolute pose, calibration.
+"""The camera, its peers and what theory allows: speed, absolute pose, calibration.
 
     .venv/bin/python -m benchmarks.camera [--quick] [--json FILE] [--only speed pose calibration]
 

@@ -1,4 +1,4 @@
-"""Calibration through the ports from synthetic views, beside its Cramer-Rao bound.
+"""Calibration through the ports from synthetic views, compared with its Cramer-Rao bound.
 
 25 stereo views of a board of 12 x 9 squares of 30 mm at 0.6 to 2.2 m, tilted, with 0.1 px of noise
 in each coordinate. Distance and normal of both ports and the pose of the right camera are unknown;
@@ -94,14 +94,14 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Mode:
-    """All parameters of one mode; those of the lens only where they are found anew."""
+    """All parameters of one mode; those of the lens only where they are found again."""
 
     known: str
     trials: int
     parameters: tuple[Parameter, ...]
 
     def figures(self, *, judged: bool) -> list[Figure]:
-        """Errors of ports and rig beside their bounds, and of all parameters by their sigmas.
+        """Errors of ports and rig next to their bounds, and of all parameters by their sigmas.
 
         Args:
             judged: whether there are trials enough for goals.

@@ -1,4 +1,4 @@
-"""Absolute pose through a flat port, beside a published table and the Cramer-Rao bound.
+"""Absolute pose through a flat port, next to a published table and the Cramer-Rao bound.
 
 The set-up is that of Refractive COLMAP's own evaluation (She et al. 2024): a new camera, port and
 pose in each trial, 200 points at 0.5 to 10 m from the pupil, 30 % of them wrong by a normal error
@@ -78,7 +78,7 @@ class Level:
     sigma_px: float
 
     def figures(self) -> list[Figure]:
-        """Means beside the published ones, root mean squares beside the bound."""
+        """Means next to the published ones, root mean squares next to the bound."""
         at, found = f"at {self.noise_px:g} px", []
         published = PUBLISHED.get(self.noise_px)
         if published is not None:
@@ -205,7 +205,7 @@ def run_level(noise_px: float, seeds: Sequence[int], executor: Executor = SERIAL
 
 
 def table(levels: Sequence[Level]) -> str:
-    """The levels in Markdown, beside the published ones."""
+    """The levels in Markdown, next to the published ones."""
     rows = [
         "| noise px | published deg / mm | mean deg / mm | rms deg / mm | bound deg / mm "
         "| rms / bound | error / sigma | right lost, wrong kept of 200 |",

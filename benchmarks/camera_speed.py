@@ -1,11 +1,11 @@
-"""Points per second of the flat-port camera, beside peers, in the same run.
+"""Points per second of the flat-port camera, compared with peers, in the same run.
 
 Peers do less than `project` does (no port), so equal work is compared where there is a peer for it:
 - `cv2.projectPoints` projects through a lens without a port. Its Python binding always fills in
-  the slopes by the lens and the pose too, so it stands beside `project` and `project_jacobian`.
+  the slopes by the lens and the pose too, so it stands next to `project` and `project_jacobian`.
 - COLMAP's OPENCV camera projects and unprojects through a lens without a port, and nothing else.
-- `cv2.undistortPoints` inverts the lens, told to iterate until a pixel is right to 1e-9.
-- AquaCal projects through one flat interface: beside `project` with glass of thickness 0.
+- `cv2.undistortPoints` inverts the lens, set to iterate until a pixel is right to 1e-9.
+- AquaCal projects through one flat interface: next to `project` with glass of thickness 0.
 All get the same float64 points and the same distortion, after a run each to warm up; runs alternate
 and the best of each counts, so that what else the machine does slows nobody alone.
 """
@@ -51,7 +51,7 @@ class Row:
     theirs_two_cores: float | None
     """None where the peer is another program."""
     goals: tuple[float, ...] = ()
-    """The least ratios on one core that are asked for."""
+    """The least ratios on one core that are requested."""
 
     @property
     def ratio(self) -> float:
@@ -159,11 +159,11 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
         row("unproject", "unproject", "COLMAP's cam_from_img"),
     ]
     if aquacal is not None:
-        rows.append(beside_aquacal(replace(camera, glass_thickness_m=0.0), points, runs, aquacal))
+        rows.append(against_aquacal(replace(camera, glass_thickness_m=0.0), points, runs, aquacal))
     return rows
 
 
-def beside_aquacal(camera: FlatPortCamera, points: Array, runs: int, python: Path) -> Row:
+def against_aquacal(camera: FlatPortCamera, points: Array, runs: int, python: Path) -> Row:
     """Projection through one interface, in turns with AquaCal in a process of its own."""
     some = points[: min(len(points), 20_000)]
     with TemporaryDirectory() as folder:
@@ -201,7 +201,7 @@ def beside_aquacal(camera: FlatPortCamera, points: Array, runs: int, python: Pat
 
 @contextmanager
 def _peer(python: Path, case: Path) -> Iterator[tuple[str, Callable[[], float]]]:
-    """AquaCal's name, and a function that has it run once and tells the seconds it took."""
+    """AquaCal's name, and a function that has it run once and returns the seconds it took."""
     script = Path(__file__).with_name("aquacal_peer.py")
     with subprocess.Popen(
         [str(python), str(script), str(case)],

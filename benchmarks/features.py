@@ -1,4 +1,4 @@
-"""Speed of features, pairs and matches, beside COLMAP and beside simpler ways, in the same run.
+"""Speed of features, pairs and matches, next to COLMAP and simpler ways, in the same run.
 
     .venv/bin/python -m benchmarks.features PICTURE PICTURE... [--quick] [--json FILE]
 
@@ -181,7 +181,7 @@ def main() -> int:
     figures = [figure for path in options.pictures for figure in features(path, runs)]
     for first, second in itertools.pairwise(options.pictures):
         figures += matches(first, second, runs)
-    print(f"{'what':48} {'ours':>9} {'beside':>20} {'its':>9}  ratio")
+    print(f"{'what':48} {'ours':>9} {'peer':>20} {'its':>9}  ratio")
     for row in figures:
         if row.peer is not None:
             print(f"{row.name:48} {row.value:9.1f} {row.peer:>20} {row.peer_value:9.1f}  "

@@ -52,7 +52,7 @@ class Figure:
     value: float
     unit: str
     peer: str | None = None
-    """What was measured beside it, in the same run unless it says otherwise."""
+    """What was measured next to it, in the same run unless it says otherwise."""
     peer_value: float | None = None
     goal: Goal | None = None
 
@@ -79,8 +79,8 @@ class Figure:
 
     def miss(self) -> str:
         """What it is and should be, in words."""
-        beside = "" if self.ratio is None else f" ({self.ratio:.4g} x {self.peer})"
-        return f"{self.name}: {self.value:.6g} {self.unit}{beside}, goal {self.goal}"
+        compared = "" if self.ratio is None else f" ({self.ratio:.4g} x {self.peer})"
+        return f"{self.name}: {self.value:.6g} {self.unit}{compared}, goal {self.goal}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class Findings:
 
 
 def add_options(parser: argparse.ArgumentParser, quick: str) -> None:
-    """The options that every benchmark has; `quick` tells what `--quick` leaves out."""
+    """The options that every benchmark has; `quick` says what `--quick` leaves out."""
     parser.add_argument("--quick", action="store_true", help=quick)
     parser.add_argument("--json", type=Path, help="write all figures to this file")
 
@@ -118,7 +118,7 @@ def hand_over(
     findings: Findings,
     rows: Mapping[str, Any] | None = None,
 ) -> int:
-    """Print the load, what was left out, missed and failed; write the figures where asked for.
+    """Print the load, what was left out, missed and failed; write the figures where requested.
 
     Args:
         options: with those of `add_options`.

@@ -14,7 +14,7 @@ from alice_survey.base.run.resources import family, memory_mib
 
 _EVERY_S, _SURELY_EVERY_S = 0.2, 2.0
 """Between looks at the memory of a command; it takes the kernel 6 ms a process to share it out, so
-that it is asked to only where the plain sum has grown, and now and then."""
+that it is only used where the plain sum has grown, and now and then."""
 
 
 @dataclass(frozen=True, kw_only=True)

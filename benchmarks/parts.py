@@ -11,7 +11,7 @@ SHORT_REPEATS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What all parts are told."""
+    """What all parts share."""
 
     work: Path
     """Folder for what parts leave behind; each has its own in it."""
@@ -19,7 +19,7 @@ class Settings:
     data: Path = Path("../shared/data")
     """Real pictures."""
     demo: Path | None = None
-    """A workspace with the demo's rendered pictures; rendered anew where there is none."""
+    """A workspace with the demo's rendered pictures; rendered again where there is none."""
     pyorthomosaic: str | None = None
     """A Python that has pyOrthomosaic."""
     aquacal: str | None = None
@@ -44,7 +44,7 @@ class Part:
 
     @property
     def repeats(self) -> int:
-        """How often it runs unless told."""
+        """How often it runs by default."""
         return 1 if self.long else SHORT_REPEATS
 
     def command(self, settings: Settings) -> list[str]:

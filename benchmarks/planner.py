@@ -1,4 +1,4 @@
-"""The planner beside its peers: areas of 100 to 10,000 rows, and the search for the best heading.
+"""The planner and its peers: areas of 100 to 10,000 rows, and the search for the best heading.
 
     .venv/bin/python -m benchmarks.planner [--quick] [--angles] [--json FILE]
 
@@ -48,7 +48,7 @@ _HEAD = (
 
 @dataclass(frozen=True, kw_only=True)
 class Angle:
-    """The heading that is found beside the best of many."""
+    """The heading that is found next to the best of many."""
 
     area: str
     seconds: float
@@ -67,7 +67,7 @@ class Angle:
         return self.cost_s / self.best_s
 
     def figures(self) -> list[Figure]:
-        """Cost and width beside the best sampled ones, and the time of the search."""
+        """Cost and width next to the best sampled ones, and the time of the search."""
         peer = f"best of {self.sampled:,}"
         return [
             Figure(
@@ -141,9 +141,9 @@ def _figures(name: str, rows: int, results: list[Measured]) -> list[Figure]:
         Figure(name=f"{where}: way in holes", value=own.holes_m, unit="m", goal=none),
         Figure(name=f"{where}: way", value=own.path_m, unit="m"),
     ]
-    beside = []
+    compared = []
     for peer in results[1:]:
-        beside += [
+        compared += [
             Figure(
                 name=f"{where}: time", value=1e3 * own.seconds, unit="ms", peer=peer.planner,
                 peer_value=1e3 * peer.seconds,
@@ -154,7 +154,7 @@ def _figures(name: str, rows: int, results: list[Measured]) -> list[Figure]:
                 goal=Goal(most=1.0, of="ratio") if _as_good(peer, own) else None,
             ),
         ]  # fmt: skip
-    return [*alone, *beside]
+    return [*alone, *compared]
 
 
 def _as_good(peer: Measured, own: Measured) -> bool:

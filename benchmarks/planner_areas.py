@@ -31,7 +31,7 @@ def shapes() -> dict[str, Polygon]:
 
 
 def planned_area(shape: Polygon, rows: int, spacing_m: float, margin_m: float) -> Area:
-    """A shape at the size of so many rows; its holes are no-go zones, a margin is left to turn."""
+    """A shape as large as some rows; its holes are no-go zones, a margin is left to turn."""
     size_m = rows * spacing_m
     survey = shapely.affinity.scale(shape, size_m, size_m, origin=(0, 0))
     holes = MultiPolygon([Polygon(ring) for ring in survey.interiors])

@@ -46,8 +46,8 @@ class Way:
     """Of one core to plan it, once warm: lines, their order, and how they are joined. All planners
     work on one core; its time leaves out what else the machine does."""
     seen: Array
-    """(S, 4) lines, x and y of both ends: straights along the heading that was asked for. What is
-    seen in turns and on the way between lines is no part of a pattern, whoever flies it."""
+    """(S, 4) lines, x and y of both ends: straights along the heading that was requested. What is
+    seen in turns and on the way between lines does not count for any planner."""
     path: Array
     """(K, 2) the whole way, from the first line's start to the last one's end."""
 
@@ -70,7 +70,7 @@ class Measured:
 
 
 def own_plan(area: Area, repeats: int) -> Way:
-    """This planner: lines, order, and the route with its turns. The area's ways are sorted anew."""
+    """This planner: lines, order, and the route with its turns. The area's ways are sorted too."""
     best = math.inf
     for _ in range(repeats + 1):
         began = time.process_time()
@@ -164,7 +164,7 @@ PLANNERS: dict[str, Callable[[Area, int], Way]] = {
 
 
 def measured(planner: str, way: Way, area: Area) -> Measured:
-    """Measure a plan, whoever made it: by points in boxes, and by clipping its way."""
+    """Measure a plan of any planner: by points in boxes, and by clipping its way."""
     path = LineString(way.path)
     beyond = path.difference(area.allowed.buffer(1e-6))
     in_holes = beyond.intersection(area.no_go).length

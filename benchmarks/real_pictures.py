@@ -4,7 +4,7 @@
 
 For the drone block the surface is compared with another tool's cloud (`model.laz`) after a
 similarity alignment, since neither has a measured scale. Workspaces of the same names are made
-anew, so that times are those of the whole. `--quick` reconstructs a few pictures of a third set.
+again, so that times are those of the whole. `--quick` reconstructs a few pictures of a third set.
 """
 
 import argparse
@@ -105,7 +105,7 @@ def compare(ours: Array, theirs: Array, rng: np.random.Generator) -> dict[str, f
     }
 
 
-def beside_cloud(drone: Path, workspace: Path) -> Findings:
+def against_cloud(drone: Path, workspace: Path) -> Findings:
     """Distance from the other tool's cloud; prints it."""
     with laspy.open(drone / "model.laz") as file:
         reference = file.read()
@@ -154,11 +154,11 @@ def run_stereo(source: Path, workspaces: Path) -> Findings:
 
 
 def run_drone(source: Path, workspaces: Path) -> Findings:
-    """A drone's block, beside another tool's cloud of it."""
+    """A drone's block, next to another tool's cloud of it."""
     findings = reconstruct(source.name, [str(source / "images")], workspaces)
     if findings.failed:
         return findings
-    return findings + beside_cloud(source, workspaces / source.name)
+    return findings + against_cloud(source, workspaces / source.name)
 
 
 def run_few(source: Path, workspaces: Path) -> Findings:

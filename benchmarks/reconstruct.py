@@ -1,4 +1,4 @@
-"""Reconstruction beside stock COLMAP and pyOrthomosaic on the same pictures, in one run.
+"""Reconstruction next to stock COLMAP and pyOrthomosaic on the same pictures, in one run.
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
         [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
-from benchmarks.reconstruct_figures import beside_peers, beside_real, grown, of_real
+from benchmarks.reconstruct_figures import against_peers, against_real, grown, of_real
 from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
 from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
 
@@ -116,7 +116,7 @@ def run_peers(
             accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
             print(row(name, [cost], accuracy), flush=True)
             rivals[name] = (cost, accuracy)
-        findings += beside_peers(count, costs, found, rivals)
+        findings += against_peers(count, costs, found, rivals)
     return findings
 
 
@@ -164,7 +164,7 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
         target = work / "haltbrekken_mosaics.png"
         side_by_side([workspace / "mosaic" / "mosaic.png", out / "orthophoto.tif"], target)
         print(f"both mosaics: {target}")
-    return findings + beside_real("haltbrekken", costs, "pyorthomosaic", cost)
+    return findings + against_real("haltbrekken", costs, "pyorthomosaic", cost)
 
 
 def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
@@ -191,7 +191,7 @@ def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float
     out = _emptied(work / "brighton_pyorthomosaic")
     cost = peer("pyorthomosaic", interpreter, source / "images", out, limit_s)
     print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
-    findings += beside_real("brighton", costs, "pyorthomosaic", cost)
+    findings += against_real("brighton", costs, "pyorthomosaic", cost)
     if not cost.ok:
         return findings
     datum = read_frame(workspace / "sparse" / "frame.json").datum
@@ -244,7 +244,7 @@ def peer_registered(out: Path, cost: Cost) -> str:
 
 
 def side_by_side(files: Sequence[Path], target: Path, height_px: int = 1400) -> None:
-    """Pictures of one height beside each other, transparent parts white."""
+    """Pictures of one height next to each other, transparent parts white."""
     columns = []
     for file in files:
         picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
@@ -278,7 +278,7 @@ def find_pyorthomosaic(given: str | None) -> str | None:
 
 
 def main() -> int:
-    """Run the parts that are asked for."""
+    """Run the parts that are requested."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--work", type=Path, required=True, help="scratch folder")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="real pictures")

@@ -1,4 +1,4 @@
-"""The figures of `benchmarks.reconstruct`: ours beside other programs, or alone where they fail."""
+"""The figures of `benchmarks.reconstruct`: ours and those of other programs, or ours alone."""
 
 import json
 import math
@@ -15,7 +15,7 @@ _SPARSE_ALONE = ("colmap",)
 """Programs that end at the sparse model."""
 
 
-def beside_peers(
+def against_peers(
     count: int,
     costs: Mapping[str, Cost],
     found: Accuracy | None,
@@ -27,7 +27,7 @@ def beside_peers(
         count: of pictures.
         costs: of our stages.
         found: our accuracy; None where there is no model.
-        rivals: cost and accuracy of others, by name; None where there is no such program.
+        rivals: cost and accuracy of others, by name; None where the program is missing.
     """
     findings = Findings(failed=failures(f"{count} pictures", costs))
     for name, (cost, accuracy) in rivals.items():
@@ -71,8 +71,8 @@ def of_real(where: str, workspace: Path, costs: Mapping[str, Cost]) -> Findings:
     return Findings(figures=() if failed else tuple(_figures(where, numbers)), failed=failed)
 
 
-def beside_real(where: str, costs: Mapping[str, Cost], name: str, cost: Cost) -> Findings:
-    """Cost of ours beside another program's on real pictures."""
+def against_real(where: str, costs: Mapping[str, Cost], name: str, cost: Cost) -> Findings:
+    """Cost of ours next to another program's on real pictures."""
     if not cost.ok:
         return Findings(left_out=(f"{where}, {name}: {cost.last_line()}",))
     if failures(where, costs):
@@ -121,12 +121,12 @@ def _surface_errors(found: Accuracy | None) -> _Numbers:
 def _figures(
     where: str, own: _Numbers, peer: str | None = None, theirs: _Numbers | None = None
 ) -> Iterator[Figure]:
-    """All that are numbers; beside the peer's where it has them."""
+    """All that are numbers; next to the peer's where it has them."""
     for what, (value, unit) in own.items():
         other, _ = (theirs or {}).get(what, (math.nan, unit))
         if math.isfinite(value):
-            beside = peer is not None and math.isfinite(other)
+            compared = peer is not None and math.isfinite(other)
             yield Figure(
                 name=f"{where}: {what}", value=value, unit=unit,
-                peer=peer if beside else None, peer_value=other if beside else None,
+                peer=peer if compared else None, peer_value=other if compared else None,
             )  # fmt: skip

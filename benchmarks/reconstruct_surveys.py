@@ -27,7 +27,7 @@ def render(workspace: Path, survey: str) -> None:
 
 
 def survey_toml(pictures: int, scale: int) -> str:
-    """Settings of a survey like the demo's that gives at least so many pictures.
+    """Settings of a survey like the demo's that gives at least a number of pictures.
 
     Args:
         pictures: of both cameras.
@@ -83,7 +83,7 @@ def subset(whole: Path, part: Path, pictures: int) -> Path:
     with (whole / "images" / "manifest.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     if len(rows) < pictures:
-        raise SystemExit(f"{whole} has {len(rows)} pictures; {pictures} are asked for")
+        raise SystemExit(f"{whole} has {len(rows)} pictures; {pictures} are requested")
     stations = sorted({int(row["station"]) for row in rows})[: pictures // 2]
     rows = [row for row in rows if int(row["station"]) in set(stations)]
     write_csv(images / "manifest.csv", list(rows[0]), ([*row.values()] for row in rows))

@@ -5,8 +5,8 @@
 
 For port distances of 20 and 50 mm and tilts of 0 and 2 degrees it states the rms of points and
 cameras after rigid alignment: ours, the warp to one working depth alone, COLMAP's self-calibrated
-OPENCV model of the pixels as taken, and, where asked, an exact refractive adjustment as plain as
-can be (10 minutes a row with 48 stations and 1000 points).
+OPENCV model of the pixels as taken, and, where requested, an exact refractive adjustment as plain
+as can be (10 minutes a row with 48 stations and 1000 points).
 """
 
 import argparse
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def _figures(where: str, found: Sequence[tuple[str, float, float, float]]) -> list[Figure]:
-    """Ours, the first row, beside each of the others."""
+    """Ours, the first row, next to each of the others."""
     (_, *own), *others = found
     whats = (("rms of points", "mm", 1e3), ("rms of cameras", "mm", 1e3), ("time", "s", 1.0))
     return [

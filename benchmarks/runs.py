@@ -16,7 +16,7 @@ from benchmarks.machine import load
 
 _LINE_EVERY_S, _SCREEN_EVERY_S = 30.0, 1.0
 _PATIENCE_S = 10.0
-"""How long a process has to end when told to."""
+"""How long a process has to end when it is signalled."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class Run:
 
     @property
     def trouble(self) -> str | None:
-        """Why it is no measurement, though goals may be missed; None where it is one."""
+        """Why it is not a measurement, though goals may be missed; None where it is one."""
         if self.report is None:
             return f"ended with exit code {self.code}: {_last_line(self.log)}"
         if self.report["failed"]:
@@ -43,14 +43,14 @@ class Run:
         return None
 
 
-def run(command: Sequence[str], logs: Path, name: str, heed: Callable[[float], None]) -> Run:
+def run(command: Sequence[str], logs: Path, name: str, on_wait: Callable[[float], None]) -> Run:
     """Run a benchmark and read what it hands over.
 
     Args:
         command: for this Python; `--json` is added.
         logs: folder for what it says, `<name>.log`, and its figures, `<name>.json`.
         name: of the run.
-        heed: told the seconds so far, now and then.
+        on_wait: called with the seconds so far, now and then.
     """
     logs.mkdir(parents=True, exist_ok=True)
     log, figures = logs / f"{name}.log", logs / f"{name}.json"
@@ -70,7 +70,7 @@ def run(command: Sequence[str], logs: Path, name: str, heed: Callable[[float], N
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     code = process.wait(every_s)
                     break
-                heed(time.perf_counter() - started)
+                on_wait(time.perf_counter() - started)
         finally:
             _end(process)
     return Run(
@@ -83,7 +83,7 @@ def run(command: Sequence[str], logs: Path, name: str, heed: Callable[[float], N
     )
 
 
-def tell(text: str, *, passing: bool = False) -> None:
+def report(text: str, *, passing: bool = False) -> None:
     """Say on standard error what goes on; on a screen, a passing line gives way to the next."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text}", end="" if passing else "\n", file=sys.stderr, flush=True)

@@ -197,7 +197,7 @@ def _section(part: Outcome) -> list[str]:
     lines = ["", f"## {part.name}", ""]
     if part.figures:
         lines += [
-            "| figure | median | spread | unit | beside | its median | ratio | goal | met |",
+            "| figure | median | spread | unit | peer | its median | ratio | goal | met |",
             "|---|---|---|---|---|---|---|---|---|",
             *(_figure_row(figure) for figure in part.figures),
             "",

@@ -1,4 +1,4 @@
-"""The vehicle beside its peers: equations of motion, allocation, and whole missions.
+"""The vehicle compared with its peers: equations of motion, allocation, and whole missions.
 
     .venv/bin/python -m benchmarks.vehicle [--quick] [--json FILE] [--only PART ...]
 

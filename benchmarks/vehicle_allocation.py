@@ -1,6 +1,6 @@
-"""Microseconds an allocation takes, the exact one and the paper's, beside peers, in the same run.
+"""Microseconds an allocation takes, the exact one, the paper's and those of peers, in the same run.
 
-All solve ALICE's 6 x 5 matrix with four axes asked for, for the same wrenches: small ones, as on a
+All solve ALICE's 6 x 5 matrix with four axes requested, for the same wrenches: small ones, as on a
 survey line (no thruster at its bound), ones drawn as B f with f anywhere within the bounds, and
 ones beyond reach. Peers are called from Python, as their users do; ours from compiled code, as the
 simulator does, and once more from Python. All are held against each other: BVLS must find the same
@@ -47,11 +47,11 @@ class Row:
     miss: float
     """Mean weighted miss of the wrench, N and N m times `AXIS_WEIGHTS`."""
     goal_us: float | None = None
-    """The most that is asked for."""
+    """The most that is requested."""
 
 
 class Case(NamedTuple):
-    """What all solvers are told."""
+    """What all solvers are given."""
 
     matrix: Array
     wanted: Array
@@ -110,7 +110,7 @@ _SOLVERS: dict[str, Callable[[Case, Array], None]] = {
 
 
 def measure(runs: int) -> list[Row]:
-    """All rows; each solver does all wrenches so many times, in turns, and its best run counts."""
+    """All rows; each solver does all wrenches repeatedly, in turns, and its best run counts."""
     alice = vehicle("alice")
     matrix, count = alice.configuration_matrix, len(alice.thrusters)
     lower, upper = np.zeros(count), np.zeros(count)
@@ -161,7 +161,7 @@ def _same(what: str, found: Array, expected: Array, limit: float) -> None:
 
 
 def figures(rows: list[Row]) -> list[Figure]:
-    """The exact allocation alone, beside each of the others, and what each misses."""
+    """The exact allocation alone, next to each of the others, and what each misses."""
     own = {row.wrenches: row for row in rows if row.solver == "exact"}
     alone = [
         Figure(
@@ -170,7 +170,7 @@ def figures(rows: list[Row]) -> list[Figure]:
         )
         for kind, row in own.items()
     ]  # fmt: skip
-    beside = [
+    compared = [
         Figure(
             name=f"exact allocation, {row.wrenches}", value=own[row.wrenches].us, unit="us",
             peer=row.solver, peer_value=row.us,
@@ -182,7 +182,7 @@ def figures(rows: list[Row]) -> list[Figure]:
         Figure(name=f"{row.solver}, {row.wrenches}: mean miss", value=row.miss, unit="N, weighted")
         for row in rows
     ]
-    return [*alone, *beside, *misses]
+    return [*alone, *compared, *misses]
 
 
 def table(rows: list[Row]) -> str:

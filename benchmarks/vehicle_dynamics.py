@@ -1,6 +1,6 @@
-"""Microseconds that the equations of motion take, beside numpy, and the error of a step.
+"""Microseconds that the equations of motion take, next to numpy, and the error of a step.
 
-Ours runs from compiled code, as in the simulator. Two twins of the same equations stand beside it,
+Ours runs from compiled code, as in the simulator. Two twins of the same equations stand next to it,
 held against it to rounding: a plain one in numpy, such as a careful script has it (matrices made
 once, thrusters as arrays), and the slow textbook twin of the tests. All go round robin, and the
 best run of each counts.
@@ -93,7 +93,7 @@ def _derivatives(
 ) -> None:
     for i in range(count):
         derivative(1e-3 * i, state, command_rps, load, plant, current, scratch, out)
-        state[2] += 1e-9 * out[2]  # each asks for the one before
+        state[2] += 1e-9 * out[2]  # each needs the one before
 
 
 @kernel
@@ -361,7 +361,7 @@ def accuracy(seconds: int) -> list[Accuracy]:
 
 
 def figures(rows: list[Row]) -> list[Figure]:
-    """Ours alone, then beside each twin."""
+    """Ours alone, then next to each twin."""
     own = {(row.what, row.case): row for row in rows if row.ratio is None}
     alone = [
         Figure(
@@ -370,13 +370,13 @@ def figures(rows: list[Row]) -> list[Figure]:
         )
         for row in own.values()
     ]  # fmt: skip
-    beside = [
+    compared = [
         Figure(name=f"{what}: {case}", value=ours.us, unit="us", peer=row.what, peer_value=row.us)
         for row in rows
         for (what, case), ours in own.items()
         if row.ratio is not None and row.case == case and row.what.startswith(what)
     ]
-    return [*alone, *beside]
+    return [*alone, *compared]
 
 
 def table(rows: list[Row]) -> str:

@@ -38,7 +38,7 @@ class Row:
     wall_s: float
     complete: bool
     goal: float = 1000.0
-    """The least factor that is asked for; 2,000 is hoped for."""
+    """The least factor that is requested; 2,000 is hoped for."""
 
     @property
     def factor(self) -> float:
@@ -70,7 +70,7 @@ class Start:
 
 
 def measure(runs: int) -> list[Row]:
-    """All missions, each so many times."""
+    """All missions, each a number of times."""
     calm = SurveyConfig()
     across = changed(calm, "sea", current_mps=0.1, current_towards_deg=90.0)
     rough = changed(

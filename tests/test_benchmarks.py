@@ -16,7 +16,7 @@ from benchmarks import table
 from benchmarks.figures import Figure, Findings, Goal, hand_over
 from benchmarks.measured import Cost
 from benchmarks.parts import PARTS, SHORT_REPEATS, Part, Settings, chosen
-from benchmarks.reconstruct_figures import beside_peers
+from benchmarks.reconstruct_figures import against_peers
 from benchmarks.reconstruct_scores import Accuracy
 from benchmarks.runs import Run, run
 
@@ -267,8 +267,8 @@ def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Pa
                      surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
     costs = {"sparse": cost, "dense": cost, "mosaic": cost}
 
-    all_ran = beside_peers(16, costs, found, {"colmap": (cost, found), "other": (cost, found)})
-    alone = beside_peers(16, costs, found, {"colmap": (broken, None), "other": (None, None)})
+    all_ran = against_peers(16, costs, found, {"colmap": (cost, found), "other": (cost, found)})
+    alone = against_peers(16, costs, found, {"colmap": (broken, None), "other": (None, None)})
 
     assert all(figure.peer is not None for figure in all_ran.figures)
     assert [f.name for f in alone.figures] == [f.name for f in all_ran.figures]
@@ -280,7 +280,7 @@ def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Pa
                      "16 pictures to the mosaic: time": 18.0}  # fmt: skip
     assert not any("surface, rms" in figure.name for figure in all_ran.figures)
 
-    ours_broke = beside_peers(16, {"sparse": broken}, None, {"colmap": (cost, found)})
+    ours_broke = against_peers(16, {"sparse": broken}, None, {"colmap": (cost, found)})
     assert ours_broke.figures == ()
     assert ours_broke.failed == ("16 pictures, sparse: no model",)
 

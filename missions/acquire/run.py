@@ -259,8 +259,8 @@ def _take(job: tuple[_Shoot, int, str, Array]) -> str:
     imaging = shoot.imaging
     image = f"{camera}/{station:06d}.{imaging.image_format}"
     ranges = shoot.folder / "truth" / "range" / f"{camera}_{station:06d}.tif"
-    wants_range = imaging.range_maps and not ranges.exists()
-    if (shoot.folder / image).exists() and not wants_range:
+    needs_range = imaging.range_maps and not ranges.exists()
+    if (shoot.folder / image).exists() and not needs_range:
         return image
     scene, rig, lights, sensor, gain = _studio(shoot)
     one, poses = rig.cameras[camera], RigidTransform.from_matrix(body) * rig.body_from_cam(camera)
@@ -271,7 +271,7 @@ def _take(job: tuple[_Shoot, int, str, Array]) -> str:
             rng = np.random.default_rng(seed) if imaging.noise else None
             picture = develop(expose(radiance, sensor, rng), gain)
             _write_picture(shoot.folder / image, picture)
-        if wants_range:
+        if needs_range:
             _write_picture(ranges, range_map(scene, one, poses[MOMENTS]))
     except ImageError as error:
         raise ImageError(f"station {station}, {camera} camera: {error}") from None

@@ -136,7 +136,7 @@ def _config_of_plan(path: Path) -> SurveyConfig:
     settings = {} if stage is None else stage.settings
     if "camera" not in settings or "water" not in settings:
         raise PlanError(
-            f"{path}: lies in no finished plan folder, so that where the camera sits on the "
+            f"{path}: is not in a finished plan folder, so that where the camera sits on the "
             "vehicle is not known: give the survey's settings too"
         )
     known = {key: settings[key] for key in ("camera", "water")}

@@ -272,11 +272,11 @@ def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
     pattern = flown.pattern
     pictures = pattern.passes * pattern.pictures
-    asked = f"{counted(pattern.passes, 'line')}, {pictures} pictures of each camera"
+    wanted = f"{counted(pattern.passes, 'line')}, {pictures} pictures of each camera"
     rows = [
         ("in at least one picture", planned.covered_share, flown.covered_share),
         ("in stereo", planned.stereo_share, flown.stereo_share),
-        (f"at the overlap asked for ({asked})", planned.share_at_overlap, flown.share_at_overlap),
+        (f"at the requested overlap ({wanted})", planned.share_at_overlap, flown.share_at_overlap),
     ]
     width = max(len(name) for name, _, _ in rows)
     altitude = record.stations.altitude_m
@@ -350,7 +350,7 @@ def _flights_text(result: MonteCarlo) -> str:
     complete = result.endings.get("complete", 0)
     return (
         f"\n{counted(result.flights, 'simulated flight')}, {complete} complete: at the "
-        f"overlap asked for {share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at "
+        f"requested overlap {share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at "
         f"least one picture {seen['p50']:.2%} ({seen['p05']:.2%});\n"
         f"the place that is missed most is missed in "
         f"{math.ceil(100 * data['greatest_hole_probability'])} % of flights"

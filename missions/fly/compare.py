@@ -232,7 +232,6 @@ def fly_all(
     cases: Sequence[Case],
     seeds: Sequence[int],
     executor: Executor,
-    variants: Sequence[Variant] = VARIANTS,
 ) -> Iterator[Outcome]:
     """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
 
@@ -243,10 +242,9 @@ def fly_all(
         cases: mean currents.
         seeds: of the water and of the instruments.
         executor: where tasks run.
-        variants: what flies.
     """
     fly = partial(fly_one, settings, plan, seeds[0])
-    yield from executor.map(fly, list(itertools.product(cases, variants, seeds)), label="flights")
+    yield from executor.map(fly, list(itertools.product(cases, VARIANTS, seeds)), label="flights")
 
 
 def fly_one(

@@ -25,14 +25,14 @@ def one_dive(plan: Plan, dive: int | None) -> Plan:
         dive: which, from 1 on; None leaves all of them.
 
     Raises:
-        PlanError: there is no such dive.
+        PlanError: the plan lacks that dive.
     """
     if dive is None:
         return plan
     count = len(plan.dives)
     if not 1 <= dive <= count:
         held = "1 dive" if count == 1 else f"dives 1 to {count}"
-        raise PlanError(f"dive {dive} is asked for; the plan has {held}: choose one of these")
+        raise PlanError(f"dive {dive} was requested; the plan has {held}: choose one of these")
     chosen = plan.dives[dive - 1]
     return replace(
         plan,

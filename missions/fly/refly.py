@@ -50,7 +50,7 @@ def refly_plan(
         PlanError: there are none, or lines over them leave the allowed area.
     """
     if not holes:
-        raise PlanError("there is no hole to fly again")
+        raise PlanError("no hole to fly again")
     area = replace(plan.area, survey=to_see(plan.area, flown, holes))
     lines = lines_over(area.survey, area, flown.pattern)
     if not lines:

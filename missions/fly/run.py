@@ -74,7 +74,7 @@ def _check_pictures(flight: Flight, planned: int) -> None:
     """Warn of stations that were missed or lie off their lines.
 
     Raises:
-        VehicleError: there is no picture at all.
+        VehicleError: no picture was taken.
     """
     if not len(flight.trigger_s):
         raise VehicleError(

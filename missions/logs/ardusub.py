@@ -171,12 +171,12 @@ _TLOG: Mapping[str, tuple[_Source, ...]] = {
 }
 
 
-def read_ardusub_bin(path: Path, asked: Mapping[str, str]) -> LoggedDive:
+def read_ardusub_bin(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read an on-board log.
 
     Args:
         path: a .BIN or a text .log.
-        asked: the message to use for each role (`dive.ROLES`), `NAME` or `NAME[instance]`.
+        requested: the message to use for each role (`dive.ROLES`), `NAME` or `NAME[instance]`.
 
     Raises:
         NavigationError: it is not such a log, or lacks what navigation needs.
@@ -193,7 +193,7 @@ def read_ardusub_bin(path: Path, asked: Mapping[str, str]) -> LoggedDive:
         elif "TimeMS" in table.columns and name != "GPS":
             timed[name] = _with_time(table, table.columns["TimeMS"] * 1e-3 + offset_s)
     return _dive(
-        path, _BIN, asked, timed, present, lost,
+        path, _BIN, requested, timed, present, lost,
         kind="an on-board log of ArduSub",
         clock="the vehicle's clock, set by GPS" if dated else "the vehicle's clock since boot",
         dated=dated,
@@ -201,7 +201,7 @@ def read_ardusub_bin(path: Path, asked: Mapping[str, str]) -> LoggedDive:
     )  # fmt: skip
 
 
-def read_ardusub_tlog(path: Path, asked: Mapping[str, str]) -> LoggedDive:
+def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read a ground station's log; arguments and errors as of `read_ardusub_bin`."""
     lost: Counter[str] = Counter()
     wanted = {source.message for sources in _TLOG.values() for source in sources}
@@ -216,7 +216,7 @@ def read_ardusub_tlog(path: Path, asked: Mapping[str, str]) -> LoggedDive:
             offset[name] = _with_time(own, _tlog_times(own))
     recorded = np.concatenate([table.columns[RECORDED] for table in tables.values()])
     return _dive(
-        path, _TLOG, asked, offset, present, lost,
+        path, _TLOG, requested, offset, present, lost,
         kind="a ground station's log of ArduSub",
         clock="the ground station's clock",
         dated=bool(np.median(recorded) > DATED_AFTER_S),
@@ -227,7 +227,7 @@ def read_ardusub_tlog(path: Path, asked: Mapping[str, str]) -> LoggedDive:
 def _dive(
     path: Path,
     sources: Mapping[str, tuple[_Source, ...]],
-    asked: Mapping[str, str],
+    requested: Mapping[str, str],
     tables: _Tables,
     present: Sequence[str],
     lost: Counter[str],
@@ -242,7 +242,7 @@ def _dive(
 
     def signal(role: str) -> Signal | None:
         own: Counter[str] = Counter()
-        found, note = _signal(path, role, sources[role], asked.get(role), tables, present, own)
+        found, note = _signal(path, role, sources[role], requested.get(role), tables, present, own)
         # What the times of a message cost is counted once, though it serves several roles.
         if found is not None and found.source not in counted:
             counted.add(found.source)
@@ -280,13 +280,13 @@ def _signal(
     path: Path,
     role: str,
     sources: Sequence[_Source],
-    asked: str | None,
+    requested: str | None,
     tables: _Tables,
     present: Sequence[str],
     lost: Counter[str],
 ) -> tuple[Signal | None, str]:
     """The best source that the log holds, or the requested one, and its note."""
-    name, _, instance = (asked or "").removesuffix("]").partition("[")
+    name, _, instance = (requested or "").removesuffix("]").partition("[")
     known = [source.message for source in sources]
     if name and name not in known:
         raise NavigationError(f"{path}: {role} can come from {', '.join(known)}, not {name}")
@@ -306,12 +306,12 @@ def _signal(
         if found is not None:
             return found, f"{source.note}{others}".strip("; ")
     if name:
-        raise NavigationError(f"{path}: {asked} gives no {role}; it has {', '.join(present)}")
+        raise NavigationError(f"{path}: {requested} gives no {role}; it has {', '.join(present)}")
     return None, ""
 
 
 def _one_instance(
-    path: Path, role: str, table: LogTable, asked: str, named: bool
+    path: Path, role: str, table: LogTable, requested: str, named: bool
 ) -> tuple[LogTable | None, str]:
     """The rows of one core or sensor, and a note on the others.
 
@@ -323,12 +323,12 @@ def _one_instance(
         return table, ""
     known = table.columns[field][np.isfinite(table.columns[field])]
     numbers = np.unique(known).astype(int).tolist()
-    if asked:
-        if not asked.isdigit() or int(asked) not in numbers:
+    if requested:
+        if not requested.isdigit() or int(requested) not in numbers:
             raise NavigationError(
-                f"{path}: {table.name} has {', '.join(map(str, numbers))}, not {asked}"
+                f"{path}: {table.name} has {', '.join(map(str, numbers))}, not {requested}"
             )
-        return table.rows(table.columns[field] == int(asked)), ""
+        return table.rows(table.columns[field] == int(requested)), ""
     if len(numbers) < 2:
         return table, ""
     if table.name == "BARO":

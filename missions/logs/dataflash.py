@@ -3,7 +3,7 @@
 The format describes itself: a message is A3 95, a type number and packed fields; messages of type
 0x80 (FMT) give each type's length, name, field types and field names (ardupilot,
 libraries/AP_Logger/LogStructure.h and README.md). pymavlink's reader of these logs is under the
-GPL, so this one is our own.
+GPL, so this is another.
 """
 
 import struct
@@ -145,7 +145,7 @@ def _read_binary(
             _learn(data[place + 3 : place + _FMT_LENGTH], formats, lengths, lost)
         place += length
     if skipped:
-        lost["bytes that are no message"] += skipped
+        lost["bytes that are not a message"] += skipped
     if place < end:
         lost["bytes of a message cut off at the end of the file"] += end - place
     view = np.frombuffer(data, dtype=np.uint8)
@@ -209,7 +209,7 @@ def _read_text(
             if name in wanted:
                 rows[name].append(cells)
         elif name:
-            lost["lines that are no message"] += 1
+            lost["lines that are not a message"] += 1
     tables = {}
     for name in wanted:
         if rows.get(name):
@@ -237,6 +237,6 @@ def _text_table(
             try:
                 values[j] = float(cell)
             except ValueError:
-                lost[f"{name}: {field} is no number"] += 1
+                lost[f"{name}: {field} is not a number"] += 1
         columns[field] = values
     return LogTable(name=name, columns=columns, texts=texts)

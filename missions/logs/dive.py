@@ -79,8 +79,8 @@ class LoggedDive:
     pwm: Signal | None = None
     """(N, n) microseconds of servo outputs 1 to n."""
     declination_in_log_deg: float | None = None
-    """What the vehicle itself added to its compass, where the log says; NaN: it did, by a table
-    of its own."""
+    """What the vehicle itself added to its compass, where the log says; NaN: it did, by its
+    built-in table."""
     lost: Mapping[str, int] = field(default_factory=dict)
     """How many rows or bytes were left out, by reason."""
     notes: tuple[str, ...] = ()
@@ -100,7 +100,7 @@ def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Si
     values = values[:, None] if values.ndim == 1 else values
     good = np.abs(time_s) < _LATEST_S
     if not good.all():
-        lost[f"{source}: the time is no number, or after 2200"] += int((~good).sum())
+        lost[f"{source}: the time is not a number, or after 2200"] += int((~good).sum())
     time_s, values = time_s[good], values[good]
     values = np.where(np.isfinite(values), values, np.nan)
     keep = _increasing(time_s)
@@ -153,7 +153,7 @@ def usable_positions(position: Signal | None, source: str, lost: Counter[str]) -
             inside = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
         nowhere = known & (latitude == 0) & (longitude == 0)
         for reason, rows in (
-            ("the position is no number", ~known),
+            ("the position is not a number", ~known),
             ("the position is beyond the range of latitude and longitude", known & ~inside),
             ("the position is 0, 0: no fix", nowhere),
         ):

@@ -4,21 +4,22 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from missions.logs.corrections import Corrections, moment, navigation_table, read_tide
-from missions.logs.dive import ROLES, LoggedDive, Signal
-from missions.logs.navigation_csv import longest_gap_s, utc_date
+from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
+from missions.logs.navigation_csv import csv_rows, longest_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
+_LONGEST_S = 1e9
 _MICRO = 1e6
 
 
@@ -50,6 +51,19 @@ class ImportOptions:
     vehicle_log: Path | None = None
     """Vehicle log to write, too."""
 
+    def __post_init__(self) -> None:
+        numbers = (
+            self.declination_deg, self.clock_offset_s, self.altitude_offset_m, *self.lever_body_m,
+        )  # fmt: skip
+        if not all(math.isfinite(number) for number in numbers):
+            raise NavigationError("declination, offsets and lever arm need finite numbers")
+        if abs(self.clock_offset_s) > _LONGEST_S:
+            raise NavigationError(f"--clock-offset {self.clock_offset_s:g} s is more than 30 years")
+        if abs(self.declination_deg) > 180:
+            raise NavigationError(
+                f"a declination of {self.declination_deg:g} degrees: give -180 to 180"
+            )
+
 
 def import_log(
     path: Path, out: Path, options: ImportOptions | None = None
@@ -70,29 +84,24 @@ def import_log(
     Raises:
         NavigationError: the log cannot be read, holds no position, or an option does not fit it.
     """
-    asked = options or ImportOptions()
-    written = [file for file in (out, asked.vehicle_log) if file is not None]
+    options = options or ImportOptions()
+    written = [file for file in (out, options.vehicle_log) if file is not None]
     for file in written:
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
-    dive = read_dive(path, asked)
-    dated = dive.dated or asked.start_utc is not None
-    if asked.start_utc is not None:
-        dive = _dated(dive, asked.start_utc)
-    corrections = Corrections(
-        declination_deg=asked.declination_deg,
-        tide=read_tide(asked.tide, dated=dated),
-        clock_offset_s=asked.clock_offset_s,
-        lever_body_m=asked.lever_body_m,
-        altitude_offset_m=asked.altitude_offset_m,
-    )
-    _warn_of_declination(dive, asked.declination_deg)
-    time_s, columns = navigation_table(_trimmed(dive, asked.start_s, asked.end_s), corrections)
+    dive = read_dive(path, options)
+    dated = dive.dated or options.start_utc is not None
+    if options.start_utc is not None:
+        dive = _dated(dive, options.start_utc)
+    tide = read_tide(options.tide, dated=dated)
+    _warn_of_declination(dive, options.declination_deg)
+    dive = _trimmed(dive, options.start_s, options.end_s)
+    time_s, columns = navigation_table(dive, options, tide)
     complete = np.isfinite(columns["latitude_deg"] + columns["depth_m"])
     lost = Counter(dict(dive.lost))
     if not complete.all():
         reason = "positions without a depth" + (
-            " or an attitude for the lever arm" if any(asked.lever_body_m) else ""
+            " or an attitude for the lever arm" if any(options.lever_body_m) else ""
         )
         lost[reason] += int((~complete).sum())
     if not complete.any():
@@ -105,11 +114,11 @@ def import_log(
     try:
         texts = [_date(t) if dated else f"{t:.6f}" for t in time_s.tolist()]
         write_navigation_rows(out, texts, columns, "time_utc" if dated else "time_s")
-        if asked.vehicle_log is not None:
-            _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
+        if options.vehicle_log is not None:
+            _write_vehicle_log(options.vehicle_log, dive, options)
     except OSError as error:
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
-    tidal = isinstance(corrections.tide, Signal) or corrections.tide != 0.0
+    tidal = isinstance(tide, Signal) or tide != 0.0
     return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
 
 
@@ -125,21 +134,21 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
-    asked = _roles(options.topics)
+    chosen = _roles(options.topics)
     suffix = path.suffix.lower()
     if suffix not in ("", ".bag", ".mcap", ".db3") and options.datum_deg is not None:
         raise NavigationError("--datum is for the odometry of a bag of ROS: leave it out")
     if path.is_dir() or is_bag(path):
         datum = None if options.datum_deg is None else Datum(*options.datum_deg)
-        return read_ros_bag(path, asked, datum)
+        return read_ros_bag(path, chosen, datum)
     if suffix in (".bin", ".log"):
-        return read_ardusub_bin(path, asked)
+        return read_ardusub_bin(path, chosen)
     if suffix == ".tlog":
-        return read_ardusub_tlog(path, asked)
+        return read_ardusub_tlog(path, chosen)
     if suffix == ".csv":
-        return read_qgc_csv(path, asked, options.time_zone)
+        return read_qgc_csv(path, chosen, options.time_zone)
     raise NavigationError(
-        f"{path}: no log that is known: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
+        f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
         ".log or .tlog, or QGroundControl's .csv"
     )
 
@@ -151,17 +160,17 @@ def _date(time_s: float) -> str:
 
 
 def _roles(topics: Sequence[str]) -> dict[str, str]:
-    asked: dict[str, str] = {}
+    chosen: dict[str, str] = {}
     for text in topics:
         role, mark, name = text.partition("=")
         if not mark or role not in ROLES or not name:
             raise NavigationError(
                 f"--topic {text!r}: give ROLE=NAME with a role of {', '.join(ROLES)}"
             )
-        if role in asked:
+        if role in chosen:
             raise NavigationError(f"--topic {role} is given twice")
-        asked[role] = name
-    return asked
+        chosen[role] = name
+    return chosen
 
 
 def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
@@ -172,21 +181,21 @@ def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
         start_s = utc_date(start_utc).timestamp()
     except ValueError:
         raise NavigationError(
-            f"--start-utc {start_utc!r} is no date such as 2024-05-01T12:00:00Z"
+            f"--start-utc {start_utc!r} is not a date such as 2024-05-01T12:00:00Z"
         ) from None
     shift = start_s - float(dive.position.time_s[0])
+    signals = {field.name: getattr(dive, field.name) for field in fields(dive)}
     moved: dict[str, Any] = {
-        name: replace(signal, time_s=signal.time_s + shift)
-        for name in (
-            "position", "depth", "attitude", "altitude", "velocity_ned", "velocity_body", "rates",
-            "rpm", "pwm",
-        )
-        if (signal := getattr(dive, name)) is not None
-    }  # fmt: skip
-    moved["sigmas"] = {
-        name: replace(signal, time_s=signal.time_s + shift) for name, signal in dive.sigmas.items()
+        name: _later(signal, shift)
+        for name, signal in signals.items()
+        if isinstance(signal, Signal)
     }
-    return replace(dive, **moved)
+    sigmas = {name: _later(signal, shift) for name, signal in dive.sigmas.items()}
+    return replace(dive, sigmas=sigmas, **moved)
+
+
+def _later(signal: Signal, by_s: float) -> Signal:
+    return replace(signal, time_s=signal.time_s + by_s)
 
 
 def _trimmed(dive: LoggedDive, start_s: float | None, end_s: float | None) -> LoggedDive:
@@ -206,12 +215,12 @@ def _trimmed(dive: LoggedDive, start_s: float | None, end_s: float | None) -> Lo
     )
 
 
-def _warn_of_declination(dive: LoggedDive, asked_deg: float) -> None:
+def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
     known = dive.declination_in_log_deg
-    if known is None or not asked_deg:
+    if known is None or not declination_deg:
         return
     if math.isnan(known):
-        warn("the vehicle added a declination of its own (COMPASS_AUTODEC): yours comes on top")
+        warn("the vehicle added a declination itself (COMPASS_AUTODEC): yours comes on top")
     elif known:
         warn(
             f"the vehicle added a declination of {known:.2f} degrees (COMPASS_DEC): yours comes on "
@@ -219,18 +228,148 @@ def _warn_of_declination(dive: LoggedDive, asked_deg: float) -> None:
         )
 
 
-def _write_vehicle_log(
-    path: Path, dive: LoggedDive, corrections: Corrections, options: ImportOptions
-) -> None:
+def navigation_table(
+    dive: LoggedDive, options: ImportOptions, tide: float | Signal
+) -> tuple[Array, dict[str, Array]]:
+    """Times, (N,), and the columns of the navigation CSV, (N,) each, at the positions' times.
+
+    What is not known is NaN. Everything else than the position is interpolated onto its times, but
+    not across gaps. Depth is from the level that the tide counts from.
+
+    Args:
+        dive: as logged.
+        options: what to correct.
+        tide: height of the water above the level that depths are to count from, metres; or (N, 1)
+            of it on the clock of the log after the offset.
+
+    Raises:
+        NavigationError: the lever arm needs an attitude that the log lacks, or the tide does not
+            cover the dive.
+    """
+    logged_s = dive.position.time_s
+    time_s = logged_s + options.clock_offset_s
+    nothing = np.full((len(time_s), 1), np.nan)
+    depth = nothing if dive.depth is None else dive.depth.at(logged_s)
+    angles = np.full((len(time_s), 3), np.nan)
+    if dive.attitude is not None:
+        angles = dive.attitude.at(logged_s, turning=True)
+        angles[:, 2] += options.declination_deg
+    altitude = nothing if dive.altitude is None else dive.altitude.at(logged_s)
+    if dive.altitude_slant:
+        # The range along the body's down axis, seen upright: cos(roll) cos(pitch) is the axis' down
+        # component (Fossen 2011, 2.18). Without an attitude it is not known.
+        altitude = altitude * np.cos(np.deg2rad(angles[:, :2])).prod(axis=1, keepdims=True)
+    place = _at_origin(dive, np.hstack([dive.position.values, depth]), angles, options.lever_body_m)
+    values = [
+        place[:, 0],
+        place[:, 1],
+        place[:, 2] - _tide_at(time_s, tide),
+        (angles[:, 0] + 180.0) % 360.0 - 180.0,
+        angles[:, 1],
+        angles[:, 2] % 360.0,
+        altitude[:, 0] + options.altitude_offset_m,
+    ]
+    columns = dict(zip(COLUMNS, values, strict=False))
+    for name in COLUMNS[len(values) :]:
+        signal = dive.sigmas.get(name)
+        columns[name] = nothing[:, 0] if signal is None else signal.at(logged_s)[:, 0]
+    return time_s, columns
+
+
+def _at_origin(
+    dive: LoggedDive, place: Array, angles_deg: Array, lever_body_m: tuple[float, float, float]
+) -> Array:
+    """Latitude, longitude and depth, (N, 3), of the body's origin."""
+    lever = np.array(lever_body_m)
+    if not lever.any():
+        return place
+    if dive.attitude is None:
+        raise NavigationError("a lever arm needs an attitude, and the log has none")
+    moved = np.full_like(place, np.nan)
+    good = np.isfinite(place).all(axis=1) & np.isfinite(angles_deg).all(axis=1)
+    if good.any():
+        datum = Datum(*(float(value) for value in place[good][0, :2]))
+        rotation = rotation_from_attitude(*np.deg2rad(angles_deg[good]).T)
+        ned = datum.ned_from_geodetic(place[good]) - rotation.apply(lever)
+        moved[good] = datum.geodetic_from_ned(ned)
+    return moved
+
+
+def _tide_at(time_s: Array, tide: float | Signal) -> Array:
+    if not isinstance(tide, Signal):
+        return np.full(time_s.shape, float(tide))
+    first, last = tide.time_s[0], tide.time_s[-1]
+    if time_s[0] < first or time_s[-1] > last:
+        raise NavigationError(
+            f"{tide.source}: tides from {moment(first)} to {moment(last)} do not cover the dive, "
+            f"{moment(float(time_s[0]))} to {moment(float(time_s[-1]))}"
+        )
+    heights: Array = np.interp(time_s, tide.time_s, tide.values[:, 0])
+    return heights
+
+
+def read_tide(text: str, *, dated: bool) -> float | Signal:
+    """A tide as typed: metres, or a CSV with `time_utc` (or `time_s`) and `height_m`.
+
+    Args:
+        text: a number, or a path.
+        dated: whether the log's times are UTC: then the CSV's must be, too.
+
+    Raises:
+        NavigationError: it is neither, or the file cannot be used.
+    """
+    try:
+        metres = float(text)
+    except ValueError:
+        path = Path(text)
+    else:
+        if not math.isfinite(metres):
+            raise NavigationError(f"--tide {text}: give a finite number")
+        return metres
+    column = "time_utc" if dated else "time_s"
+    try:
+        names, rows = csv_rows(path)
+    except NavigationError as error:
+        raise NavigationError(f"--tide is neither metres nor a CSV: {error}") from None
+    for name in (column, "height_m"):
+        if name not in names:
+            raise NavigationError(
+                f"{path}: column {name} is missing; it has {shown(', '.join(names))}"
+                + ("" if dated else " (the log's times have no date)")
+            )
+    times, heights = [], []
+    for line, row in rows:
+        try:
+            cell = (row[column] or "").strip()
+            times.append(utc_date(cell).timestamp() if dated else float(cell))
+            heights.append(float(row["height_m"] or ""))
+        except ValueError:
+            raise NavigationError(
+                f"{path} line {line}: {row[column]!r}, {row['height_m']!r}: not a time and a height"
+            ) from None
+    if not times or not np.all(np.isfinite([*times, *heights])):
+        raise NavigationError(f"{path}: holds no tides, or heights that are not numbers")
+    if not np.all(np.diff(times) > 0):
+        raise NavigationError(f"{path}: the times must increase")
+    return Signal(source=text, time_s=np.array(times), values=np.array(heights)[:, None])
+
+
+def moment(time_s: float) -> str:
+    """A time as people read it: a date where it is one."""
+    if time_s < DATED_AFTER_S:
+        return f"{time_s:.1f} s"
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _write_vehicle_log(path: Path, dive: LoggedDive, options: ImportOptions) -> None:
     """The vehicle log (docs/vehicle-logs.md) at the positions' times, from the first position."""
     from scipy.spatial.transform import Rotation
 
     from alice_survey.vehicle.log import vehicle_log, write_vehicle_log
 
-    trimmed = _trimmed(dive, options.start_s, options.end_s)
     # Depths of the log, not of the chart: a vehicle's log knows of no tide.
-    time_s, columns = navigation_table(trimmed, replace(corrections, tide=0.0))
-    at_s = trimmed.position.time_s
+    time_s, columns = navigation_table(dive, options, 0.0)
+    at_s = dive.position.time_s
     place = np.stack([columns[name] for name in COLUMNS[:3]], axis=1)
     known = np.isfinite(place).all(axis=1)
     position = np.full(place.shape, np.nan)
@@ -323,7 +462,7 @@ def _report(
         lines.append(f"  {len(gaps)} gaps, the longest {max(g[1] for g in gaps):.1f} s")
     if tidal:
         lines.append(
-            "  depths count from the level that --tide refers to: tell import-images its name by "
+            "  depths count from the level that --tide refers to: give import-images its name by "
             "--vertical-datum"
         )
     if not dated:

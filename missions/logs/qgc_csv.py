@@ -22,7 +22,7 @@ _ALTITUDES = ("distanceSensor.rotationPitch270", "apmSubInfo.rangefinderDistance
 """The first has metres; of the second ArduSub's RANGEFINDER message, metres."""
 
 
-def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> LoggedDive:
+def read_qgc_csv(path: Path, requested: Mapping[str, str], time_zone: str) -> LoggedDive:
     """Read a CSV that QGroundControl wrote ("Save CSV log of telemetry data").
 
     Rows of another number of cells than the header are left out: until a battery is found, QGC
@@ -30,13 +30,13 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
 
     Args:
         path: the file.
-        asked: which column to use for depth or altitude.
+        requested: which column to use for depth or altitude.
         time_zone: of the PC.
 
     Raises:
         NavigationError: it is not such a file, or holds no position.
     """
-    wrong = [role for role in asked if role not in ("depth", "altitude")]
+    wrong = [role for role in requested if role not in ("depth", "altitude")]
     if wrong:
         raise NavigationError(f"--topic {wrong[0]}: of a CSV only depth and altitude can be chosen")
     zone = find_zone(time_zone)
@@ -52,7 +52,7 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
         )
     missing = [name for name in (_TIME, *_PLACE) if name not in header]
     if missing:
-        raise NavigationError(f"{path}: no CSV of QGroundControl: column {missing[0]} is missing")
+        raise NavigationError(f"{path}: not QGroundControl's CSV: column {missing[0]} is missing")
     lost: Counter[str] = Counter()
     whole = [row for row in rows if len(row) == len(header)]
     if len(whole) < len(rows):
@@ -64,7 +64,7 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
         return np.array([[_number(cell) for cell in columns[name]] for name in names]).T
 
     def chosen(role: str, *usual: str) -> str | None:
-        name = asked.get(role)
+        name = requested.get(role)
         if name is not None and name not in columns:
             raise NavigationError(f"{path}: no column {name}; it has {shown(', '.join(header))}")
         return name or next((column for column in usual if column in columns), None)

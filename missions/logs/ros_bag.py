@@ -93,12 +93,12 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
-def read_ros_bag(path: Path, asked: Mapping[str, str], datum: Datum | None) -> LoggedDive:
+def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) -> LoggedDive:
     """Read a bag.
 
     Args:
         path: a ROS 1 file, a ROS 2 folder, or the single .mcap or .db3 of one.
-        asked: the topic to use for each role (`dive.ROLES`).
+        requested: the topic to use for each role (`dive.ROLES`).
         datum: origin of an odometry's world, where the bag does not state it.
 
     Raises:
@@ -107,7 +107,7 @@ def read_ros_bag(path: Path, asked: Mapping[str, str], datum: Datum | None) -> L
     with _opened(path) as reader:
         present = sorted({_Topic(c.topic, c.msgtype.split("/")[-1]) for c in reader.connections},
                          key=lambda topic: topic.name)  # fmt: skip
-        chosen = _choose(path, present, asked)
+        chosen = _choose(path, present, requested)
         origin = [
             topic for topic in present
             if topic.kind == FIX and topic.name.rsplit("/", 1)[-1] in _ORIGIN
@@ -199,11 +199,13 @@ def _bounded(decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
     return unpack
 
 
-def _choose(path: Path, present: Sequence[_Topic], asked: Mapping[str, str]) -> dict[str, _Topic]:
+def _choose(
+    path: Path, present: Sequence[_Topic], requested: Mapping[str, str]
+) -> dict[str, _Topic]:
     """Which topic serves each role; roles that nothing serves are left out."""
     chosen = {}
     by_name = {topic.name: topic for topic in present}
-    for role, name in asked.items():
+    for role, name in requested.items():
         topic = by_name.get(name)
         if topic is None:
             raise NavigationError(f"{path}: no topic {name}; it has {_listed(present)}")

@@ -205,12 +205,12 @@ def read_tlog(
     rows: dict[int, bytearray] = defaultdict(bytearray)
     present: set[int] = set()
     numbers = {message.name: number for number, message in MESSAGES.items()}
-    asked = {numbers[name] for name in wanted}
+    numbers_wanted = {numbers[name] for name in wanted}
     try:
         with path.open("rb") as file:
             for stamp, packet in packets(file, lost):
                 present.add(packet.number)
-                if packet.number in asked:
+                if packet.number in numbers_wanted:
                     length = MESSAGES[packet.number].length
                     rows[packet.number] += stamp
                     rows[packet.number] += bytes((packet.system, packet.component))
@@ -273,7 +273,7 @@ def packets(
         skipped += step
     skipped += len(data) - place
     if skipped:
-        lost["bytes that are no message, or of one that is cut off"] += skipped
+        lost["bytes that are not a message, or of one that is cut off"] += skipped
 
 
 def _leads_on(data: bytes, place: int, following: int, previous: bytes) -> bool:

@@ -148,7 +148,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             max(stereo.ahead_m, stereo.astern_m),
         )
         camera = rig.cameras[rig.reference]
-        terrain = _terrain(lines, wanted, reach, pattern, camera, bathymetry)
+        depths_m, terrain, figures = _terrain(lines, wanted, reach, pattern, camera, bathymetry)
         plan = Plan(
             name=config.name,
             area=area,
@@ -173,7 +173,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             duration_s=sum(dive.duration_s for dive in dives),
             energy_wh=sum(dive.energy_wh for dive in dives),
             coverage=math.nan,
-            line_depths_m=terrain.depths_m,
+            line_depths_m=depths_m,
             details={},
         )
         seen = certificate(area, rig, _stations(plan, bathymetry), pattern)
@@ -183,8 +183,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
                 f"and {1 - seen.every_camera_share:.2%} is not seen by every camera: look at "
                 "map.png, and give the vehicle more room, or raise the overlaps"
             )
-        figures = _details(imaging, sweep, stereo, rig, wanted) | {"terrain": terrain.figures}
-        details = json.loads(json.dumps(figures))  # as they are read back
+        about = _details(imaging, sweep, stereo, rig, wanted) | {"terrain": figures}
+        details = json.loads(json.dumps(about))  # as they are read back
         finished = replace(plan, coverage=seen.share_at_overlap, details=details)
         planned = Planned(
             plan=finished,
@@ -194,7 +194,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             sweep=sweep,
             bathymetry=bathymetry,
             warnings=(),
-            terrain=terrain.text,
+            terrain=terrain,
             rows=(*imaging.rows, *plan_rows(finished, seen, sweep, config.vehicle, rig)),
         )
     return replace(planned, warnings=tuple(warnings))
@@ -266,16 +266,6 @@ def _depth_m(settings: AreaConfig, area: Area, bathymetry: Bathymetry | None) ->
     return mean_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Following:
-    """How lines follow a bathymetry."""
-
-    depths_m: tuple[tuple[float, ...], ...] = ()
-    """Depth of the glass, at each station of each line."""
-    text: str = ""
-    figures: dict[str, Any] | None = None
-
-
 def _terrain(
     lines: Sequence[Line],
     wanted: PlanConfig,
@@ -283,9 +273,10 @@ def _terrain(
     pattern: Pattern,
     camera: FlatPortCamera,
     bathymetry: Bathymetry | None,
-) -> _Following:
+) -> tuple[tuple[tuple[float, ...], ...], str, dict[str, Any] | None]:
+    """How lines follow a bathymetry: depths of the glass at each station, in words, in figures."""
     if bathymetry is None:
-        return _Following()
+        return (), "", None
     limits = TerrainLimits(
         altitude_m=wanted.altitude_m,
         least_clearance_m=wanted.least_clearance_m,
@@ -302,7 +293,7 @@ def _terrain(
         extent_m=partial(footprint_size_m, camera),
     )
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return _Following(depths_m=depths, text=text, figures=figures)
+    return depths, text, figures
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

@@ -52,7 +52,7 @@ def plan_rows(
         *_line_rows(plan, sweep),
         *_dive_rows(plan, vehicle),
         _data_row(plan, rig),
-        *_coverage_rows(seen),
+        _coverage_row(seen),
     )
 
 
@@ -103,17 +103,15 @@ def _data_row(plan: Plan, rig: Rig) -> Setting:
     )  # fmt: skip
 
 
-def _coverage_rows(seen: Certificate) -> Sequence[Setting]:
+def _coverage_row(seen: Certificate) -> Setting:
     often = seen.pattern.passes * seen.pattern.pictures
-    return (
-        _row(
-            "covered as requested", seen.share_at_overlap, "%", "union of real footprints", "lines",
-            f"by every camera on {seen.pattern.passes} line{'s'[: seen.pattern.passes > 1]} and in "
-            f"{often} pictures or more, as in an endless pattern of this spacing and step; "
-            f"{seen.covered_share:.2%} is in some picture, {seen.stereo_share:.2%} in stereo; the "
-            f"place seen least is in {seen.fewest_pictures} pictures of a camera, the mean place "
-            f"in {seen.mean_pictures:.1f} of all",
-        ),
+    return _row(
+        "covered as requested", seen.share_at_overlap, "%", "union of real footprints", "lines",
+        f"by every camera on {seen.pattern.passes} line{'s'[: seen.pattern.passes > 1]} and in "
+        f"{often} pictures or more, as in an endless pattern of this spacing and step; "
+        f"{seen.covered_share:.2%} is in some picture, {seen.stereo_share:.2%} in stereo; the "
+        f"place seen least is in {seen.fewest_pictures} pictures of a camera, the mean place "
+        f"in {seen.mean_pictures:.1f} of all",
     )  # fmt: skip
 
 

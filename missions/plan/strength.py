@@ -156,14 +156,14 @@ def _tried(
 
 def _headings(flown: FlightConditions) -> Iterator[Way]:
     """The nearest heading that flies, where one is requested."""
-    asked = flown.line_heading_deg
-    if asked is None:
+    wanted_deg = flown.line_heading_deg
+    if wanted_deg is None:
         return
     for turned in np.arange(_HEADING_STEP_DEG, 90.0 + _HEADING_STEP_DEG / 2, _HEADING_STEP_DEG):
-        for heading in ((asked + turned) % 360.0, (asked - turned) % 360.0):
+        for heading in ((wanted_deg + turned) % 360.0, (wanted_deg - turned) % 360.0):
             if flies_everywhere(replace(flown, line_heading_deg=heading)):
                 yield Way(
-                    change=f"plan.line_heading_deg {heading:g} instead of {asked:g}",
+                    change=f"plan.line_heading_deg {heading:g} instead of {wanted_deg:g}",
                     price=f"lines turned by {turned:g} deg",
                     cost=turned / 90.0,
                 )

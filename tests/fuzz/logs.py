@@ -16,14 +16,13 @@ _START_NS = 1_714_564_800_000_000_000
 
 def read_any_log(path: Path) -> object:
     """As `import-log` until it writes; of a side file, the log in whose folder it is."""
-    from missions.logs.corrections import Corrections, navigation_table
-    from missions.logs.import_log import ImportOptions, read_dive
+    from missions.logs.import_log import ImportOptions, navigation_table, read_dive
 
     log = path.parent if path.parent.name == "bag" else path
     options = ImportOptions(lever_body_m=(0.1, 0.0, 0.2))
     dive = read_dive(log, options)
     lever = options.lever_body_m if dive.attitude is not None else (0.0, 0.0, 0.0)
-    return navigation_table(dive, Corrections(lever_body_m=lever))
+    return navigation_table(dive, ImportOptions(lever_body_m=lever), 0.0)
 
 
 def _bag(folder: Path, version: int, storage: str = "MCAP") -> None:
@@ -147,7 +146,7 @@ def _check_log(folder: Path) -> None:
 
 
 def read_tide(path: Path) -> object:
-    from missions.logs.corrections import read_tide
+    from missions.logs.import_log import read_tide
 
     return read_tide(str(path), dated=True)
 

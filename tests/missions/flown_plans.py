@@ -1,17 +1,25 @@
-"""Small plans made by hand: legs one after the other, dives from home to home."""
+"""Plans to fly: small ones by hand, legs one after the other, and those of surveys."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.frames import Datum
 from alice_survey.seafloor.terrain import Terrain, survey_terrain
+from alice_survey.vehicle.floor import FloorGrid, level_floor
+from camera_calib.rig import design_rig
+from missions.fly.simulation import flight_settings, simulate_plan
+from missions.plan.planner import plan_survey
 from missions.values.area import Area
+from missions.values.flight import Flight
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
-from missions.values.plan_file import Dive, Plan
+from missions.values.plan_file import Plan
+from tests.missions.exports.plans import plan_of as exported_plan
 
 Move = tuple[str, float] | tuple[str, float, int]
 """("go", metres), ("line", metres, index), ("spot", degrees), ("step", metres to starboard)."""
@@ -43,53 +51,48 @@ def plan_of(routes: Sequence[Route], stations: int = 6, turn_radius_m: float = 0
     legs = sorted(
         (leg for route in routes for leg in route.legs if leg.line >= 0), key=lambda leg: leg.line
     )
-    lines = tuple(
+    lines = [
         Line(kind="survey", start_ne_m=leg.start_ne_m, end_ne_m=leg.end_ne_m, stations=stations)
         for leg in legs
+    ]
+    indices = [[leg.line for leg in route.legs if leg.line >= 0] for route in routes]
+    plan = exported_plan(
+        lines,
+        [(min(own), max(own)) for own in indices],
+        datum=Datum(latitude_deg=32.8, longitude_deg=34.9),
+        routes=list(routes),
+        home=routes[0].legs[0].start_ne_m,
+        seafloor_depth_m=6.0,
+        interval_s=2.0,
+        footprint_m=(1.4, 1.15),
+        station_spacing_m=0.8,
+        turn_radius_m=turn_radius_m,
+    )
+    turned = [sum(abs(leg.turn_rad) for leg in route.legs) for route in routes]
+    dives = tuple(
+        replace(dive, duration_s=dive.duration_s + turn_rad / math.radians(15.0))
+        for dive, turn_rad in zip(plan.dives, turned, strict=True)
     )
     area, allowed = (MultiPolygon([box(-m, -m, 7.0 + m, 4.0 + m)]) for m in (1.0, 5.0))
-    dives = []
-    for route in routes:
-        indices = [leg.line for leg in route.legs if leg.line >= 0]
-        turned = sum(abs(leg.turn_rad) for leg in route.legs)
-        dives.append(
-            Dive(
-                first_line=min(indices),
-                last_line=max(indices),
-                route=route,
-                duration_s=route.length_m / 0.2 + turned / math.radians(15.0),
-                energy_wh=2.0,
-            )
-        )
-    return Plan(
-        name="by hand",
-        area=Area(
-            datum=Datum(latitude_deg=32.8, longitude_deg=34.9), survey=area, allowed=allowed,
-            no_go=MultiPolygon(),
-        ),
-        home_ne_m=routes[0].legs[0].start_ne_m,
-        seafloor_depth_m=6.0,
-        altitude_m=2.0,
-        speed_mps=0.2,
-        interval_s=2.0,
-        exposure_s=0.003,
-        strobe_pulse_s=0.003,
-        strobe_lead_s=0.0002,
-        footprint_m=(1.4, 1.15),
-        line_spacing_m=1.0,
-        station_spacing_m=0.8,
-        reached_forward_overlap=0.3,
-        reached_side_overlap=0.29,
-        lines=lines,
-        dives=tuple(dives),
-        turn_radius_m=turn_radius_m,
-        run_in_m=0.5,
-        length_m=sum(dive.route.length_m for dive in dives),
+    return replace(
+        plan,
+        area=Area(datum=plan.datum, survey=area, allowed=allowed, no_go=MultiPolygon()),
+        dives=dives,
         duration_s=sum(dive.duration_s for dive in dives),
-        energy_wh=2.0 * len(dives),
-        coverage=1.0,
-        details={},
-    )  # fmt: skip
+    )
+
+
+def planned(config: SurveyConfig) -> Plan:
+    """The plan of a survey."""
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
+
+
+def flown(
+    plan: Plan, config: SurveyConfig, floor: FloorGrid | None = None, seed: int = 1
+) -> Flight:
+    """A plan flown over a floor, level at 6 m if there is none."""
+    rng = np.random.default_rng(seed)
+    return simulate_plan(plan, flight_settings(config), floor or level_floor(6.0), rng)
 
 
 def terrain_of(config: SurveyConfig, plan: Plan) -> Terrain:

@@ -13,11 +13,9 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
-from camera_calib.rig import design_rig
-from missions.fly.simulation import flight_settings, simulate_plan
-from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
+from tests.missions.flown_plans import flown, planned
 
 LEAST_M = 1.0
 """Half the altitude of 2 m."""
@@ -40,8 +38,7 @@ def survey(*silent_s: tuple[float, float]) -> SurveyConfig:
 
 @lru_cache
 def plan_of() -> Plan:
-    config = survey()
-    return plan_survey(config, design_rig(config.camera, config.water)).plan
+    return planned(survey())
 
 
 def ground(depth_at: Callable[[Array], Array]) -> FloorGrid:
@@ -55,9 +52,7 @@ def slope(angle_deg: float) -> FloorGrid:
 
 
 def fly(floor: FloorGrid, *silent_s: tuple[float, float]) -> Flight:
-    return simulate_plan(
-        plan_of(), flight_settings(survey(*silent_s)), floor, np.random.default_rng(1)
-    )
+    return flown(plan_of(), survey(*silent_s), floor)
 
 
 def true_clearance_m(flight: Flight, floor: FloorGrid) -> float:
@@ -71,16 +66,16 @@ def true_clearance_m(flight: Flight, floor: FloorGrid) -> float:
 
 
 @pytest.mark.parametrize("angle_deg", [20.0, 30.0])
-def test_slopes_are_flown_up_and_down_at_the_altitude_that_is_asked_for(angle_deg: float) -> None:
+def test_slopes_are_flown_up_and_down_at_the_planned_altitude(angle_deg: float) -> None:
     floor = slope(angle_deg)
     flight = fly(floor)
     assert flight.ending == "complete"
     assert true_clearance_m(flight, floor) > 0.8 * LEAST_M
     columns = flight.flown.navigation
-    told, sigma = columns[:, 12], columns[:, 19]
+    believed, sigma = columns[:, 12], columns[:, 19]
     true = np.array([floor_depth(floor, n, e) - d for n, e, d in flight.glass_ned])
     on_line = flight.line >= 0
-    off = (told - true)[on_line]
+    off = (believed - true)[on_line]
     assert np.sqrt(np.mean(off**2)) < 0.1
     assert 0.5 < np.sqrt(np.mean((off / sigma[on_line]) ** 2)) < 1.5
     assert columns[on_line, -1].min() > 0.8 * LEAST_M

@@ -9,18 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
 
 from alice_survey.base.config import parse_config
-from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.navigation import tick as navigation
-from camera_calib.rig import design_rig
-from missions.fly import flight_plots
 from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
 from missions.fly.flight_records import rpm_of
-from missions.fly.simulation import flight_settings, simulate_plan
-from missions.plan.planner import plan_survey
 from missions.values.flight import Flight, rms
+from tests.missions.flown_plans import flown, planned
 
 CONFIG = parse_config(
     {
@@ -34,8 +29,7 @@ CONFIG = parse_config(
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    plan = plan_survey(CONFIG, design_rig(CONFIG.camera, CONFIG.water)).plan
-    return simulate_plan(plan, flight_settings(CONFIG), level_floor(6.0), np.random.default_rng(1))
+    return flown(planned(CONFIG), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +78,7 @@ def test_the_current_is_that_of_the_sea(flight: Flight) -> None:
     np.testing.assert_allclose(true_current(flight.flown), expected, atol=1e-12)
 
 
-def test_a_curve_has_so_many_points_at_most() -> None:
+def test_a_curve_has_a_limited_number_of_points() -> None:
     for count in (1, 20_000, 20_001, 123_456):
         kept = len(range(*thin(count).indices(count)))
         assert min(count, 10_000) <= kept <= 20_000
@@ -138,17 +132,3 @@ def test_a_flight_without_lines_is_drawn_too(
     figure = drawn(draw, lost, monkeypatch)
     assert len(figure.axes) > 5
     assert line_spans(lost) == []
-
-
-def test_a_picture_has_ink_and_the_same_bytes_each_time(
-    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(flight_plots, "_DRAWN", 500)
-    for name in ("one.png", "two.png"):
-        draw_flight(tmp_path / name, flight)
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    with Image.open(tmp_path / "one.png") as picture:
-        pixels = np.asarray(picture.convert("L"))
-        assert "Software" not in picture.info
-    assert min(pixels.shape) > 800
-    assert 0.03 < (pixels < 230).mean() < 0.9

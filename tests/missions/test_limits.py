@@ -2,18 +2,15 @@
 
 import math
 
-import numpy as np
 import pytest
 
 from alice_survey.base.config import SurveyConfig, parse_config
-from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
 from missions.exports.format import Export
 from missions.exports.options import options_of
-from missions.fly.simulation import flight_settings, simulate_plan
-from missions.plan.planner import plan_survey
 from missions.values.costs import SETTLE_S
 from missions.values.plan_file import Plan
+from tests.missions.flown_plans import flown, planned
 
 
 def _survey(limit_deg_s: float) -> SurveyConfig:
@@ -27,10 +24,6 @@ def _survey(limit_deg_s: float) -> SurveyConfig:
     )
 
 
-def _planned(config: SurveyConfig) -> Plan:
-    return plan_survey(config, design_rig(config.camera, config.water)).plan
-
-
 def _turned_rad(plan: Plan) -> float:
     """By all turns on the spot."""
     legs = [leg for dive in plan.dives for leg in dive.route.legs]
@@ -39,11 +32,9 @@ def _turned_rad(plan: Plan) -> float:
 
 def test_a_slow_turn_is_planned_as_it_is_flown() -> None:
     config = _survey(5.0)
-    plan = _planned(config)
+    plan = planned(config)
     assert _turned_rad(plan) / math.radians(5.0) > 0.2 * plan.duration_s
-    flight = simulate_plan(
-        plan, flight_settings(config), level_floor(6.0), np.random.default_rng(1), label=""
-    )
+    flight = flown(plan, config)
     assert flight.ending == "complete"
     assert 0.9 < plan.duration_s / flight.flown.time_s[-1] < 1.1
 
@@ -51,7 +42,7 @@ def test_a_slow_turn_is_planned_as_it_is_flown() -> None:
 @pytest.mark.parametrize("limit_deg_s", [5.0, 15.0, 40.0])
 def test_way_points_wait_for_turns_at_the_rate_that_is_flown(limit_deg_s: float) -> None:
     config = _survey(limit_deg_s)
-    rig, plan = design_rig(config.camera, config.water), _planned(config)
+    rig, plan = design_rig(config.camera, config.water), planned(config)
     options = options_of(config.camera, config.plan)
     rate = options.turn_rate_rad_s
     assert rate == pytest.approx(math.radians(min(limit_deg_s, 15.0)))
@@ -79,7 +70,7 @@ def test_no_go_zones_are_compared_with_the_vehicles_own_hull(
             "vehicle": {"name": name, "controller": "los"},
         }  # fmt: skip
         capsys.readouterr()
-        _planned(parse_config(values, "test"))
+        planned(parse_config(values, "test"))
         return "no_go_clearance_m" in capsys.readouterr().err
 
     assert warned(reach_m - 0.01)

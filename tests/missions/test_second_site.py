@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from alice_survey.base.config import SurveyConfig, load_config
-from camera_calib.rig import design_rig
-from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
-from missions.plan.planner import plan_survey
+from missions.fly.simulation import floor_grid
 from missions.values.plan_file import Plan
-from tests.missions.flown_plans import terrain_of
+from tests.missions.flown_plans import flown, planned, terrain_of
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +19,7 @@ def config() -> SurveyConfig:
 
 @pytest.fixture(scope="module")
 def plan(config: SurveyConfig) -> Plan:
-    return plan_survey(config, design_rig(config.camera, config.water)).plan
+    return planned(config)
 
 
 def test_it_is_the_site_of_the_paper(plan: Plan) -> None:
@@ -41,9 +39,7 @@ def test_it_is_flown_over_its_rocks(config: SurveyConfig, plan: Plan) -> None:
     # Large rocks: they stick out of the sand by decimetres.
     assert 0.3 < -terrain.depths.min() < 1.0
     assert 0.05 < (terrain.material > 0.5).mean() < 0.3
-    flight = simulate_plan(
-        plan, flight_settings(config), floor_grid(terrain), np.random.default_rng(1)
-    )
+    flight = flown(plan, config, floor_grid(terrain))
     assert flight.ending == "complete"
     assert len(flight.trigger_s) == plan.stations
     assert flight.stations_off_line == 0

@@ -15,15 +15,15 @@ from alice_survey.base.config import (
     parse_config,
 )
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle.floor import FloorGrid, level_floor
+from alice_survey.vehicle.floor import FloorGrid
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.sea import current_at
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
-from missions.fly.simulation import current_of, flight_settings, simulate_plan
-from missions.plan.planner import plan_survey
-from missions.values.flight import Flight
+from missions.fly.simulation import current_of
+from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
+from tests.missions.flown_plans import flown, planned
 
 RIG = design_rig(CameraConfig(), WaterConfig())
 
@@ -43,22 +43,16 @@ def survey(**changes: object) -> SurveyConfig:
 def plan_of(heading_deg: float = 20.0) -> Plan:
     config = survey()
     area = config.area.model_copy(update={"heading_deg": heading_deg})
-    config = config.model_copy(update={"area": area})
-    return plan_survey(config, design_rig(config.camera, config.water)).plan
+    return planned(config.model_copy(update={"area": area}))
 
 
 def fly(config: SurveyConfig, floor: FloorGrid | None = None, seed: int = 1) -> Flight:
-    rng = np.random.default_rng(seed)
-    return simulate_plan(plan_of(), flight_settings(config), floor or level_floor(6.0), rng)
+    return flown(plan_of(), config, floor, seed)
 
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     return fly(survey())
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def metres_into_line(flight: Flight) -> np.ndarray:
@@ -172,10 +166,10 @@ def test_navigation_is_consistent_in_the_closed_loop() -> None:
     runs, axes = 50, ("north", "east", "depth")
     squares = []
     for seed in range(runs):
-        flown = fly(survey(), seed=seed)
-        rows = np.flatnonzero(flown.line >= 0)[::20]
-        off = flown.log.position_ned[rows] - flown.truth.ned_from_body.translation[rows]
-        columns = dict(zip(LOG_COLUMNS, flown.flown.navigation[rows].T, strict=True))
+        flight = fly(survey(), seed=seed)
+        rows = np.flatnonzero(flight.line >= 0)[::20]
+        off = flight.log.position_ned[rows] - flight.truth.ned_from_body.translation[rows]
+        columns = dict(zip(LOG_COLUMNS, flight.flown.navigation[rows].T, strict=True))
         sigma = np.stack([columns[f"sigma_{axis}_m"] for axis in axes], axis=1)
         squares.append(((off / sigma) ** 2).sum(axis=1))
     epochs = min(len(square) for square in squares)
@@ -186,7 +180,7 @@ def test_navigation_is_consistent_in_the_closed_loop() -> None:
 
 
 def test_without_the_vertical_thruster_she_cannot_dive_and_says_so() -> None:
-    with pytest.raises(VehicleError, match="cannot control heave"):
+    with pytest.raises(VehicleError, match="heave"):
         fly(survey(vehicle={"thruster_health": {"vertical": 0.0}}))
 
 

@@ -14,7 +14,7 @@ from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
 
-def write_lines(path: Path, export: Export, _dive: int = 0) -> None:
+def write_lines(path: Path, export: Export, _dive: int) -> None:
     """The lines with their ends in latitude and longitude and in local metres."""
     plan = export.plan
     header = (
@@ -42,7 +42,7 @@ def write_lines(path: Path, export: Export, _dive: int = 0) -> None:
     write_csv(path, header, rows)
 
 
-def write_stations(path: Path, export: Export, _dive: int = 0) -> None:
+def write_stations(path: Path, export: Export, _dive: int) -> None:
     """Every place where all cameras take a picture, in the order of flight."""
     header = (
         "station", "dive", "line", "kind", "latitude_deg", "longitude_deg", "north_m", "east_m",
@@ -51,7 +51,7 @@ def write_stations(path: Path, export: Export, _dive: int = 0) -> None:
     write_csv(path, header, _stations(export.plan))
 
 
-def write_waypoints(path: Path, export: Export, _dive: int = 0) -> None:
+def write_waypoints(path: Path, export: Export, _dive: int) -> None:
     """One row for each way-point: of the glass, and of the vehicle that brings it there."""
     header = (
         "number", "dive", "latitude_deg", "longitude_deg", "depth_m", "altitude_m", "speed_mps",

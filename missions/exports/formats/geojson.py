@@ -25,7 +25,7 @@ from missions.exports.geometry import (
 from missions.values.plan_file import Plan
 
 
-def write_geojson(path: Path, export: Export, _dive: int = 0) -> None:
+def write_geojson(path: Path, export: Export, _dive: int) -> None:
     """Write what a plan holds, of the left port's glass; footprints are of the first camera."""
     plan, rig = export.plan, export.rig
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:

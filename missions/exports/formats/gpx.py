@@ -12,7 +12,7 @@ from missions.exports.xml_text import child, degrees, metres, write_xml
 _GPX = "http://www.topografix.com/GPX/1/1"
 
 
-def write_gpx(path: Path, export: Export, _dive: int = 0) -> None:
+def write_gpx(path: Path, export: Export, _dive: int) -> None:
     """Write way-points of the left port's glass; elevations are negative depths."""
     plan = export.plan
     root = Element("gpx", {"xmlns": _GPX, "version": "1.1", "creator": "alice-survey"})

@@ -27,7 +27,7 @@ _STYLES = {
 }
 
 
-def write_kml(path: Path, export: Export, _dive: int = 0) -> None:
+def write_kml(path: Path, export: Export, _dive: int) -> None:
     """Write areas, lines and routes of the left port's glass; heights are negative depths."""
     plan = export.plan
     root = Element("kml", xmlns=_KML)

@@ -1,6 +1,6 @@
 """QGroundControl plans with a survey item, which holds the very items of the mission.
 
-QGroundControl shows it as a survey, and lays lines of its own only when a person changes it.
+QGroundControl shows it as a survey, and lays other lines only when a person changes it.
 """
 
 import math

@@ -14,7 +14,7 @@ from missions.exports.write import write_exports
 from missions.values.costs import SETTLE_S
 from missions.values.footprint import common_swath
 from missions.values.legs import Route
-from missions.values.plan_file import Dive, Plan
+from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan, straight
 from tests.missions.exports.readers import (
     Step,
@@ -190,9 +190,7 @@ def test_lines_that_follow_a_bathymetry_bend_where_the_floor_does() -> None:
 def test_dives_of_one_line_without_a_run_in() -> None:
     only = line((0.0, 0.0), (3.0, 0.0))
     route = Route(legs=(straight((0.0, 0.0), (3.0, 0.0), 0),))
-    plan = plan_of([only], [(0, 0)], routes=[route])
-    assert isinstance(plan.dives[0], Dive)
-    steps = steps_of(plan, RIG)
+    steps = steps_of(plan_of([only], [(0, 0)], routes=[route]), RIG)
     assert [step.kind for step in steps] == ["goto", "section", "goto"]
     assert steps[0].actions == ["camera_trigger/enable"]
     assert steps[1].actions == ["camera_trigger/disable"]

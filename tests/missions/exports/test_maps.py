@@ -106,34 +106,6 @@ def test_gpx_in_gpxpy(plan: Plan) -> None:
         assert route.points[-1].elevation == 0.0
 
 
-@pytest.mark.parametrize(
-    ("file", "layer", "count"),
-    [
-        ("plan.kml", "Lines", 6),
-        ("plan.kml", "Routes", 2),
-        ("plan.gpx", "routes", 2),
-        ("plan.gpx", "waypoints", 13),
-    ],
-)
-def test_gdal_reads_the_layers_of_kml_and_gpx(
-    tmp_path: Path, file: str, layer: str, count: int
-) -> None:
-    plan = small_plan()
-    write_exports(tmp_path, plan, RIG, formats=["kml", "gpx"])
-    about, _, shapes, _ = pyogrio.raw.read(tmp_path / file, layer=layer)
-    assert about["crs"] == "EPSG:4326"
-    assert len(shapes) == count
-    ends = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
-    read = ne(plan, shapely.get_coordinates(shapely.from_wkb(shapes)))
-    if layer == "Lines":
-        np.testing.assert_allclose(read, ends, atol=MM)
-    elif layer == "waypoints":
-        np.testing.assert_allclose(read[1:], ends, atol=MM)
-    else:
-        distances = np.linalg.norm(read[:, None] - ends[None], axis=2).min(axis=0)
-        assert distances.max() < MM
-
-
 @WIDE
 @given(plan=plans())
 def test_geojson_in_gdal(plan: Plan) -> None:
