@@ -14,11 +14,39 @@ _LEAST_SHARE = 0.25
 """Share of the fullest block's count that a block must hold to count."""
 _LEAST_BLOCKS = 12
 _PAIRS = 4000
+WITHIN_PX = (1, 2, 3, 5)
+"""Ground pixels within which completeness is reported."""
 
 
 def rms(values: Array) -> float:
     """Root mean square; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
+
+
+def median(values: Array) -> float:
+    """Median; NaN of nothing."""
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def percentile(values: Array, percent: float) -> float:
+    """What this share of the values is below; NaN of nothing."""
+    return float(np.percentile(values, percent)) if len(values) else math.nan
+
+
+def spread(name: str, values_mm: Array) -> dict[str, float | None]:
+    """Root mean square, median and 95th percentile of errors, by name."""
+    return {
+        f"{name}_rms_mm": rounded(rms(values_mm), 3),
+        f"{name}_median_mm": rounded(median(values_mm), 3),
+        f"{name}_95_mm": rounded(percentile(values_mm, 95), 3),
+    }
+
+
+def shares_within(distances_m: Array, pixel_m: float, total: float) -> dict[str, float]:
+    """Shares of a total that lie within some ground pixels, by their number."""
+    return {
+        str(px): round(float((distances_m < px * pixel_m).sum() / total), 4) for px in WITHIN_PX
+    }
 
 
 def rounded(value: float, digits: int) -> float | None:

@@ -5,7 +5,6 @@ surface is moved by the same alignment and compared with the terrain's mesh, cel
 included; the mosaic is compared with the true sea floor painted at the same places.
 """
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,9 +28,8 @@ from reconstruct.evaluate.mesh import read_mesh, score_mesh
 from reconstruct.evaluate.mosaic import score_mosaic
 from reconstruct.evaluate.overlap import overlaps_reached
 from reconstruct.evaluate.plots import plot_errors, plot_sheet, plot_track
-from reconstruct.evaluate.stations import count_stations, ground_pixel_m
 from reconstruct.evaluate.surface import score_surface
-from reconstruct.evaluate.truth import read_true_poses
+from reconstruct.evaluate.truth import count_stations, ground_pixel_m, read_true_poses
 from reconstruct.placing.track import read_track_poses
 
 _SEED_STREAM = 6100
@@ -73,7 +71,8 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, fold
     }
     if read_stage(mesh) is not None:
         score["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
-    score["overlaps"] = _rounded(overlaps_reached(workspace, truth))
+    overlaps = overlaps_reached(workspace, truth)
+    score["overlaps"] = {name: round(value, 4) for name, value in overlaps.items()}
     ScoreRecord.save(folder / "score.json", score)
     write_cameras(folder / "cameras.csv", cameras)
     _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
@@ -103,7 +102,3 @@ def write_cameras(path: Path, cameras: CameraScore) -> None:
             )
         ),
     )
-
-
-def _rounded(values: Mapping[str, float]) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in values.items()}

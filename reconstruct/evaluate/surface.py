@@ -18,16 +18,18 @@ from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import (
     compare_volumes,
     fit_doming,
+    median,
+    percentile,
     rms,
     rounded,
+    shares_within,
+    spread,
 )
 from reconstruct.evaluate.truth import surface_depth, surface_distance
 from reconstruct.raster import opened_raster
 
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
-WITHIN_PX = (1, 2, 3, 5)
-"""Ground pixels within which completeness is reported."""
 LEAST_STATIONS = 3
 """Cells seen from this many stations are also scored separately."""
 
@@ -77,11 +79,11 @@ class SurfaceScore:
             "cells": self.cells,
             "completeness": round(self.completeness, 4),
             "accurate_share": round(float((self.distance_m < GOOD_M).sum() / self.cells), 4),
-            **_spread("distance", distance),
-            "distance_max_mm": rounded(_percentile(distance, 100), 3),
+            **spread("distance", distance),
+            "distance_max_mm": rounded(percentile(distance, 100), 3),
             "height_rms_mm": rounded(rms(height), 3),
-            "height_median_mm": rounded(_median(height), 3),
-            "height_95_mm": rounded(_percentile(np.abs(height), 95), 3),
+            "height_median_mm": rounded(median(height), 3),
+            "height_95_mm": rounded(percentile(np.abs(height), 95), 3),
             "doming": fit_doming(self.places_ne, self.height_m).to_json(),
             "volume": compare_volumes(
                 self.true_height_m + self.height_m, self.true_height_m, self.cell_m**2
@@ -89,45 +91,28 @@ class SurfaceScore:
         }
         if ground_pixel_m is not None:
             figures["ground_pixel_mm"] = round(1e3 * ground_pixel_m, 4)
-            figures["completeness_within_px"] = {
-                str(px): round(float((self.distance_m < px * ground_pixel_m).sum() / self.cells), 4)
-                for px in WITHIN_PX
-            }
+            figures["completeness_within_px"] = shares_within(
+                self.distance_m, ground_pixel_m, self.cells
+            )
         if self.stations is not None:
             well = self.stations >= LEAST_STATIONS
             figures[f"seen_from_{LEAST_STATIONS}_stations"] = {
                 "cells": self.cells_seen_well,
                 "share": round(self.cells_seen_well / self.cells, 4),
                 "completeness": rounded(float(well.sum()) / max(self.cells_seen_well, 1), 4),
-                **_spread("distance", distance[well]),
+                **spread("distance", distance[well]),
             }
         if self.sigma_m is not None:
             stated = self.sigma_m > 0
             ratio = self.height_m[stated] / self.sigma_m[stated]
             figures["error_over_sigma"] = {
                 "rms": rounded(rms(ratio), 3),
-                "robust": rounded(MAD_TO_SIGMA * _median(np.abs(ratio)), 3),
+                "robust": rounded(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
                 "within_1_sigma": rounded(float(np.mean(np.abs(ratio) < 1)), 4),
                 "within_2_sigma": rounded(float(np.mean(np.abs(ratio) < 2)), 4),
-                "median_sigma_mm": rounded(1e3 * _median(self.sigma_m[stated]), 3),
+                "median_sigma_mm": rounded(1e3 * median(self.sigma_m[stated]), 3),
             }
         return figures
-
-
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
-
-
-def _percentile(values: Array, percent: float) -> float:
-    return float(np.percentile(values, percent)) if len(values) else float("nan")
-
-
-def _spread(name: str, values_mm: Array) -> dict[str, Any]:
-    return {
-        f"{name}_rms_mm": rounded(rms(values_mm), 3),
-        f"{name}_median_mm": rounded(_median(values_mm), 3),
-        f"{name}_95_mm": rounded(_percentile(values_mm, 95), 3),
-    }
 
 
 @progress.step("score the surface")

@@ -1,6 +1,7 @@
 """A picture of a textured mesh seen at a slant, by casting a ray for every pixel."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.mesh.texture import Textured
+from reconstruct.mesh.texture import Textured, remapped
 from reconstruct.mesh.topology import face_normals
 from reconstruct.mesh.visibility import ray_scene
 
@@ -90,7 +91,7 @@ def _camera(
 
 def _shade(
     mesh: Textured,
-    scene: object,
+    scene: Any,
     normals: Array,
     pages: list[NDArray[np.uint8]],
     eye: Array,
@@ -99,7 +100,7 @@ def _shade(
     import open3d as o3d
 
     packed = np.concatenate([np.broadcast_to(eye, rays.shape), rays], axis=1).astype(np.float32)
-    hit = scene.cast_rays(o3d.core.Tensor(packed))  # type: ignore[attr-defined]
+    hit = scene.cast_rays(o3d.core.Tensor(packed))
     seen = np.flatnonzero(np.isfinite(hit["t_hit"].numpy()))
     face = hit["primitive_ids"].numpy()[seen].astype(np.int64)
     share = hit["primitive_uvs"].numpy()[seen].astype(np.float64)
@@ -111,19 +112,7 @@ def _shade(
     for number, page in enumerate(pages):
         mine = mesh.page[face] == number
         height, width = page.shape[:2]
-        x = (uv[mine, 0] * width - 0.5).astype(np.float32)
-        y = ((1 - uv[mine, 1]) * height - 0.5).astype(np.float32)
-        if not len(x):
-            continue
-        # remap takes at most 32767 rows
-        grid = -(-len(x) // 16384)
-        pad = grid * 16384 - len(x)
-        found = cv2.remap(
-            page,
-            np.pad(x, (0, pad)).reshape(grid, -1),
-            np.pad(y, (0, pad)).reshape(grid, -1),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        ).reshape(-1, 3)[: len(x)]
+        at = np.column_stack([uv[mine, 0] * width, (1 - uv[mine, 1]) * height])
+        found = remapped(page, at, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
         colour[seen[mine]] = np.clip(found * lit[mine][:, None], 0, 255)
     return colour

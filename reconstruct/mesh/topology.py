@@ -34,7 +34,7 @@ def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
 
 
 def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
-    """Triangles less those without area and those at edges that more than two share."""
+    """Triangles without those that have no area and those at edges that more than two share."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     longest = np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c))
@@ -80,6 +80,11 @@ def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles,
     place[order] = np.arange(total, dtype=np.int32)
     split: Triangles = np.asarray(place[fan], np.int32).reshape(-1, 3)
     return vertices[source[order]], split, source[order]
+
+
+def clean(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:
+    """Without folds, and with fans split; returns as `split_fans`."""
+    return split_fans(vertices, without_folds(vertices, triangles))
 
 
 def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.int32], Array]:

@@ -21,8 +21,8 @@ from reconstruct.evaluate.cloud_registration import (
     distances,
     register_cloud,
 )
+from reconstruct.evaluate.plots import mean_map
 from reconstruct.evaluate.reference import lifted
-from reconstruct.evaluate.reference_plot import mean_map
 from reconstruct.placing.alignment import Similarity
 
 DATUM = Datum(46.8426, -91.9946)
