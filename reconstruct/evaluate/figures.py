@@ -49,6 +49,19 @@ def shares_within(distances_m: Array, pixel_m: float, total: float) -> dict[str,
     }
 
 
+def mean_grid(places_en: Array, values: Array, side: float) -> tuple[Array, float, float]:
+    """Means of values at (N, 2) places on a grid of cells, rows from north; its west and north."""
+    west, north = places_en[:, 0].min(), places_en[:, 1].max()
+    column = ((places_en[:, 0] - west) / side).astype(np.int64)
+    row = ((north - places_en[:, 1]) / side).astype(np.int64)
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    place = row * shape[1] + column
+    count = np.bincount(place, minlength=shape[0] * shape[1])
+    total = np.bincount(place, values, minlength=shape[0] * shape[1])
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean.reshape(shape), float(west), float(north)
+
+
 def rounded(value: float, digits: int) -> float | None:
     """A number for JSON, which has no NaN: None instead."""
     return round(float(value), digits) if math.isfinite(value) else None

@@ -22,6 +22,7 @@ from reconstruct.evaluate.cameras import CameraScore
 from reconstruct.evaluate.change import SIGNIFICANT, Change
 from reconstruct.evaluate.cloud_registration import CloudDistances
 from reconstruct.evaluate.elevation import Elevation
+from reconstruct.evaluate.figures import mean_grid
 from reconstruct.evaluate.surface import SurfaceScore
 from reconstruct.raster import hillshade
 
@@ -181,17 +182,10 @@ def mean_map(
     places_en: Array, values: Array, cells: int
 ) -> tuple[Array, tuple[float, float, float, float]]:
     """Means of values at (N, 2) places on a grid, rows from north; and its extent for a plot."""
-    low, high = places_en.min(axis=0), places_en.max(axis=0)
-    side = max(float((high - low).max()) / cells, 1e-12)
-    column = ((places_en[:, 0] - low[0]) / side).astype(np.int64)
-    row = ((high[1] - places_en[:, 1]) / side).astype(np.int64)
-    shape = (int(row.max()) + 1, int(column.max()) + 1)
-    place = row * shape[1] + column
-    count = np.bincount(place, minlength=shape[0] * shape[1])
-    total = np.bincount(place, values, minlength=shape[0] * shape[1])
-    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
-    west, north = float(low[0]), float(high[1])
-    return mean, (west, west + shape[1] * side, north - shape[0] * side, north)
+    side = max(float(np.ptp(places_en, axis=0).max()) / cells, 1e-12)
+    mean, west, north = mean_grid(places_en, values, side)
+    rows, columns = mean.shape
+    return mean, (west, west + columns * side, north - rows * side, north)
 
 
 @figure_style()

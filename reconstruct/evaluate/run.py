@@ -23,6 +23,7 @@ from alice_survey.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
 from missions.values.plan_file import read_plan
 from reconstruct.evaluate.cameras import CameraScore, score_cameras
+from reconstruct.evaluate.elevation import elevation_in
 from reconstruct.evaluate.figures import compare_lengths
 from reconstruct.evaluate.mesh import read_mesh, score_mesh
 from reconstruct.evaluate.mosaic import score_mosaic
@@ -56,16 +57,14 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, fold
         poses=poses,
         terrain=terrain,
     )
-    surface = score_surface(
-        dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
-    )
+    surface = score_surface(elevation_in(dense), area, terrain, moved, pixel_m, counter)
     painted = score_mosaic(
         mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config.seed), moved
     )
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
     score: dict[str, Any] = {
         "cameras": cameras.to_json(),
-        "surface": surface.to_json(pixel_m),
+        "surface": surface.to_json(),
         "mosaic": painted.to_json(),
         "lengths": compare_lengths(painted.points_world, painted.points_true, rng),
     }

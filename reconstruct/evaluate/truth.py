@@ -20,6 +20,8 @@ from camera_calib.rig import Rig
 
 _ABOVE_M = 8.0
 """Rays start this far above the mean sea floor: far enough, and near enough for float32."""
+_MOST_RAYS = 500_000
+"""Rays that are cast at once."""
 _CLEAR_M = 0.004
 """Height above the surface at which a ray to the camera starts, so as not to hit its own facet."""
 
@@ -154,10 +156,12 @@ def count_stations(
             length = np.linalg.norm(ray, axis=1)
             start = points_ned[near] - terrain.offset_ned
             rays = np.column_stack([start, ray / length[:, None]]).astype(np.float32)
+            rays[:, :3] += np.float32(_CLEAR_M) * rays[:, 3:]
             hidden = np.zeros(len(near), dtype=np.bool_)
-            for reach in _slices(len(near)):
-                hits = scene.cast_rays(o3d.core.Tensor(_raised(rays[reach])))["t_hit"].numpy()
-                hidden[reach] = hits < length[reach] - 2 * _CLEAR_M
+            for first in range(0, len(near), _MOST_RAYS):
+                part = slice(first, first + _MOST_RAYS)
+                hits = scene.cast_rays(o3d.core.Tensor(rays[part]))["t_hit"].numpy()
+                hidden[part] = hits < length[part] - 2 * _CLEAR_M
             seen[near[~hidden]] = True
         count += seen
     return count
@@ -177,13 +181,3 @@ def _near(points_ned: Array, camera: FlatPortCamera, pose: RigidTransform) -> ND
         away = np.linalg.norm(offset, axis=1)
         near: NDArray[np.bool_] = (along > 0) & (away < along * np.hypot(1.0, slope))
     return near
-
-
-def _raised(rays: NDArray[np.float32]) -> NDArray[np.float32]:
-    raised = rays.copy()
-    raised[:, :3] += np.float32(_CLEAR_M) * rays[:, 3:]
-    return raised
-
-
-def _slices(count: int, size: int = 500_000) -> list[slice]:
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]

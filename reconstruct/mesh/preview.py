@@ -17,27 +17,20 @@ _WIDTH_PX = 1600
 _SAMPLES = 2
 """Rays a pixel along either axis."""
 _ELEVATION_DEG, _AZIMUTH_DEG = 40.0, 200.0
+"""Of the eye over the horizon, and where it stands, from north over east."""
 _FOV_DEG = 30.0
 _ROWS = 128
 _BACK = 255.0
 
 
 @progress.step("draw the mesh")
-def render_oblique(
-    mesh: Textured, *, elevation_deg: float = _ELEVATION_DEG, azimuth_deg: float = _AZIMUTH_DEG
-) -> NDArray[np.uint8]:
-    """Draw a mesh, (H, W, 3) BGR on white.
-
-    Args:
-        mesh: with pages that exist.
-        elevation_deg: of the eye over the horizon.
-        azimuth_deg: where the eye stands, from north over east.
-    """
+def render_oblique(mesh: Textured) -> NDArray[np.uint8]:
+    """Draw a mesh whose pages exist, (H, W, 3) BGR on white."""
     corners = mesh.wedges.vertex[mesh.wedges.triangles]
     scene = ray_scene(mesh.vertices, corners.astype(np.int32))
     normals = face_normals(mesh.vertices, corners.astype(np.int32))
     pages = [_read(page) for page in mesh.pages]
-    eye, right, down, forward, slope, shape = _camera(mesh.vertices, elevation_deg, azimuth_deg)
+    eye, right, down, forward, slope, shape = _camera(mesh.vertices)
     rows, columns = shape[0] * _SAMPLES, shape[1] * _SAMPLES
     picture = np.empty((shape[0], shape[1], 3), np.float32)
     x = ((np.arange(columns) + 0.5) / columns * 2 - 1) * slope
@@ -59,11 +52,9 @@ def _read(page: Path) -> NDArray[np.uint8]:
     return np.asarray(picture, np.uint8)
 
 
-def _camera(
-    vertices: Array, elevation_deg: float, azimuth_deg: float
-) -> tuple[Array, Array, Array, Array, float, tuple[int, int]]:
+def _camera(vertices: Array) -> tuple[Array, Array, Array, Array, float, tuple[int, int]]:
     """Eye, axes, half the width's slope, and rows and columns that hold the whole mesh."""
-    elevation, azimuth = np.deg2rad([elevation_deg, azimuth_deg])
+    elevation, azimuth = np.deg2rad([_ELEVATION_DEG, _AZIMUTH_DEG])
     back = np.array(
         [
             np.sin(azimuth) * np.cos(elevation),
@@ -81,9 +72,8 @@ def _camera(
     local = (sample - middle) @ np.stack([right, down, forward], axis=1)
     distance = float((np.abs(local[:, 0]) / slope - local[:, 2]).max()) * 1.03
     seen = local[:, 1] / (local[:, 2] + distance)
-    half = slope * 1.0
     middle_slope = 0.5 * (seen.min() + seen.max())
-    height = (seen.max() - seen.min()) / (2 * half) * 1.04
+    height = (seen.max() - seen.min()) / (2 * slope) * 1.04
     rows = int(np.clip(np.ceil(_WIDTH_PX * height / 64) * 64, 128, 2 * _WIDTH_PX))
     eye = middle - distance * forward
     return eye, right, down, forward + middle_slope * down, slope, (rows, _WIDTH_PX)

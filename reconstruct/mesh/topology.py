@@ -24,6 +24,14 @@ def edges_of(triangles: Triangles) -> tuple[NDArray[np.int64], NDArray[np.int64]
     return np.stack([key // base, key % base], axis=1), edge.reshape(-1)
 
 
+def twin_sides(edge: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Both sides of each edge that has exactly two, by the edge of every side."""
+    order = np.argsort(edge, kind="stable")
+    count = np.bincount(edge)
+    first = (np.cumsum(count) - count)[count == 2]
+    return order[first], order[first + 1]
+
+
 def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
     """Quadrilaterals cut along their shorter diagonal."""
     corners = vertices[quads]
@@ -55,15 +63,7 @@ def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles,
     Returns:
         Vertices, triangles, and of which vertex each is a copy.
     """
-    edges, edge = edges_of(triangles)
-    order = np.argsort(edge, kind="stable")
-    first = order[np.searchsorted(edge[order], np.arange(len(edges)))]
-    count = np.bincount(edge, minlength=len(edges))
-    twin = np.where(count == 2, order[np.minimum(
-        np.searchsorted(edge[order], np.arange(len(edges))) + 1, max(len(order) - 1, 0)
-    )], -1)  # fmt: skip
-    shared = twin >= 0
-    one, other = first[shared], twin[shared]
+    one, other = twin_sides(edges_of(triangles)[1])
     corner = np.arange(triangles.size)
     end = corner // 3 * 3 + (corner + 1) % 3
     flat = triangles.reshape(-1)

@@ -52,8 +52,6 @@ class PreciseDepth:
     """(N,) before the left pinhole's centre."""
     sigma: Array
     """(N,) sigma from the noise of the pictures alone."""
-    sigma_px: Array
-    """(N,) the same sigma in pixels of disparity."""
     missed_sigmas: Array
     """(N,) how far the patches miss each other across the epipolar line; see `inflation`."""
 
@@ -139,7 +137,6 @@ def precise_depth(
     return PreciseDepth(
         depth=depth,
         sigma=sigma_px * np.abs(per_px) * depth * depth,
-        sigma_px=sigma_px,
         missed_sigmas=np.where(good & (bend > 0), missed, np.nan),
     )
 

@@ -90,10 +90,9 @@ def test_depth_map_of_a_plane_comes_back():
     right = transfer(pair.rect_from_partner, other.project(world))
     disparity = (grid.reshape(-1, 2)[:, 0] - right[:, 0]).reshape(grid.shape[:2])
 
-    depth, across = depth_in_reference(one, other, pair, disparity.astype(np.float32))
+    depth = depth_in_reference(one, other, pair, disparity.astype(np.float32))
 
     inside = np.isfinite(depth)
-    assert across < 1e-4
     assert inside.mean() > 0.3
     x, y = np.moveaxis(transfer(pair.rect_from_reference, _pixels(one)), 1, 0)
     size = [pair.width_px, pair.height_px]
@@ -160,16 +159,13 @@ def test_depth_through_a_tilted_port_is_exact(base_m: float):
     seen, _ = spots(one, transfer(np.linalg.inv(pair.rect_from_reference), grid))
     right = transfer(pair.rect_from_partner, other.project(seen))
     disparity = (grid - right)[:, 0].reshape(pair.height_px, pair.width_px).astype(np.float32)
-    rows_apart_px = np.sqrt(np.mean((grid - right)[:, 1] ** 2))
 
-    depth, across_px = depth_in_reference(one, other, pair, disparity)
+    depth = depth_in_reference(one, other, pair, disparity)
     views = [replace(view, shift=None) for view in (one, other)]
-    central, none_px = depth_in_reference(*views, pair, disparity)
+    central = depth_in_reference(*views, pair, disparity)
 
     known = np.isfinite(depth)
     assert known.mean() > 0.3
     assert np.abs(depth.ravel() - true)[known.ravel()].max() < 1e-5
     without = np.sqrt(np.mean((central.ravel() - true)[known.ravel()] ** 2))
     assert 3e-4 < without < 0.05
-    assert across_px == pytest.approx(rows_apart_px, rel=0.2)
-    assert none_px < 1e-4
