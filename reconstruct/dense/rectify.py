@@ -65,17 +65,17 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
     base = partner.world_from_cam.translation - reference.world_from_cam.translation
     baseline = float(np.linalg.norm(base))
     x_axis = base / baseline
-    sights = [v.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for v in (reference, partner)]
-    sight = sights[0] + sights[1]
-    z_axis = sight - (sight @ x_axis) * x_axis
+    axes = [v.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for v in (reference, partner)]
+    mean = axes[0] + axes[1]
+    z_axis = mean - (mean @ x_axis) * x_axis
     if np.linalg.norm(z_axis) < _LEAST_COSINE:
         return None
     z_axis /= np.linalg.norm(z_axis)
-    if min(s @ z_axis for s in sights) < _LEAST_COSINE:
+    if min(s @ z_axis for s in axes) < _LEAST_COSINE:
         return None
     world_from_rect = Rotation.from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1))
     # a picture turned by t is stretched by cos(t)^-3 in area at its middle: undo it on average
-    stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in sights])) ** 0.5
+    stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in axes])) ** 0.5
     focal = (reference.fx_px + reference.fy_px) / 2.0 / stretch
     homographies, boxes, cosines = [], [], []
     for view in (reference, partner):

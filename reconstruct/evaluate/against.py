@@ -94,7 +94,7 @@ def evaluate_against(
         rows=now.height.shape[0], columns=now.height.shape[1],
     )  # fmt: skip
     for name, values, text in (
-        ("difference", change.difference, "height less before (m)"),
+        ("difference", change.difference, "height now minus before (m)"),
         ("significance", change.significance, "change over its sigma"),
     ):
         path = folder / f"{name}.tif"

@@ -86,7 +86,7 @@ def _write_errors(path: Path, dem: Path, errors: Array) -> None:
         profile = source.profile
     with rasterio.open(path, "w", **profile) as raster:
         raster.write(errors.astype(np.float32), 1)
-        raster.set_band_description(1, "height less true height (m)")
+        raster.set_band_description(1, "height minus true height (m)")
 
 
 def write_cameras(path: Path, cameras: CameraScore) -> None:

@@ -265,7 +265,7 @@ def _calibration(rig: Rig, pixels: Array, n_water_sigma: float) -> tuple[Array, 
         names = list(rig.cameras)[:2]
         water, _ = calibration_slopes(rig, pixels, {f"{n}.n_water": n_water_sigma for n in names})
         slopes = np.concatenate([slopes, water.sum(axis=0, keepdims=True)])
-        matrix = block_diag(matrix, n_water_sigma**2)
+        matrix = block_diag(matrix, [n_water_sigma**2])
     return slopes, matrix
 
 

@@ -238,7 +238,12 @@ def dense_pair(
     """
     wanted = min(scale or matching_scale(optics.views[0]), 1.0)
     views = [scaled_view(view, wanted) for view in optics.views]
-    names, opened = open_pair(optics, pictures)
+    names = [str(path.absolute()) for path in pictures]
+    opened = Pictures(
+        Path(),
+        dict(zip(optics.rig.names, optics.lenses, strict=True)),
+        dict(zip(names, optics.rig.names, strict=True)),
+    )
     colours, looks = [], []
     for name, view in zip(names, views, strict=True):
         colour, valid = shrunk(opened, name, (view.width_px, view.height_px))
@@ -248,9 +253,10 @@ def dense_pair(
     for a, b in ((0, 1), (1, 0)):
         found = pair_depth((views[a], views[b]), (looks[a], looks[b]), points, MATCH_SIGMA_PX)
         if found is None:
+            angle = np.rad2deg(optics.rig.second_from_first.rotation.magnitude())
             raise ReconstructionError(
                 "the cameras of the rig share too little of their view for dense matching: their "
-                f"axes are {_angle_deg(optics):.0f} degrees apart"
+                f"axes are {angle:.0f} degrees apart"
             )
         maps.append(found)
     depth = _agreeing(views[0], views[1], maps)
@@ -267,17 +273,6 @@ def dense_pair(
         match_sigma_px=match_sigma,
         inflation=factor,
     )
-
-
-def open_pair(optics: PairOptics, pictures: tuple[Path, Path]) -> tuple[list[str], Pictures]:
-    """The pictures of a pair as their pinholes see them, and their names there."""
-    names = [str(path.absolute()) for path in pictures]
-    opened = Pictures(
-        Path(),
-        dict(zip(optics.rig.names, optics.lenses, strict=True)),
-        dict(zip(names, optics.rig.names, strict=True)),
-    )
-    return names, opened
 
 
 def pair_samplers(
@@ -331,10 +326,6 @@ def _agreeing(left: View, right: View, maps: list[tuple[Float32, Float32]]) -> F
 
 def _centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
     return np.column_stack([columns, rows]).astype(np.float64) + 0.5
-
-
-def _angle_deg(optics: PairOptics) -> float:
-    return float(np.rad2deg(optics.rig.second_from_first.rotation.magnitude()))
 
 
 def _write_depth(folder: Path, found: PairDepth) -> None:

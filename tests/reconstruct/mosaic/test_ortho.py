@@ -18,16 +18,16 @@ def test_visible_cells_equal_a_walk_along_the_sight_line(camera: tuple[float, fl
     height, cell, tolerance = hills(), 0.1, 0.15
     place = np.array(camera)
     visible = visible_cells(height, place, 0.0, 0.0, cell, tolerance, (0, 40, 0, 50))
-    clear = doubtful = 0
+    clear = unsure = 0
     for row in range(0, 40, 3):
         for column in range(0, 50, 3):
             rise = sees(height, place, cell, row, column)
             if abs(rise - tolerance) < 0.1:  # cells are steps: the two walks meet others of them
-                doubtful += 1
+                unsure += 1
                 continue
             clear += 1
             assert visible[row, column] == (rise < tolerance), (row, column, rise)
-    assert clear > 2 * doubtful
+    assert clear > 2 * unsure
     assert 0.2 < visible.mean() < 0.98
 
 
