@@ -1,5 +1,6 @@
 """A survey against an earlier one of the same site: where and by how much the sea floor changed."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.base.records import ChangeRecord
 from alice_survey.base.run import progress
-from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change, without
+from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
 from reconstruct.evaluate.height_registration import HeightFit, refine_heights, register_heights
 from reconstruct.evaluate.plots import plot_change
@@ -32,7 +33,7 @@ def compare_elevations(
     fit = register_heights(now, before, now_from_before)
     change = find_change(now, before, fit)
     if change.changed.any():
-        stable = without(now, change.changed)
+        stable = replace(now, height=np.where(change.changed, np.nan, now.height))
         try:
             fit = refine_heights(stable, before, fit.fixed_from_moving)
         except ReconstructionError:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""
@@ -14,6 +15,8 @@ _LEAST_SHARE = 0.25
 """Share of the fullest block's count that a block must hold to count."""
 _LEAST_BLOCKS = 12
 _PAIRS = 4000
+_TUKEY = 4.685
+"""Tukey's constant: 95 % efficient for normal errors."""
 WITHIN_PX = (1, 2, 3, 5)
 """Ground pixels within which completeness is reported."""
 
@@ -47,6 +50,13 @@ def shares_within(distances_m: Array, pixel_m: float, total: float) -> dict[str,
     return {
         str(px): round(float((distances_m < px * pixel_m).sum() / total), 4) for px in WITHIN_PX
     }
+
+
+def tukey_weights(misses: Array) -> tuple[Array, float]:
+    """(N,) weights that are 0 for what lies beyond Tukey's limit, and the robust scatter."""
+    scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(misses))), 1e-12)
+    weights: Array = np.clip(1 - (misses / (_TUKEY * scatter)) ** 2, 0, None) ** 2
+    return weights, scatter
 
 
 def mean_grid(places_en: Array, values: Array, side: float) -> tuple[Array, float, float]:

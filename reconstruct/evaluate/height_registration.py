@@ -16,10 +16,8 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.evaluate.figures import mean_grid
+from reconstruct.evaluate.figures import mean_grid, tukey_weights
 
-_TUKEY = 4.685
-"""Tukey's constant: 95 % efficient for normal errors."""
 _ROUNDS = 40
 _STILL = 1e-6
 """Share of a cell: motion of the block's rim at which the adjustment has settled."""
@@ -234,9 +232,7 @@ def _jacobian(offsets: Array, normals: Array) -> Array:
 def _tukey_weights(compared: _Compared) -> Array:
     """(N,) weights, 1 / m^2: none for what lies beyond Tukey's limit about the median."""
     scaled = (compared.miss - np.median(compared.miss)) / np.sqrt(compared.variance)
-    spread = max(MAD_TO_SIGMA * float(np.median(np.abs(scaled))), 1e-12)
-    weight: Array = np.clip(1 - (scaled / (_TUKEY * spread)) ** 2, 0, None) ** 2
-    return weight / compared.variance
+    return tukey_weights(scaled)[0] / compared.variance
 
 
 def _fit(points: Array, compared: _Compared, pose: RigidTransform, centre: Array) -> HeightFit:

@@ -17,7 +17,7 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from missions.values.plan_file import read_plan
+from missions.values.plan_file import Plan
 from reconstruct.evaluate.cameras import CameraScore
 from reconstruct.evaluate.change import SIGNIFICANT, Change
 from reconstruct.evaluate.cloud_registration import CloudDistances
@@ -35,9 +35,8 @@ _LABELLED = 8
 
 @progress.step("draw the track's errors")
 @figure_style()
-def plot_track(path: Path, plan_file: Path, cameras: CameraScore) -> None:
+def plot_track(path: Path, plan: Plan, cameras: CameraScore) -> None:
     """Planned lines, camera positions coloured by error, and the error of each picture."""
-    plan = read_plan(plan_file)
     places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
     south, west, north, east = plan.area.survey.bounds
     figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)

@@ -41,13 +41,14 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, fold
     folders = ("plan", "images", "sparse", "dense", "mosaic", "mesh")
     plan, images, sparse, dense, mosaic, mesh = (workspace / name for name in folders)
     truth = images / "truth"
-    area = read_plan(plan / "plan.json").area.survey
+    flown = read_plan(plan / "plan.json")
+    area = flown.area.survey
     terrain = read_terrain(truth / "terrain.ply")
     rig, poses = read_rig(truth / "rig.json"), read_true_poses(truth / "poses.csv")
     records = read_manifest(images / "manifest.csv")
     total = RegistrationRecord.read(sparse / "registration.json").total
     track = read_track_poses(sparse / "track.csv")
-    cameras = score_cameras(track, truth / "poses.csv", total)
+    cameras = score_cameras(track, poses, total)
     moved = cameras.truth_from_world
     pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
     counter = partial(
@@ -70,12 +71,13 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, fold
     }
     if read_stage(mesh) is not None:
         score["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
-    overlaps = overlaps_reached(workspace, truth)
+    triggers = workspace / "flight" / "triggers.csv"
+    overlaps = overlaps_reached(triggers, flown, rig, records, poses)
     score["overlaps"] = {name: round(value, 4) for name, value in overlaps.items()}
     ScoreRecord.save(folder / "score.json", score)
     write_cameras(folder / "cameras.csv", cameras)
     _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
-    plot_track(folder / "track.png", plan / "plan.json", cameras)
+    plot_track(folder / "track.png", flown, cameras)
     plot_errors(folder / "errors.png", surface, area)
     plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
 

@@ -31,24 +31,23 @@ def test_visible_cells_equal_a_walk_along_the_sight_line(camera: tuple[float, fl
     assert 0.2 < visible.mean() < 0.98
 
 
-def test_a_wall_hides_what_is_behind_it_and_not_itself():
+def seen_over_wall(height_m: float) -> np.ndarray:
+    """From 2 m over column 10 of level ground with a wall at column 30."""
     height = np.zeros((21, 60), np.float32)
-    height[:, 30] = 1.0
-    # camera 2 m up over column 10: its line over the wall reaches the ground 20 cells behind
-    visible = visible_cells(
-        height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60)
-    )
+    height[:, 30] = height_m
+    camera = np.array([1.05, -1.05, 2.0])
+    return visible_cells(height, camera, 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60))
+
+
+def test_a_wall_hides_what_is_behind_it_and_not_itself():
+    visible = seen_over_wall(1.0)  # the line over the wall reaches the ground 20 cells behind
     assert visible[10, :31].all()
     assert not visible[10, 31:49].any()
     assert visible[10, 52:].all()
 
 
 def test_unknown_cells_are_neither_seen_nor_in_the_way():
-    height = np.zeros((21, 60), np.float32)
-    height[:, 30] = np.nan
-    visible = visible_cells(
-        height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60)
-    )
+    visible = seen_over_wall(np.nan)
     assert not visible[:, 30].any()
     assert visible[:, 31:].all()
 
