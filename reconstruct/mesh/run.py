@@ -13,9 +13,8 @@ from alice_survey.base.frames import Array
 from alice_survey.base.records import CloudRecord, MeshRecord
 from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
-from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
+from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.labels import choose_views, make_charts
-from reconstruct.mesh.preview import render_oblique
 from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.topology import face_areas

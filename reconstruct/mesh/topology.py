@@ -105,31 +105,30 @@ def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.i
 
 def face_areas(vertices: Array, triangles: Triangles) -> Array:
     """(T,) areas in squared units of length."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    areas: Array = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas: Array = 0.5 * np.linalg.norm(_crosses(vertices, triangles), axis=1)
     return areas
 
 
 def face_normals(vertices: Array, triangles: Triangles) -> Array:
     """(T, 3) unit normals; 0 of a triangle without area."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    unit: Array = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    return unit
+    return _unit(_crosses(vertices, triangles))
 
 
 def vertex_normals(vertices: Array, triangles: Triangles) -> Array:
     """(V, 3) unit normals weighted by the area of the faces around."""
+    normal = np.repeat(_crosses(vertices, triangles), 3, axis=0)
+    around = [np.bincount(triangles.ravel(), normal[:, k], len(vertices)) for k in range(3)]
+    return _unit(np.stack(around, axis=1))
+
+
+def _crosses(vertices: Array, triangles: Triangles) -> Array:
+    """(T, 3) cross products of two sides: along the normals, twice the areas long."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    total = np.stack(
-        [
-            np.bincount(triangles.ravel(), np.repeat(normal[:, k], 3), len(vertices))
-            for k in range(3)
-        ],
-        axis=1,
-    )
-    unit: Array = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    return np.cross(b - a, c - a)
+
+
+def _unit(vectors: Array) -> Array:
+    unit: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
     return unit
 
 

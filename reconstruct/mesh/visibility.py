@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
-from reconstruct.mesh.topology import Triangles, face_normals
+from reconstruct.mesh.topology import Triangles, face_areas, face_normals
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 
@@ -155,8 +155,7 @@ def _quality(
     p = pixels[triangles[faces]]
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area_px = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = 0.5 * np.linalg.norm(np.cross(e, f), axis=1)
+    area = face_areas(vertices, triangles[faces])
     facing = (cosine > _LEAST_COSINE) & (area > 0)
     towards = middle[:, None] * (1 - _SHRINK) + corners * _SHRINK
     spots = np.concatenate([middle[:, None], towards], axis=1)
