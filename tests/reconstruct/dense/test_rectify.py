@@ -77,15 +77,7 @@ def test_depth_map_of_a_plane_comes_back():
     inverse = np.linalg.inv(pair.rect_from_reference)
     grid = np.stack(np.meshgrid(np.arange(pair.width_px), np.arange(pair.height_px)), -1) + 0.5
     pixels = transfer(inverse, grid.reshape(-1, 2).astype(float))
-    rays = one.world_from_cam.rotation.apply(
-        np.column_stack(
-            [
-                (pixels[:, 0] - one.cx_px) / one.fx_px,
-                (pixels[:, 1] - one.cy_px) / one.fy_px,
-                np.ones(len(pixels)),
-            ]
-        )
-    )
+    rays = one.at_depth(pixels, np.ones(len(pixels)))  # its centre is the origin
     world = rays * (2.0 / rays[:, 2:])
     right = transfer(pair.rect_from_partner, other.project(world))
     disparity = (grid.reshape(-1, 2)[:, 0] - right[:, 0]).reshape(grid.shape[:2])
@@ -98,10 +90,8 @@ def test_depth_map_of_a_plane_comes_back():
     size = [pair.width_px, pair.height_px]
     reached = ((x > 1) & (y > 1) & (x < size[0] - 1) & (y < size[1] - 1)).reshape(240, 320)
     assert inside[reached].all()
-    grid_x, grid_y = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
-    rays = np.stack([(grid_x - 163.0) / 400.0, (grid_y - 118.0) / 404.0, np.ones((240, 320))], -1)
-    down = one.world_from_cam.rotation.apply(rays.reshape(-1, 3))[:, 2].reshape(240, 320)
-    np.testing.assert_allclose((depth * down)[inside], 2.0, atol=1e-3)
+    found = one.at_depth(_pixels(one)[inside.ravel()], depth[inside].astype(float))
+    np.testing.assert_allclose(found[:, 2], 2.0, atol=1e-3)
 
 
 def test_no_pair_along_the_line_of_sight_or_face_to_face():
