@@ -16,7 +16,7 @@ from reconstruct.dense.dem import bin_points, sorted_ranks
 from reconstruct.dense.points import Points
 from reconstruct.ply import VERTEX as MESH_VERTEX
 from reconstruct.ply import write_ply
-from reconstruct.raster import DemGrid
+from reconstruct.raster import DemGrid, crs_of
 from reconstruct.views.model import WorldFrame
 
 Float32 = NDArray[np.float32]
@@ -154,8 +154,6 @@ def laz_writer(
     import laspy
     import pyproj
 
-    from reconstruct.raster import crs_of
-
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.offsets = np.asarray(offset_enu, dtype=np.float64)
     header.scales = np.full(3, _LAZ_STEP)
@@ -191,8 +189,6 @@ def write_cloud_json(
     path: Path, count: int, offset_enu: Sequence[float], edge: float, frame: WorldFrame
 ) -> None:
     """Write what the PLY cannot say."""
-    from reconstruct.raster import crs_of
-
     crs = crs_of(frame)
     CloudRecord.save(
         path,

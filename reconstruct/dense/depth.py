@@ -125,7 +125,7 @@ def pair_depth(
     disparity = match(left, right, pair.disparities_px)
     disparity[~_valid(usable, pair.rect_from_reference, pair)] = np.nan
     _drop_outside(disparity, _valid(usable_partner, pair.rect_from_partner, pair))
-    depth, _ = depth_in_reference(*views, pair, without_mixed(disparity))
+    depth = depth_in_reference(*views, pair, without_mixed(disparity))
     sigma = depth * depth * np.float32(match_sigma_px / (pair.focal_px * pair.baseline))
     return depth, sigma
 

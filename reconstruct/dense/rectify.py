@@ -65,17 +65,17 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
     base = partner.world_from_cam.translation - reference.world_from_cam.translation
     baseline = float(np.linalg.norm(base))
     x_axis = base / baseline
-    sights = [v.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for v in (reference, partner)]
-    sight = sights[0] + sights[1]
-    z_axis = sight - (sight @ x_axis) * x_axis
+    axes = [v.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for v in (reference, partner)]
+    mean = axes[0] + axes[1]
+    z_axis = mean - (mean @ x_axis) * x_axis
     if np.linalg.norm(z_axis) < _LEAST_COSINE:
         return None
     z_axis /= np.linalg.norm(z_axis)
-    if min(s @ z_axis for s in sights) < _LEAST_COSINE:
+    if min(s @ z_axis for s in axes) < _LEAST_COSINE:
         return None
     world_from_rect = Rotation.from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1))
     # a picture turned by t is stretched by cos(t)^-3 in area at its middle: undo it on average
-    stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in sights])) ** 0.5
+    stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in axes])) ** 0.5
     focal = (reference.fx_px + reference.fy_px) / 2.0 / stretch
     homographies, boxes, cosines = [], [], []
     for view in (reference, partner):
@@ -143,7 +143,7 @@ def depth_in_reference(
     partner: View,
     rectification: Rectification,
     disparity_px: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], float]:
+) -> NDArray[np.float32]:
     """Take a disparity map of the virtual picture to depth along the reference's own axis.
 
     Args:
@@ -153,12 +153,10 @@ def depth_in_reference(
         disparity_px: (h, w) of the virtual left picture, NaN where unknown.
 
     Returns:
-        (H, W) depth, NaN where any of the four virtual pixels around is unknown; and by how many
-        virtual pixels, rms, the two exact rays of the matches pass each other, which a match along
-        a row cannot see (0 without a port).
+        (H, W) depth, NaN where any of the four virtual pixels around is unknown.
     """
     corner = np.array([[1.0, 0, _HALF], [0, 1, _HALF], [0, 0, 1]])
-    depth, squares, count = triangulate(
+    depth: NDArray[np.float32] = triangulate(
         disparity_px,
         (reference.height_px, reference.width_px),
         lens_of(reference),
@@ -169,7 +167,7 @@ def depth_in_reference(
         rectification.focal_px * rectification.baseline,
         rectification.disparity_offset_px,
     )
-    return depth, float(np.sqrt(squares / max(count, 1)))
+    return depth
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -183,7 +181,7 @@ def triangulate(
     cosines: Array,
     focal_baseline: float,
     offset_px: float,
-) -> tuple[NDArray[np.float32], float, int]:
+) -> NDArray[np.float32]:
     """Depth of every pixel from the two refracted rays of its match.
 
     A match says which pixels p and q of the two warped pictures show one spot. Where the pinholes
@@ -202,13 +200,11 @@ def triangulate(
         offset_px: of the disparity.
 
     Returns:
-        (H, W) depth, NaN where unknown; the sum of squares of the rows by which rays pass each
-        other; how many pixels it sums.
+        (H, W) depth, NaN where unknown.
     """
     rows, columns = disparity_px.shape
     height, width = shape
     depth = np.full(shape, np.nan, np.float32)
-    squares, count = 0.0, 0
     h, g = rect_from_reference, rect_from_partner
     back = np.linalg.inv(g)
     c = cosines
@@ -233,7 +229,7 @@ def triangulate(
             ray = c[0, 2] + c[0, 0] * (x - pinhole[2]) / pinhole[0]
             ray += c[0, 1] * (y - pinhole[3]) / pinhole[1]
             shifted = disparity + offset_px  # of the two pinhole pixels
-            across, px, py = 0.0, x, y
+            px, py = x, y
             if near != 0.0 or far != 0.0:
                 right = left - disparity
                 w = 1.0 / (back[2, 0] * right + back[2, 1] * level + back[2, 2])
@@ -251,16 +247,12 @@ def triangulate(
                     qx, qy = u + bx * step, v + by * step
                     w = 1.0 / (h[2, 0] * px + h[2, 1] * py + h[2, 2])
                     here = (h[0, 0] * px + h[0, 1] * py + h[0, 2]) * w
-                    across = (h[1, 0] * px + h[1, 1] * py + h[1, 2]) * w
                     w = 1.0 / (g[2, 0] * qx + g[2, 1] * qy + g[2, 2])
                     there = (g[0, 0] * qx + g[0, 1] * qy + g[0, 2]) * w
-                    across -= (g[1, 0] * qx + g[1, 1] * qy + g[1, 2]) * w
                     shifted = here - there + offset_px
                 ray = c[0, 2] + c[0, 0] * (px - pinhole[2]) / pinhole[0]
                 ray += c[0, 1] * (py - pinhole[3]) / pinhole[1]
             z = focal_baseline / (shifted * ray)
             if z > 0.0:
                 depth[row, column] = z
-                squares += across * across
-                count += 1
-    return depth, squares, count
+    return depth

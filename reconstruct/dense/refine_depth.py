@@ -192,8 +192,6 @@ class RefinedDepth:
     """Depth; NaN where unknown, or where no neighbour looks alike."""
     sigma: Float32
     """Standard deviation from what differs between the pictures, NaN where unknown."""
-    likeness: Float32
-    """Correlation of the window with its neighbours, their mean weighted as they were used."""
     seen: NDArray[np.uint8]
     """How many neighbours look alike there."""
 
@@ -207,6 +205,7 @@ class _NeighbourSums:
     speed: Float32
     """Pixels per unit of inverse depth, of the neighbour that moves most."""
     likeness: Float32
+    """Correlation of the window with its neighbours, their mean weighted as they were used."""
     seen: NDArray[np.uint8]
 
 
@@ -244,7 +243,6 @@ def refine(
     return RefinedDepth(
         depth=np.where(kept, depth, refined),
         sigma=np.where(kept, sigma, refined * refined / root),
-        likeness=sums.likeness,
         seen=sums.seen,
     )
 

@@ -98,7 +98,7 @@ def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
     Raises:
         ReconstructionError: no view has a partner.
     """
-    sights = [view.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for view in model.views]
+    axes = [view.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for view in model.views]
     centres = np.array([view.world_from_cam.translation for view in model.views]).reshape(-1, 3)
     tree = cKDTree(centres)
     observed = points_of_views(model)
@@ -116,13 +116,13 @@ def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
             base = centres[other] - centres[index]
             if other == index:
                 continue
-            if sights[index] @ sights[other] < np.cos(np.deg2rad(_WIDEST_ANGLE_DEG)):
+            if axes[index] @ axes[other] < np.cos(np.deg2rad(_WIDEST_ANGLE_DEG)):
                 continue
-            across = np.linalg.norm(base - (base @ sights[index]) * sights[index])
+            across = np.linalg.norm(base - (base @ axes[index]) * axes[index])
             ratio = float(across / distance)
             if not _USABLE_RATIO[0] <= ratio <= _USABLE_RATIO[1]:
                 continue
-            tilt = max(abs(base @ sights[i]) for i in (index, other)) / np.linalg.norm(base)
+            tilt = max(abs(base @ axes[i]) for i in (index, other)) / np.linalg.norm(base)
             if tilt > _LARGEST_TILT:
                 continue
             served = in_frame(model.views[other], points).astype(np.float64)

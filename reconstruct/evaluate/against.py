@@ -1,19 +1,19 @@
 """A survey against an earlier one of the same site: where and by how much the sea floor changed."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.base.records import ChangeRecord
 from alice_survey.base.run import progress
-from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change, without
+from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
 from reconstruct.evaluate.height_registration import HeightFit, refine_heights, register_heights
-from reconstruct.raster import BLOCK, DemGrid, crs_of, frame_tags, transform_of
-from reconstruct.views.model import WorldFrame
+from reconstruct.evaluate.plots import plot_change
+from reconstruct.raster import DemGrid, tiled_raster
 
 _MUCH = 0.5
 """Share of the ground that is rarely found changed between two surveys."""
@@ -33,7 +33,7 @@ def compare_elevations(
     fit = register_heights(now, before, now_from_before)
     change = find_change(now, before, fit)
     if change.changed.any():
-        stable = without(now, change.changed)
+        stable = replace(now, height=np.where(change.changed, np.nan, now.height))
         try:
             fit = refine_heights(stable, before, fit.fixed_from_moving)
         except ReconstructionError:
@@ -63,8 +63,6 @@ def evaluate_against(
         WorkspaceError: a surface is missing or has no georeference or no scale.
         ReconstructionError: the two do not overlap.
     """
-    from reconstruct.evaluate.change_plot import plot_change
-
     now, frame = read_elevation(workspace)
     before, frame_before = read_elevation(earlier)
     for folder, one in ((workspace, frame), (earlier, frame_before)):
@@ -96,8 +94,13 @@ def evaluate_against(
         west=now.west, north=now.north, cell=now.cell,
         rows=now.height.shape[0], columns=now.height.shape[1],
     )  # fmt: skip
-    _write(folder / "difference.tif", grid, frame, change.difference, "height less before (m)")
-    _write(folder / "significance.tif", grid, frame, change.significance, "change over its sigma")
+    for name, values, text in (
+        ("difference", change.difference, "height now minus before (m)"),
+        ("significance", change.significance, "change over its sigma"),
+    ):
+        path = folder / f"{name}.tif"
+        with tiled_raster(path, grid, frame, "float32", np.nan, text) as raster:
+            raster.write(values.astype(np.float32), 1)
     plot_change(folder / "change.png", now, change)
     ChangeRecord.save(folder / "change.json", figures)
     return _text(figures, folder), figures
@@ -116,19 +119,6 @@ def _registration(fit: HeightFit, georeferenced: Any) -> dict[str, Any]:
         "spread_mm": round(1e3 * fit.spread, 4),
         "cells": fit.used,
     }
-
-
-def _write(path: Path, grid: DemGrid, frame: WorldFrame, values: Any, text: str) -> None:
-    profile = {
-        "driver": "GTiff", "width": grid.columns, "height": grid.rows, "count": 1,
-        "dtype": "float32", "nodata": np.nan, "crs": crs_of(frame),
-        "transform": transform_of(grid), "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK,
-        "compress": "deflate", "predictor": 3,
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as raster:
-        raster.update_tags(**frame_tags(frame))
-        raster.set_band_description(1, text)
-        raster.write(values.astype(np.float32), 1)
 
 
 def _text(figures: dict[str, Any], folder: Path) -> str:

@@ -1,7 +1,7 @@
 """How well the cameras of a simulated survey were placed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.evaluate.figures import rms
-from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.placing.alignment import align_rigid, align_similarity
 
 
@@ -57,27 +56,28 @@ class CameraScore:
 
 
 @progress.step("score the cameras")
-def score_cameras(estimated: dict[str, RigidTransform], truth: Path, total: int) -> CameraScore:
+def score_cameras(
+    estimated: Mapping[str, RigidTransform], truth: Mapping[str, RigidTransform], total: int
+) -> CameraScore:
     """Compare entrance pupils with the true poses of a simulated survey.
 
     Args:
         estimated: `world_from_cam` by picture, in metres.
-        truth: `poses.csv` of the truth.
+        truth: `ned_from_cam` by picture.
         total: how many pictures there are.
 
     Raises:
         WorkspaceError: fewer than three pictures are registered.
     """
-    true_poses = read_true_poses(truth)
     names = tuple(sorted(estimated))
     if len(names) < 3:
         raise WorkspaceError(f"{len(names)} registered pictures; 3 or more are needed to align")
     found = np.stack([estimated[name].translation for name in names])
-    true = np.stack([true_poses[name].translation for name in names])
+    true = np.stack([truth[name].translation for name in names])
     alignment = align_rigid(found, true)
     similarity = align_similarity(found, true)
     turns = [
-        (true_poses[n].rotation.inv() * alignment.rotation * estimated[n].rotation).magnitude()
+        (truth[n].rotation.inv() * alignment.rotation * estimated[n].rotation).magnitude()
         for n in names
     ]
     return CameraScore(

@@ -4,7 +4,7 @@ The sigma of a difference is that of both heights and of the registration. Singl
 sigma by chance in 5 % of all cases; a place counts as changed only where most cells around agree.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -273,8 +273,3 @@ def _region(region: Region) -> dict[str, float]:
         "sigma_l": round(1e3 * region.sigma_m3, 4),
         "most_mm": round(1e3 * region.most_m, 2),
     }
-
-
-def without(elevation: Elevation, changed: NDArray[np.bool_]) -> Elevation:
-    """Heights without what changed: a second registration is pulled by none of it."""
-    return replace(elevation, height=np.where(changed, np.nan, elevation.height))

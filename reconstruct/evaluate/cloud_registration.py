@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.evaluate.figures import rms, rounded
+from reconstruct.evaluate.figures import rms, rounded, tukey_weights
 from reconstruct.placing.alignment import Similarity
 
-_TUKEY = 4.685
 _NEIGHBOURS = 12
 _SAMPLES = (8_000, 40_000)
 _COMPARED = 300_000
@@ -135,8 +134,7 @@ def _adjust(
             )
         points, normal = moved[paired], normals[paired]
         miss = np.einsum("ni,ni->n", points - middles[paired], normal)
-        spread = max(MAD_TO_SIGMA * float(np.median(np.abs(miss))), 1e-12)
-        weight = np.clip(1 - (miss / (_TUKEY * spread)) ** 2, 0, None) ** 2
+        weight, spread = tukey_weights(miss)
         centre = points.mean(axis=0)
         rim = float(np.linalg.norm(points - centre, axis=1).max())
         arm = (points - centre) / rim

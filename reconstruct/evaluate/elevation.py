@@ -76,21 +76,26 @@ def read_elevation(workspace: Path) -> tuple[Elevation, WorldFrame]:
     """
     dense = need_stage(workspace, "dense", "reconstruct")
     frame = read_frame(need_stage(workspace, "sparse", "reconstruct") / "frame.json")
+    elevation = elevation_in(dense)
+    if not elevation.known.any():
+        raise ReconstructionError(f"{dense / 'dem.tif'}: holds no height")
+    return elevation, frame
+
+
+def elevation_in(dense: Path) -> Elevation:
+    """The DEM and its standard deviation in a folder."""
     with opened_raster(dense / "dem.tif") as source:
         height = source.read(1).astype(np.float64)
         transform = source.transform
     with opened_raster(dense / "sigma.tif") as source:
         sigma = source.read(1).astype(np.float64)
-    if not np.isfinite(height).any():
-        raise ReconstructionError(f"{dense / 'dem.tif'}: holds no height")
-    elevation = Elevation(
+    return Elevation(
         height=height,
         sigma=np.where(sigma > 0, sigma, np.nan),
         west=float(transform.c),
         north=float(transform.f),
         cell=float(transform.a),
     )
-    return elevation, frame
 
 
 def enu_from_enu(target: Datum, source: Datum) -> RigidTransform:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""
@@ -14,11 +15,61 @@ _LEAST_SHARE = 0.25
 """Share of the fullest block's count that a block must hold to count."""
 _LEAST_BLOCKS = 12
 _PAIRS = 4000
+_TUKEY = 4.685
+"""Tukey's constant: 95 % efficient for normal errors."""
+WITHIN_PX = (1, 2, 3, 5)
+"""Ground pixels within which completeness is reported."""
 
 
 def rms(values: Array) -> float:
     """Root mean square; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
+
+
+def median(values: Array) -> float:
+    """Median; NaN of nothing."""
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def percentile(values: Array, percent: float) -> float:
+    """What this share of the values is below; NaN of nothing."""
+    return float(np.percentile(values, percent)) if len(values) else math.nan
+
+
+def spread(name: str, values_mm: Array) -> dict[str, float | None]:
+    """Root mean square, median and 95th percentile of errors, by name."""
+    return {
+        f"{name}_rms_mm": rounded(rms(values_mm), 3),
+        f"{name}_median_mm": rounded(median(values_mm), 3),
+        f"{name}_95_mm": rounded(percentile(values_mm, 95), 3),
+    }
+
+
+def shares_within(distances_m: Array, pixel_m: float, total: float) -> dict[str, float]:
+    """Shares of a total that lie within some ground pixels, by their number."""
+    return {
+        str(px): round(float((distances_m < px * pixel_m).sum() / total), 4) for px in WITHIN_PX
+    }
+
+
+def tukey_weights(misses: Array) -> tuple[Array, float]:
+    """(N,) weights that are 0 for what lies beyond Tukey's limit, and the robust scatter."""
+    scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(misses))), 1e-12)
+    weights: Array = np.clip(1 - (misses / (_TUKEY * scatter)) ** 2, 0, None) ** 2
+    return weights, scatter
+
+
+def mean_grid(places_en: Array, values: Array, side: float) -> tuple[Array, float, float]:
+    """Means of values at (N, 2) places on a grid of cells, rows from north; its west and north."""
+    west, north = places_en[:, 0].min(), places_en[:, 1].max()
+    column = ((places_en[:, 0] - west) / side).astype(np.int64)
+    row = ((north - places_en[:, 1]) / side).astype(np.int64)
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    place = row * shape[1] + column
+    count = np.bincount(place, minlength=shape[0] * shape[1])
+    total = np.bincount(place, values, minlength=shape[0] * shape[1])
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean.reshape(shape), float(west), float(north)
 
 
 def rounded(value: float, digits: int) -> float | None:

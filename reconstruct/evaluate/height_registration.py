@@ -16,9 +16,8 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
+from reconstruct.evaluate.figures import mean_grid, tukey_weights
 
-_TUKEY = 4.685
-"""Tukey's constant: 95 % efficient for normal errors."""
 _ROUNDS = 40
 _STILL = 1e-6
 """Share of a cell: motion of the block's rim at which the adjustment has settled."""
@@ -113,8 +112,9 @@ def rough_shifts(
     """
     both = max(fixed.height.shape + moving.height.shape)
     cell = fixed.cell * max(1.0, both / _COARSE_CELLS)
-    one, corner = _resampled(fixed, RigidTransform.identity(), cell)
-    two, other = _resampled(moving, fixed_from_moving, cell)
+    points, moved = fixed.points(), fixed_from_moving.apply(moving.points())
+    one, *corner = mean_grid(points[:, :2], points[:, 2], cell)
+    two, *other = mean_grid(moved[:, :2], moved[:, 2], cell)
     mask1, mask2 = np.isfinite(one).astype(float), np.isfinite(two).astype(float)
     one, two = _levelled(one), _levelled(two)
     flipped, mask_flipped = two[::-1, ::-1], mask2[::-1, ::-1]
@@ -137,23 +137,6 @@ def rough_shifts(
         shifts.append((east, north))
         score[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = -1.0
     return shifts
-
-
-def _resampled(
-    elevation: Elevation, target_from_own: RigidTransform, cell: float
-) -> tuple[Array, tuple[float, float]]:
-    """Mean heights on coarse cells of the target frame, and its west and north edge."""
-    points = target_from_own.apply(elevation.points())
-    west, north = points[:, 0].min(), points[:, 1].max()
-    columns = ((points[:, 0] - west) / cell).astype(np.int64)
-    rows = ((north - points[:, 1]) / cell).astype(np.int64)
-    shape = (int(rows.max()) + 1, int(columns.max()) + 1)
-    place = rows * shape[1] + columns
-    count = np.bincount(place, minlength=shape[0] * shape[1])
-    total = np.bincount(place, points[:, 2], minlength=shape[0] * shape[1])
-    with np.errstate(invalid="ignore"):
-        mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return mean.reshape(shape), (float(west), float(north))
 
 
 def _levelled(height: Array) -> Array:
@@ -249,9 +232,7 @@ def _jacobian(offsets: Array, normals: Array) -> Array:
 def _tukey_weights(compared: _Compared) -> Array:
     """(N,) weights, 1 / m^2: none for what lies beyond Tukey's limit about the median."""
     scaled = (compared.miss - np.median(compared.miss)) / np.sqrt(compared.variance)
-    spread = max(MAD_TO_SIGMA * float(np.median(np.abs(scaled))), 1e-12)
-    weight: Array = np.clip(1 - (scaled / (_TUKEY * spread)) ** 2, 0, None) ** 2
-    return weight / compared.variance
+    return tukey_weights(scaled)[0] / compared.variance
 
 
 def _fit(points: Array, compared: _Compared, pose: RigidTransform, centre: Array) -> HeightFit:

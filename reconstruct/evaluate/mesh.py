@@ -13,11 +13,10 @@ from alice_survey.base.frames import Array
 from alice_survey.base.records import MeshRecord
 from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
-from reconstruct.evaluate.figures import rms, rounded
+from reconstruct.evaluate.figures import shares_within, spread
 from reconstruct.evaluate.truth import surface_depth, surface_distance
 
 _SAMPLES = 200_000
-_WITHIN_PX = (1, 2, 3, 5)
 
 
 def read_mesh(folder: Path) -> tuple[Array, Array]:
@@ -69,15 +68,8 @@ def score_mesh(
     away = distance_from_mesh(vertices, triangles, truth[np.isfinite(truth[:, 2])])
     return {
         "triangles": len(triangles),
-        "distance_rms_mm": rounded(rms(distance), 3),
-        "distance_median_mm": rounded(float(np.median(distance)) if len(distance) else np.nan, 3),
-        "distance_95_mm": rounded(
-            float(np.percentile(distance, 95)) if len(distance) else np.nan, 3
-        ),
-        "completeness_within_px": {
-            str(px): round(float((away < px * ground_pixel_m).sum() / max(len(places), 1)), 4)
-            for px in _WITHIN_PX
-        },
+        **spread("distance", distance),
+        "completeness_within_px": shares_within(away, ground_pixel_m, max(len(places), 1)),
     }
 
 

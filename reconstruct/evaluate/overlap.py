@@ -2,47 +2,53 @@
 
 import csv
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
-from camera_calib.rig import read_rig
+from alice_survey.base.manifest import ImageRecord
+from camera_calib.rig import Rig
 from missions.values.footprint import footprint_polygon
-from missions.values.plan_file import Plan, read_plan
-from reconstruct.evaluate.truth import read_true_poses
+from missions.values.plan_file import Plan
 
 _PARALLEL = 1e-3
 _SPACED = 0.2
 """Lines are neighbours when they are one spacing apart, give or take this share of it."""
 
 
-def overlaps_reached(workspace: Path, truth: Path) -> dict[str, float]:
+def overlaps_reached(
+    triggers: Path,
+    plan: Plan,
+    rig: Rig,
+    records: Iterable[ImageRecord],
+    poses: Mapping[str, RigidTransform],
+) -> dict[str, float]:
     """Shares of a footprint seen again by the next picture and of a swath by the next line.
 
     Footprints are of the reference camera at its true poses, exactly through the port, on a level
     sea floor of the mean depth. Swaths are compared where both lines take pictures.
 
+    Args:
+        triggers: file of the flight's exposures, with station and line.
+        plan: that was flown.
+        rig: true cameras.
+        records: of the pictures.
+        poses: true `ned_from_cam` by picture.
+
     Returns:
         `forward_mean`, `forward_least`, `side_mean`, `side_least`; a key is left out where there
         are no two neighbours to compare.
     """
-    plan = read_plan(workspace / "plan" / "plan.json")
-    rig = read_rig(truth / "rig.json")
-    name, camera = rig.reference, rig.cameras[rig.reference]
-    poses = read_true_poses(truth / "poses.csv")
-    with (workspace / "images" / "manifest.csv").open(newline="", encoding="utf-8") as file:
-        image_of = {
-            int(row["station"]): row["image"]
-            for row in csv.DictReader(file)
-            if row["camera"] == name
-        }
+    camera = rig.cameras[rig.reference]
+    image_of = {r.station: r.image for r in records if r.camera == rig.reference}
     lines: dict[int, list[Polygon]] = {}
-    with (workspace / "flight" / "triggers.csv").open(newline="", encoding="utf-8") as file:
+    with triggers.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             pose = poses[image_of[int(row["station"])]]
             polygon = footprint_polygon(camera, pose, plan.seafloor_depth_m)

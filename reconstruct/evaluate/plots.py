@@ -1,11 +1,12 @@
-"""Pictures of a score: track and camera errors, the error of the surface, one sheet of all."""
+"""Pictures of a score, of the distance from a reference, and of the change between two surveys."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from shapely.geometry import MultiPolygon
 
+from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from alice_survey.kit.figure import (
     Axes,
@@ -16,20 +17,26 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from missions.values.plan_file import read_plan
-
-if TYPE_CHECKING:
-    from reconstruct.evaluate.cameras import CameraScore
-    from reconstruct.evaluate.surface import SurfaceScore
+from missions.values.plan_file import Plan
+from reconstruct.evaluate.cameras import CameraScore
+from reconstruct.evaluate.change import SIGNIFICANT, Change
+from reconstruct.evaluate.cloud_registration import CloudDistances
+from reconstruct.evaluate.elevation import Elevation
+from reconstruct.evaluate.figures import mean_grid
+from reconstruct.evaluate.surface import SurfaceScore
+from reconstruct.raster import hillshade
 
 _WIDTH_IN = 11.0
+_CELLS = 320
+"""Cells of the map along its longer side."""
+_LONGEST = 1200
+_LABELLED = 8
 
 
 @progress.step("draw the track's errors")
 @figure_style()
-def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
+def plot_track(path: Path, plan: Plan, cameras: CameraScore) -> None:
     """Planned lines, camera positions coloured by error, and the error of each picture."""
-    plan = read_plan(plan_file)
     places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
     south, west, north, east = plan.area.survey.bounds
     figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
@@ -53,7 +60,7 @@ def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
 
 @progress.step("draw the errors")
 @figure_style()
-def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None:
+def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
     """Map and histogram of height errors of the surface."""
     figures = surface.to_json()
     limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
@@ -90,8 +97,8 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
 def plot_sheet(
     path: Path,
     workspace: Path,
-    cameras: "CameraScore",
-    surface: "SurfaceScore",
+    cameras: CameraScore,
+    surface: SurfaceScore,
     area: MultiPolygon,
 ) -> None:
     """The picture nearest to the middle of the area, surface, mosaic and error on one sheet."""
@@ -140,3 +147,97 @@ def _read(path: Path) -> Any:
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     order = cv2.COLOR_BGRA2RGBA if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(picture, order)
+
+
+@figure_style()
+def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel_m: float) -> None:
+    """Map of the survey's signed distance from the reference, and both cumulative shares."""
+    limit = max(float(np.percentile(np.abs(ours.signed_m), 95)), 1e-9)
+    values, extent = mean_map(ours.points[:, :2], ours.signed_m, _CELLS)
+    figure = new_figure(5.6, 13)
+    plane, curve = figure.subplots(1, 2, width_ratios=[1.3, 1])
+    plane.set_facecolor("0.85")
+    image = plane.imshow(
+        values, extent=extent, vmin=-limit, vmax=limit, cmap="RdBu_r", interpolation="nearest"
+    )
+    plane.grid(visible=False)
+    plane.set_title("Survey minus reference")
+    colour_bar(image, plane, "survey above reference (m)")
+    map_axes(plane)
+    for one, name in ((ours, "survey to reference"), (back, "reference to survey")):
+        away = np.sort(np.abs(one.signed_m))[:: max(1, len(one.signed_m) // 2000)]
+        curve.plot(away / pixel_m, np.linspace(0, 1, len(away)), label=name)
+    curve.axvline(2, color="0.6", linestyle=":", label="2 ground pixels")
+    curve.set(xlim=(0, max(6.0, 2 * limit / pixel_m)), ylim=(0, 1))
+    curve.set(xlabel="distance (ground pixels)", ylabel="share of points below")
+    curve.set_title(
+        f"median {np.median(np.abs(ours.signed_m)):.3g} m, ground pixel {pixel_m:.3g} m"
+    )
+    curve.legend(loc="lower right")
+    save_figure(figure, path)
+
+
+def mean_map(
+    places_en: Array, values: Array, cells: int
+) -> tuple[Array, tuple[float, float, float, float]]:
+    """Means of values at (N, 2) places on a grid, rows from north; and its extent for a plot."""
+    side = max(float(np.ptp(places_en, axis=0).max()) / cells, 1e-12)
+    mean, west, north = mean_grid(places_en, values, side)
+    rows, columns = mean.shape
+    return mean, (west, west + columns * side, north - rows * side, north)
+
+
+@figure_style()
+def plot_change(path: Path, now: Elevation, change: Change) -> None:
+    """Difference over the relief, places that changed, and the significance with its histogram."""
+    step = max(1, max(now.height.shape) // _LONGEST)
+    difference = 1e3 * change.difference[::step, ::step]
+    ratio = change.significance[::step, ::step]
+    shade = hillshade(now.height[::step, ::step], now.cell * step)
+    rows, columns = now.height.shape
+    extent = (now.west, now.west + columns * now.cell, now.north - rows * now.cell, now.north)
+    known = np.isfinite(difference)
+    limit = max(float(np.percentile(np.abs(difference[known]), 99.5)), 1e-6) if known.any() else 1.0
+    figure = new_figure(5.2, 14)
+    left, middle, right = figure.subplots(1, 3, width_ratios=[1.2, 1.2, 0.8])
+    for axis, values, span, label, title in (
+        (left, difference, limit, "mm", "Height now minus before"),
+        (middle, ratio, 4.0, "standard deviations", "Significance"),
+    ):
+        axis.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1.2)
+        image = axis.imshow(
+            values, extent=extent, cmap="RdBu_r", vmin=-span, vmax=span,
+            alpha=np.where(np.isfinite(values), 0.75, 0.0), interpolation="nearest",
+        )  # fmt: skip
+        axis.grid(visible=False)
+        axis.set_title(title)
+        colour_bar(image, axis, label)
+        map_axes(axis)
+    changed = change.changed[::step, ::step]
+    if changed.any():
+        for axis in (left, middle):
+            axis.contour(
+                changed, levels=[0.5], colors="k", linewidths=0.8, extent=extent, origin="upper"
+            )
+    for region in change.regions[:_LABELLED]:
+        left.annotate(
+            f"{1e3 * region.volume_m3:+.2f}±{1e3 * region.sigma_m3:.2f} l",
+            (region.east_m, region.north_m), ha="center", fontsize=7,
+            bbox={"boxstyle": "round", "fc": "white", "alpha": 0.8, "lw": 0},
+        )  # fmt: skip
+    _histogram(right, change)
+    save_figure(figure, path)
+
+
+def _histogram(axis: Axes, change: Change) -> None:
+    """Unchanged ground in standard deviations, and what chance would give."""
+    stable = np.isfinite(change.difference) & ~change.changed
+    ratio = change.significance[stable]
+    edges = np.linspace(-6, 6, 97)
+    axis.hist(np.clip(ratio, -6, 6), bins=edges, density=True, label="unchanged ground")
+    axis.plot(edges, np.exp(-(edges**2) / 2) / np.sqrt(2 * np.pi), "k-", label="chance")
+    for side in (-SIGNIFICANT, SIGNIFICANT):
+        axis.axvline(side, color="0.5", linestyle=":")
+    axis.set(xlabel="difference / sigma", ylabel="density", yscale="log", ylim=(1e-5, 2))
+    axis.set_title(f"{np.mean(np.abs(ratio) > SIGNIFICANT):.1%} beyond {SIGNIFICANT} sigma")
+    axis.legend(loc="upper right")

@@ -21,12 +21,10 @@ from reconstruct.evaluate.cloud_registration import (
     distances,
     register_cloud,
 )
-from reconstruct.evaluate.figures import fit_doming, rounded
-from reconstruct.evaluate.reference_plot import plot_reference
+from reconstruct.evaluate.figures import WITHIN_PX, fit_doming, rounded
+from reconstruct.evaluate.plots import plot_reference
 from reconstruct.placing.alignment import Similarity
 from reconstruct.views.model import SparseModel, read_model
-
-WITHIN_PX = (1, 2, 3, 5)
 
 _NAVIGATION = "navigation"
 

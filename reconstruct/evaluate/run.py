@@ -5,7 +5,6 @@ surface is moved by the same alignment and compared with the terrain's mesh, cel
 included; the mosaic is compared with the true sea floor painted at the same places.
 """
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,14 +22,14 @@ from alice_survey.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
 from missions.values.plan_file import read_plan
 from reconstruct.evaluate.cameras import CameraScore, score_cameras
+from reconstruct.evaluate.elevation import elevation_in
 from reconstruct.evaluate.figures import compare_lengths
 from reconstruct.evaluate.mesh import read_mesh, score_mesh
 from reconstruct.evaluate.mosaic import score_mosaic
 from reconstruct.evaluate.overlap import overlaps_reached
 from reconstruct.evaluate.plots import plot_errors, plot_sheet, plot_track
-from reconstruct.evaluate.stations import count_stations, ground_pixel_m
 from reconstruct.evaluate.surface import score_surface
-from reconstruct.evaluate.truth import read_true_poses
+from reconstruct.evaluate.truth import count_stations, ground_pixel_m, read_true_poses
 from reconstruct.placing.track import read_track_poses
 
 _SEED_STREAM = 6100
@@ -41,13 +40,14 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
     folders = ("plan", "images", "sparse", "dense", "mosaic", "mesh")
     plan, images, sparse, dense, mosaic, mesh = (workspace / name for name in folders)
     truth = images / "truth"
-    area = read_plan(plan / "plan.json").area.survey
+    flown = read_plan(plan / "plan.json")
+    area = flown.area.survey
     terrain = read_terrain(truth / "terrain.ply")
     rig, poses = read_rig(truth / "rig.json"), read_true_poses(truth / "poses.csv")
     records = read_manifest(images / "manifest.csv")
     total = RegistrationRecord.read(sparse / "registration.json").total
     track = read_track_poses(sparse / "track.csv")
-    cameras = score_cameras(track, truth / "poses.csv", total)
+    cameras = score_cameras(track, poses, total)
     moved = cameras.truth_from_world
     pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
     counter = partial(
@@ -57,26 +57,26 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
         poses=poses,
         terrain=terrain,
     )
-    surface = score_surface(
-        dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
-    )
+    surface = score_surface(elevation_in(dense), area, terrain, moved, pixel_m, counter)
     painted = score_mosaic(
         mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(seed), moved
     )
     rng = np.random.default_rng([seed, _SEED_STREAM])
     score: dict[str, Any] = {
         "cameras": cameras.to_json(),
-        "surface": surface.to_json(pixel_m),
+        "surface": surface.to_json(),
         "mosaic": painted.to_json(),
         "lengths": compare_lengths(painted.points_world, painted.points_true, rng),
     }
     if read_stage(mesh) is not None:
         score["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
-    score["overlaps"] = _rounded(overlaps_reached(workspace, truth))
+    triggers = workspace / "flight" / "triggers.csv"
+    overlaps = overlaps_reached(triggers, flown, rig, records, poses)
+    score["overlaps"] = {name: round(value, 4) for name, value in overlaps.items()}
     ScoreRecord.save(folder / "score.json", score)
     write_cameras(folder / "cameras.csv", cameras)
     _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
-    plot_track(folder / "track.png", plan / "plan.json", cameras)
+    plot_track(folder / "track.png", flown, cameras)
     plot_errors(folder / "errors.png", surface, area)
     plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
 
@@ -87,7 +87,7 @@ def _write_errors(path: Path, dem: Path, errors: Array) -> None:
         profile = source.profile
     with rasterio.open(path, "w", **profile) as raster:
         raster.write(errors.astype(np.float32), 1)
-        raster.set_band_description(1, "height less true height (m)")
+        raster.set_band_description(1, "height minus true height (m)")
 
 
 def write_cameras(path: Path, cameras: CameraScore) -> None:
@@ -102,7 +102,3 @@ def write_cameras(path: Path, cameras: CameraScore) -> None:
             )
         ),
     )
-
-
-def _rounded(values: Mapping[str, float]) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in values.items()}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,19 +14,21 @@ from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
+from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import (
     compare_volumes,
     fit_doming,
+    median,
+    percentile,
     rms,
     rounded,
+    shares_within,
+    spread,
 )
 from reconstruct.evaluate.truth import surface_depth, surface_distance
-from reconstruct.raster import opened_raster
 
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
-WITHIN_PX = (1, 2, 3, 5)
-"""Ground pixels within which completeness is reported."""
 LEAST_STATIONS = 3
 """Cells seen from this many stations are also scored separately."""
 
@@ -54,112 +55,86 @@ class SurfaceScore:
     """(N,) height of each filled cell minus the true height straight below or above it."""
     true_height_m: Array
     """(N,) that true height, positive up."""
-    sigma_m: Array | None
-    """(N,) standard deviation that the model states; None when it states none."""
-    stations: NDArray[np.int64] | None
-    """(N,) stations that see the true surface there; None when not counted."""
+    sigma_m: Array
+    """(N,) standard deviation that the model states; NaN where it states none."""
+    stations: NDArray[np.int64]
+    """(N,) stations that see the true surface there."""
     cells_seen_well: int
     """Cells in the area, filled or not, that `LEAST_STATIONS` see."""
     map_m: Array
     """(rows, columns) of `height_m`; NaN where there is no cell."""
     extent_m: tuple[float, float, float, float]
     """West, east, south, north edges of the map, moved (not turned) to the true frame."""
+    ground_pixel_m: float
+    """Side of a picture's pixel on the sea floor."""
 
     @property
     def completeness(self) -> float:
         """Share of the area's cells that are filled."""
         return len(self.distance_m) / self.cells
 
-    def to_json(self, ground_pixel_m: float | None = None) -> dict[str, Any]:
-        """Figures in millimetres, and in ground pixels where one is given."""
+    def to_json(self) -> dict[str, Any]:
+        """Figures in millimetres and ground pixels."""
         distance, height = 1e3 * self.distance_m, 1e3 * self.height_m
-        figures: dict[str, Any] = {
+        well = self.stations >= LEAST_STATIONS
+        stated = self.sigma_m > 0
+        ratio = self.height_m[stated] / self.sigma_m[stated]
+        return {
             "cells": self.cells,
             "completeness": round(self.completeness, 4),
             "accurate_share": round(float((self.distance_m < GOOD_M).sum() / self.cells), 4),
-            **_spread("distance", distance),
-            "distance_max_mm": rounded(_percentile(distance, 100), 3),
+            **spread("distance", distance),
+            "distance_max_mm": rounded(percentile(distance, 100), 3),
             "height_rms_mm": rounded(rms(height), 3),
-            "height_median_mm": rounded(_median(height), 3),
-            "height_95_mm": rounded(_percentile(np.abs(height), 95), 3),
+            "height_median_mm": rounded(median(height), 3),
+            "height_95_mm": rounded(percentile(np.abs(height), 95), 3),
             "doming": fit_doming(self.places_ne, self.height_m).to_json(),
             "volume": compare_volumes(
                 self.true_height_m + self.height_m, self.true_height_m, self.cell_m**2
             ),
-        }
-        if ground_pixel_m is not None:
-            figures["ground_pixel_mm"] = round(1e3 * ground_pixel_m, 4)
-            figures["completeness_within_px"] = {
-                str(px): round(float((self.distance_m < px * ground_pixel_m).sum() / self.cells), 4)
-                for px in WITHIN_PX
-            }
-        if self.stations is not None:
-            well = self.stations >= LEAST_STATIONS
-            figures[f"seen_from_{LEAST_STATIONS}_stations"] = {
+            "ground_pixel_mm": round(1e3 * self.ground_pixel_m, 4),
+            "completeness_within_px": shares_within(
+                self.distance_m, self.ground_pixel_m, self.cells
+            ),
+            f"seen_from_{LEAST_STATIONS}_stations": {
                 "cells": self.cells_seen_well,
                 "share": round(self.cells_seen_well / self.cells, 4),
                 "completeness": rounded(float(well.sum()) / max(self.cells_seen_well, 1), 4),
-                **_spread("distance", distance[well]),
-            }
-        if self.sigma_m is not None:
-            stated = self.sigma_m > 0
-            ratio = self.height_m[stated] / self.sigma_m[stated]
-            figures["error_over_sigma"] = {
+                **spread("distance", distance[well]),
+            },
+            "error_over_sigma": {
                 "rms": rounded(rms(ratio), 3),
-                "robust": rounded(MAD_TO_SIGMA * _median(np.abs(ratio)), 3),
+                "robust": rounded(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
                 "within_1_sigma": rounded(float(np.mean(np.abs(ratio) < 1)), 4),
                 "within_2_sigma": rounded(float(np.mean(np.abs(ratio) < 2)), 4),
-                "median_sigma_mm": rounded(1e3 * _median(self.sigma_m[stated]), 3),
-            }
-        return figures
-
-
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
-
-
-def _percentile(values: Array, percent: float) -> float:
-    return float(np.percentile(values, percent)) if len(values) else float("nan")
-
-
-def _spread(name: str, values_mm: Array) -> dict[str, Any]:
-    return {
-        f"{name}_rms_mm": rounded(rms(values_mm), 3),
-        f"{name}_median_mm": rounded(_median(values_mm), 3),
-        f"{name}_95_mm": rounded(_percentile(values_mm, 95), 3),
-    }
+                "median_sigma_mm": rounded(1e3 * median(self.sigma_m[stated]), 3),
+            },
+        }
 
 
 @progress.step("score the surface")
 def score_surface(
-    dem: Path,
+    surface: Elevation,
     area: MultiPolygon,
     terrain: Terrain,
     truth_from_world: RigidTransform,
-    *,
-    sigma: Path | None = None,
-    stations: CountStations | None = None,
+    ground_pixel_m: float,
+    stations: CountStations,
 ) -> SurfaceScore:
     """Compare every DEM cell of the survey area with the true mesh.
 
     Args:
-        dem: heights, positive up, over local east and north.
+        surface: heights over local east and north.
         area: the survey area, x north and y east; its holes count as outside.
         terrain: the truth.
         truth_from_world: alignment from the model's to the true NED.
-        sigma: standard deviations of the heights, on the same grid.
+        ground_pixel_m: side of a picture's pixel on the sea floor.
         stations: counts the stations that see points of the true surface.
     """
-    with opened_raster(dem) as source:
-        heights = source.read(1).astype(np.float64)
-        transform = source.transform
-    sigmas = None
-    if sigma is not None:
-        with opened_raster(sigma) as source:
-            sigmas = source.read(1).astype(np.float64).ravel()
+    heights, cell = surface.height, surface.cell
     rows, columns = heights.shape
-    east = transform.c + (np.arange(columns) + 0.5) * transform.a
-    north = transform.f + (np.arange(rows) + 0.5) * transform.e
+    east = surface.west + (np.arange(columns) + 0.5) * cell
+    north = surface.north - (np.arange(rows) + 0.5) * cell
     easts, norths = np.meshgrid(east, north)
     level = np.stack([norths, easts, 0 * easts], -1).reshape(-1, 3)
     filled = np.isfinite(heights).ravel()
@@ -169,7 +144,6 @@ def score_surface(
     shapely.prepare(area)
     inside = shapely.contains_xy(area, place[:, 0], place[:, 1])
     shift_ne = (plane - level).mean(axis=0)[:2]
-    cell_m2 = abs(transform.a * transform.e)
     used = np.flatnonzero(inside & filled)
     depth, distance = np.empty(len(used)), np.empty(len(used))
     for start in range(0, len(used), _STRIP_CELLS):  # ray casting needs much memory a ray
@@ -178,26 +152,25 @@ def score_surface(
         distance[part] = surface_distance(terrain, points[used[part]])
     misses = np.full(filled.shape, np.nan)
     misses[used] = depth - points[used, 2]
-    seen = None
-    if stations is not None:
-        seen = _stations_of_cells(place[:, :2], inside, (rows, columns), terrain, stations)
+    seen = _stations_of_cells(place[:, :2], inside, (rows, columns), terrain, stations)
     return SurfaceScore(
-        cells=max(round(area.area / cell_m2), int(inside.sum())),
-        cell_m=float(transform.a),
+        cells=max(round(area.area / cell**2), int(inside.sum())),
+        cell_m=cell,
         places_ne=points[used, :2],
         distance_m=distance,
         height_m=misses[used],
         true_height_m=-depth,
-        sigma_m=None if sigmas is None else sigmas[used],
-        stations=None if seen is None else seen[used],
-        cells_seen_well=0 if seen is None else int((seen[inside] >= LEAST_STATIONS).sum()),
+        sigma_m=surface.sigma.ravel()[used],
+        stations=seen[used],
+        cells_seen_well=int((seen[inside] >= LEAST_STATIONS).sum()),
         map_m=misses.reshape(heights.shape),
         extent_m=(
-            transform.c + shift_ne[1],
-            transform.c + columns * transform.a + shift_ne[1],
-            transform.f + rows * transform.e + shift_ne[0],
-            transform.f + shift_ne[0],
+            surface.west + shift_ne[1],
+            surface.west + columns * cell + shift_ne[1],
+            surface.north - rows * cell + shift_ne[0],
+            surface.north + shift_ne[0],
         ),
+        ground_pixel_m=ground_pixel_m,
     )
 
 

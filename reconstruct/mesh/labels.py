@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.mesh.topology import Triangles, edges_of, face_normals
+from reconstruct.mesh.topology import Triangles, edges_of, face_normals, twin_sides
 from reconstruct.mesh.visibility import Candidates
 
 _SEAM_COST = 0.35
@@ -76,10 +76,7 @@ def make_charts(vertices: Array, triangles: Triangles, label: NDArray[np.int32])
 def face_neighbours(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.int32], Array]:
     """The face over each side of every face, (T, 3), -1 at the outline; and the sides' lengths."""
     edges, edge = edges_of(triangles)
-    order = np.argsort(edge, kind="stable")
-    starts = np.searchsorted(edge[order], np.arange(len(edges)))
-    pairs = np.flatnonzero(np.bincount(edge, minlength=len(edges)) == 2)
-    one, other = order[starts[pairs]], order[starts[pairs] + 1]
+    one, other = twin_sides(edge)
     neighbours = np.full(triangles.size, -1, np.int32)
     neighbours[one], neighbours[other] = other // 3, one // 3
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)

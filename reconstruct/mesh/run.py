@@ -13,21 +13,16 @@ from alice_survey.base.frames import Array
 from alice_survey.base.records import CloudRecord, MeshRecord
 from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
-from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
+from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.labels import choose_views, make_charts
-from reconstruct.mesh.preview import render_oblique
 from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.topology import face_areas
-from reconstruct.mesh.visibility import find_candidates, save_geometry
+from reconstruct.mesh.visibility import find_candidates
+from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
-from reconstruct.views.model import (
-    SparseModel,
-    WorldFrame,
-    points_of_views,
-    read_model,
-)
+from reconstruct.views.model import SparseModel, WorldFrame, read_model
 
 MOST_TRIANGLES = 4_000_000
 """Most triangles where the settings name no number."""
@@ -59,7 +54,7 @@ def build_mesh(
     about = CloudRecord.read(dense / "cloud.json")
     light = read_light(dense / "light.json")
     offset, step = np.array(about.offset_east_north_up), about.thinned_to
-    pixel = ground_pixel(model)
+    pixel = mean_pixel(model)
     views = [view for view in model.views if view.image in light.gains]
     cloud = open_cloud(dense / "cloud.ply")
     mesh = mesh_cloud(
@@ -71,7 +66,7 @@ def build_mesh(
     )
     scratch = folder / "scratch"
     scratch.mkdir(exist_ok=True)
-    save_geometry(scratch / "mesh.npz", mesh.vertices, mesh.triangles, offset)
+    np.savez(scratch / "mesh.npz", vertices=mesh.vertices, triangles=mesh.triangles, offset=offset)
     candidates = find_candidates(
         scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, executor
     )
@@ -143,13 +138,3 @@ def mesh_facts(
         "offset_east_north_up": [float(value) for value in offset_enu],
         "notes": list(frame.notes),
     }
-
-
-def ground_pixel(model: SparseModel) -> float:
-    """Median over the views of the side of a pixel on the ground."""
-    sides = [
-        np.median(view.world_from_cam.inv().apply(points)[:, 2]) / np.sqrt(view.fx_px * view.fy_px)
-        for view, points in zip(model.views, points_of_views(model), strict=True)
-        if len(points)
-    ]
-    return float(np.median(sides))

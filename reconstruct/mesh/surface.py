@@ -1,19 +1,32 @@
-"""The surface through a point cloud: meshed tile by tile, welded, cleaned and decimated."""
+"""The surface through a point cloud: meshed tile by tile, welded, cleaned and decimated.
+
+The surface is the zero of an implicit function on a lattice: the weighted mean height over the
+tangent planes of the points around (implicit moving least squares, Kolluri 2008, "Provably good
+moving least squares"). It depends on points within a few lattice steps only, so that tiles that
+share a rim of points agree exactly where they meet, and where there are no points there is no
+surface: holes stay holes. A global Poisson surface would close them, and differs from tile to tile.
+
+The zero set is meshed by dual cells (surface nets, Gibson 1998, "Constrained elastic surface
+nets"): one vertex in every lattice cell that it crosses, one quadrilateral around every lattice
+edge that it crosses.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import Executor, progress
 from alice_survey.base.frames import Array
 from reconstruct.mesh.decimate import decimate
-from reconstruct.mesh.implicit import splat, zero_mesh
 from reconstruct.mesh.topology import (
     Triangles,
+    clean,
     component_areas,
     split_fans,
     triangulated,
@@ -39,20 +52,11 @@ _KEY_BITS = 21
 _DENSE_ROUNDS = 12
 _GROWTH = 1.3
 """Factor by which the error grows until the triangles are few enough."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfaceTask:
-    """One tile of the lattice to mesh."""
-
-    cloud: CloudFile
-    step: float
-    first: tuple[int, int]
-    """Number of the tile's first cell along x and y."""
-    cells: tuple[int, int]
-    sigma: float
-    """Sigma of a point of weight 1."""
-    error: float
+KERNEL_STEPS = 0.8
+"""Standard deviation of the points' Gaussian weight, lattice steps."""
+REACH_STEPS = 2.5
+"""Distance from a node at which points stop to count, lattice steps."""
+_NEWTON_STEPS = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,8 +95,10 @@ def mesh_cloud(
     Raises:
         ReconstructionError: no surface is left.
     """
-    tasks = surface_tasks(cloud, step, error)
-    pieces = executor.map(mesh_tile, tasks, label="mesh")
+    sample = cloud.sample(200_000)
+    sigma = float(np.median(sample["sigma"])) if "sigma" in (sample.dtype.names or ()) else 1.0
+    mesh = partial(mesh_tile, cloud, step, sigma, error)
+    pieces = executor.map(mesh, surface_tiles(cloud, step), label="mesh")
     vertices, triangles = weld([p for p in pieces if len(p.triangles)])
     triangles = without_folds(vertices, triangles)
     part, area = component_areas(vertices, triangles)
@@ -104,36 +110,39 @@ def mesh_cloud(
             "thinly to carry a surface; the pictures need more overlap or sharper texture"
         )
     vertices, triangles, error = _to_count(vertices, triangles, step, error, most_triangles)
-    triangles = without_folds(vertices, triangles)
-    vertices, triangles, _ = split_fans(vertices, triangles)
+    vertices, triangles, _ = clean(vertices, triangles)
     return TriangleMesh(vertices=vertices, triangles=triangles, error=error)
 
 
-def surface_tasks(cloud: CloudFile, step: float, error: float) -> list[SurfaceTask]:
-    """Tiles over the bounds of a cloud, row by row."""
+def surface_tiles(cloud: CloudFile, step: float) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Tiles over the bounds of a cloud, row by row: first cells along x and y, and how many."""
     low = np.floor(cloud.low / step).astype(int) - 3
     high = np.ceil(cloud.high / step).astype(int) + 3
     least, most = _TILE_STEPS
     side = int(np.clip(math.sqrt(_NODES / (high[2] - low[2])), least, most))
-    sample = cloud.sample(200_000)
-    names = sample.dtype.names or ()
-    sigma = float(np.median(sample["sigma"])) if "sigma" in names else 1.0
     return [
-        SurfaceTask(
-            cloud=cloud,
-            step=step,
-            first=(x, y),
-            cells=(min(side, int(high[0]) - x), min(side, int(high[1]) - y)),
-            sigma=sigma,
-            error=error,
-        )
+        ((x, y), (min(side, int(high[0]) - x), min(side, int(high[1]) - y)))
         for y in range(int(low[1]), int(high[1]), side)
         for x in range(int(low[0]), int(high[0]), side)
     ]
 
 
-def mesh_tile(task: SurfaceTask) -> Piece:
-    """Mesh the cells of a tile and decimate what it does not share with its neighbours."""
+def mesh_tile(
+    cloud: CloudFile,
+    step: float,
+    sigma: float,
+    error: float,
+    tile: tuple[tuple[int, int], tuple[int, int]],
+) -> Piece:
+    """Mesh the cells of a tile and decimate what it does not share with its neighbours.
+
+    Args:
+        cloud: oriented points.
+        step: of the lattice.
+        sigma: of a point of weight 1.
+        error: that decimation may make.
+        tile: number of its first cell along x and y, and how many cells it has.
+    """
     from scipy.spatial import cKDTree
 
     nothing = Piece(
@@ -141,18 +150,16 @@ def mesh_tile(task: SurfaceTask) -> Piece:
         triangles=np.empty((0, 3), np.int32),
         keys=np.empty(0, np.int64),
     )
-    step, (x, y), (nx, ny) = task.step, task.first, task.cells
+    (x, y), (nx, ny) = tile
     west, south = (x - _RIM_STEPS) * step, (y - _RIM_STEPS) * step
-    records = task.cloud.inside(
-        west, (x + nx + _RIM_STEPS) * step, south, (y + ny + _RIM_STEPS) * step
-    )
+    records = cloud.inside(west, (x + nx + _RIM_STEPS) * step, south, (y + ny + _RIM_STEPS) * step)
     if len(records) < _NEIGHBOURS:
         return nothing
     points = np.column_stack([records[axis].astype(np.float64) for axis in "xyz"]) / step
     normals = np.column_stack([records[f"n{axis}"].astype(np.float64) for axis in "xyz"])
     weights = np.ones(len(points))
     if "sigma" in (records.dtype.names or ()):
-        ratio = task.sigma / np.maximum(records["sigma"].astype(np.float64), 1e-3 * task.sigma)
+        ratio = sigma / np.maximum(records["sigma"].astype(np.float64), 1e-3 * sigma)
         weights = np.minimum(ratio * ratio, _MOST_WEIGHT)
     sound = np.isfinite(normals).all(axis=1) & np.isfinite(weights) & (weights > 0)
     points, normals, weights = points[sound], normals[sound], weights[sound]
@@ -170,11 +177,10 @@ def mesh_tile(task: SurfaceTask) -> Piece:
     near = np.asarray(cKDTree(points).query(vertices, k=_NEIGHBOURS)[0])
     kept = (near[:, 0] <= TRIM_STEPS) & (near[:, -1] <= _NEIGHBOURHOOD_STEPS)
     triangles = triangulated(vertices, quads[kept[quads].all(axis=1)])
-    triangles = without_folds(vertices, triangles)
     shared = (cells[:, 0] == 0) | (cells[:, 0] == nx) | (cells[:, 1] == 0) | (cells[:, 1] == ny)
-    vertices, triangles, source = split_fans(vertices, triangles)
+    vertices, triangles, source = clean(vertices, triangles)
     keys = _keys(cells[source].astype(np.int64) + np.array(first), shared[source])
-    fewer = decimate(vertices, triangles, shared[source], task.error / step)
+    fewer = decimate(vertices, triangles, shared[source], error / step)
     return Piece(vertices=fewer.vertices * step, triangles=fewer.triangles, keys=keys[fewer.source])
 
 
@@ -258,3 +264,187 @@ def _decimate_blocks(
             )
         )
     return weld(pieces)
+
+
+@compiled
+def splat(
+    points: Array,
+    normals: Array,
+    weights: Array,
+    first: tuple[int, int, int],
+    shape: tuple[int, int, int],
+) -> NDArray[np.float64]:
+    """The implicit function at the nodes of a block of the lattice.
+
+    Args:
+        points: (N, 3) in lattice steps from the lattice's origin.
+        normals: (N, 3) unit vectors, out of the ground.
+        weights: (N,) of the points.
+        first: number of the block's first node along x, y, z.
+        shape: nodes of the block.
+
+    Returns:
+        (X, Y, Z) in lattice steps, positive outside of the ground; NaN without a point in reach.
+        A node's value does not depend on the block, if all points in its reach are there.
+    """
+    moment = np.zeros(shape)
+    total = np.zeros(shape)
+    for i in range(points.shape[0]):
+        x0 = max(math.ceil(points[i, 0] - REACH_STEPS), first[0])
+        x1 = min(math.floor(points[i, 0] + REACH_STEPS), first[0] + shape[0] - 1)
+        y0 = max(math.ceil(points[i, 1] - REACH_STEPS), first[1])
+        y1 = min(math.floor(points[i, 1] + REACH_STEPS), first[1] + shape[1] - 1)
+        z0 = max(math.ceil(points[i, 2] - REACH_STEPS), first[2])
+        z1 = min(math.floor(points[i, 2] + REACH_STEPS), first[2] + shape[2] - 1)
+        for x in range(x0, x1 + 1):
+            a = x - points[i, 0]
+            for y in range(y0, y1 + 1):
+                b = y - points[i, 1]
+                for z in range(z0, z1 + 1):
+                    c = z - points[i, 2]
+                    square = a * a + b * b + c * c
+                    if square > REACH_STEPS * REACH_STEPS:
+                        continue
+                    w = weights[i] * math.exp(-0.5 * square / (KERNEL_STEPS * KERNEL_STEPS))
+                    over = a * normals[i, 0] + b * normals[i, 1] + c * normals[i, 2]
+                    moment[x - first[0], y - first[1], z - first[2]] += w * over
+                    total[x - first[0], y - first[1], z - first[2]] += w
+    for x in range(shape[0]):
+        for y in range(shape[1]):
+            for z in range(shape[2]):
+                if total[x, y, z] > 0.0:
+                    moment[x, y, z] /= total[x, y, z]
+                else:
+                    moment[x, y, z] = np.nan
+    return moment
+
+
+@compiled
+def zero_mesh(values: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
+    """Mesh the zero of a function on a lattice.
+
+    Quadrilaterals around edges that start in the first cells along any axis are left to the block
+    before, of which those cells are the last.
+
+    Args:
+        values: (X, Y, Z) at the nodes; NaN where unknown (such a cell holds no surface).
+
+    Returns:
+        Vertices, (V, 3) in steps from the block's first node; their cells, (V, 3); and
+        quadrilaterals, (Q, 4), counter-clockwise seen from where the function is positive.
+    """
+    nx, ny, nz = values.shape
+    number = np.full((max(nx - 1, 0), max(ny - 1, 0), max(nz - 1, 0)), -1, np.int32)
+    count = 0
+    for x in range(nx - 1):
+        for y in range(ny - 1):
+            for z in range(nz - 1):
+                below = 0
+                known = True
+                for corner in range(8):
+                    v = values[x + (corner & 1), y + ((corner >> 1) & 1), z + (corner >> 2)]
+                    if math.isnan(v):
+                        known = False
+                        break
+                    if v < 0.0:
+                        below += 1
+                if known and 0 < below < 8:
+                    number[x, y, z] = count
+                    count += 1
+    vertices = np.empty((count, 3))
+    cells = np.empty((count, 3), np.int32)
+    for x in range(nx - 1):
+        for y in range(ny - 1):
+            for z in range(nz - 1):
+                if number[x, y, z] >= 0:
+                    n = number[x, y, z]
+                    cells[n, 0], cells[n, 1], cells[n, 2] = x, y, z
+                    _place(values[x : x + 2, y : y + 2, z : z + 2], vertices[n])
+                    vertices[n, 0] += x
+                    vertices[n, 1] += y
+                    vertices[n, 2] += z
+    quads = np.empty((3 * count, 4), np.int32)
+    made = 0
+    around = np.empty(4, np.int32)
+    step = np.zeros(3, np.int64)
+    for n in range(count):
+        x, y, z = cells[n, 0], cells[n, 1], cells[n, 2]
+        if x == 0 or y == 0 or z == 0:
+            continue
+        for axis in range(3):
+            # the lattice edge from this cell's first node along the axis
+            step[:] = 0
+            step[axis] = 1
+            b, c = (axis + 1) % 3, (axis + 2) % 3
+            start, end = values[x, y, z], values[x + step[0], y + step[1], z + step[2]]
+            if (start < 0.0) == (end < 0.0):
+                continue
+            for k in range(4):
+                i = cells[n].copy()
+                if k == 1 or k == 2:
+                    i[b] -= 1
+                if k >= 2:
+                    i[c] -= 1
+                around[k] = number[i[0], i[1], i[2]]
+            if around.min() < 0:
+                continue
+            for k in range(4):
+                quads[made, k] = around[k] if start < 0.0 else around[3 - k]
+            made += 1
+    return vertices, cells, quads[:made].copy()
+
+
+@compiled
+def _place(corner: Array, out: Array) -> None:
+    """The vertex of one cell: the mean crossing of its edges, moved onto the zero within the cell.
+
+    Args:
+        corner: (2, 2, 2) values.
+        out: (3,) filled, 0 to 1 in the cell.
+    """
+    out[:] = 0.0
+    crossings = 0
+    for axis in range(3):
+        for k in range(4):
+            i, j = k & 1, k >> 1
+            if axis == 0:
+                a, b = corner[0, i, j], corner[1, i, j]
+            elif axis == 1:
+                a, b = corner[j, 0, i], corner[j, 1, i]
+            else:
+                a, b = corner[i, j, 0], corner[i, j, 1]
+            if (a < 0.0) == (b < 0.0):
+                continue
+            t = a / (a - b)
+            crossings += 1
+            out[axis] += t
+            if axis == 0:
+                out[1] += i
+                out[2] += j
+            elif axis == 1:
+                out[2] += i
+                out[0] += j
+            else:
+                out[0] += i
+                out[1] += j
+    for axis in range(3):
+        out[axis] /= crossings
+    for _ in range(_NEWTON_STEPS):
+        u, v, w = out[0], out[1], out[2]
+        f, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+        for i in range(2):
+            p, dp = (u, 1.0) if i else (1.0 - u, -1.0)
+            for j in range(2):
+                q, dq = (v, 1.0) if j else (1.0 - v, -1.0)
+                for k in range(2):
+                    r, dr = (w, 1.0) if k else (1.0 - w, -1.0)
+                    f += corner[i, j, k] * p * q * r
+                    gx += corner[i, j, k] * dp * q * r
+                    gy += corner[i, j, k] * p * dq * r
+                    gz += corner[i, j, k] * p * q * dr
+        square = gx * gx + gy * gy + gz * gz
+        if square < 1e-6:
+            return
+        out[0] = min(max(u - f * gx / square, 0.0), 1.0)
+        out[1] = min(max(v - f * gy / square, 0.0), 1.0)
+        out[2] = min(max(w - f * gz / square, 0.0), 1.0)

@@ -1,23 +1,32 @@
-"""Paint the pages of a texture: each picture is read twice, to compare seams and to paint."""
+"""Paint the pages of a texture: each picture is read twice, to compare seams and to paint.
+
+Colour steps between patches of different pictures are levelled over the whole mesh at once. Every
+patch gets a smooth correction, one value a channel at each of its wedges, such that both sides of a
+seam show the same and the corrections change as little as they can within a patch (Lempitsky &
+Ivanov 2007, eq. 5; Waechter et al. 2014, "Let there be color!", eq. 3).
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import cg
 
 from alice_survey.base.compiled import compiled
+from alice_survey.base.errors import warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_wedges
 from reconstruct.mesh.labels import Charts
-from reconstruct.mesh.seam_colours import level_seams, seam_pairs
-from reconstruct.mesh.topology import Triangles
+from reconstruct.mesh.topology import Triangles, edges_of
 from reconstruct.mesh.visibility import to_world
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
@@ -27,6 +36,13 @@ _SEAM_SIGMA_PX = 4.0
 """Sigma of the average around a seam's vertices by which both sides are compared."""
 _MOST_PAGES = 16
 _JPEG_QUALITY = 93
+_MOST_ROWS = 30_000
+"""Most rows for `cv2.remap`, which takes at most 32767."""
+_SMOOTHNESS = 0.1
+"""Weight of a change along an edge within a patch, over that of a step at a seam."""
+_PULL = 1e-4
+"""Weight of the correction itself, which keeps the level of the whole."""
+_TOLERANCE, _MOST_STEPS = 1e-5, 5000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,34 +69,16 @@ class Textured:
 class PagePaintTask:
     """The patches of one view."""
 
-    workspace: Path
-    view: View
-    light: LightModel
-    scale: float
-    sizes: tuple[tuple[int, int], ...]
-    pages: tuple[Path, ...]
-    charts: NDArray[np.int32]
-    """(C,) their numbers."""
-    page: NDArray[np.int32]
-    corner: NDArray[np.int64]
-    source: NDArray[np.int64]
-    box: NDArray[np.int64]
+    view: View | None
+    """None for what no view sees, which has the colours of the cloud."""
+    atlas: Atlas
+    """Of these patches."""
     pixels: tuple[Array, ...]
     """Per patch (W, 2) its wedges in the picture as scaled."""
     corrections: tuple[Float32, ...]
     """Per patch (W, 3), BGR."""
     triangles: tuple[Triangles, ...]
     """Per patch (T, 3) of its own wedges."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SeamTask:
-    """The wedges of one view at seams."""
-
-    workspace: Path
-    view: View
-    light: LightModel
-    pixels: Array
 
 
 def paint(
@@ -124,10 +122,8 @@ def paint(
     for path, (width, height) in zip(scratch, atlas.sizes, strict=True):
         np.memmap(path, np.uint8, "w+", shape=(height, width, 3)).flush()
     placed = pixels * atlas.scale
-    tasks = _paint_tasks(
-        workspace, atlas, wedges, charts, views, light, placed, corrections, scratch
-    )
-    for _ in executor.map(paint_view, tasks, label="paint"):
+    tasks = _paint_tasks(atlas, wedges, charts, views, placed, corrections)
+    for _ in executor.map(partial(paint_view, workspace, light, scratch), tasks, label="paint"):
         pass
     on_page = atlas.place(pixels, wedges.chart)
     pages, colours = [], np.zeros((len(vertices), 3))
@@ -204,25 +200,47 @@ def even_colour(pictures: Pictures, view: View, light: LightModel) -> Float32:
     return even
 
 
-def seam_colours(task: SeamTask) -> Float32:
-    """Mean colour around pixels of one view, (N, 3) BGR; NaN where nothing usable is near."""
-    pictures = Pictures.open(task.workspace)
-    even = even_colour(pictures, task.view, task.light)
-    weight = pictures.valid(task.view.image).astype(np.float32)
+def seam_colours(workspace: Path, light: LightModel, task: tuple[View, Array]) -> Float32:
+    """Mean colour around pixels (N, 2) of one view, (N, 3) BGR; NaN where nothing usable is near.
+
+    Args:
+        workspace: with the pictures.
+        light: of the survey.
+        task: the view and the pixels.
+    """
+    view, pixels = task
+    pictures = Pictures.open(workspace)
+    even = even_colour(pictures, view, light)
+    weight = pictures.valid(view.image).astype(np.float32)
     even *= weight[..., None]
     total = cv2.GaussianBlur(even, (0, 0), _SEAM_SIGMA_PX)
     share = cv2.GaussianBlur(weight, (0, 0), _SEAM_SIGMA_PX)
-    x = (task.pixels[:, 0] - 0.5).astype(np.float32).reshape(-1, 1)
-    y = (task.pixels[:, 1] - 0.5).astype(np.float32).reshape(-1, 1)
     sums, shares = (
-        cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        remapped(picture, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
         for picture in (total, share)
     )
-    shares = shares.reshape(-1, 1)
     found: Float32 = np.where(
-        shares > 0.1, sums.reshape(-1, 3) / np.maximum(shares, 0.1), np.float32(np.nan)
+        shares[:, None] > 0.1, sums / np.maximum(shares, 0.1)[:, None], np.float32(np.nan)
     )
     return found
+
+
+def remapped(picture: NDArray[Any], pixels: Array, interpolation: int, border: int) -> NDArray[Any]:
+    """What OpenCV finds in a picture (H, W, ...) at pixels (N, 2), (N, ...).
+
+    Beyond the picture it is what the border's mode says, NaN for a constant one.
+    """
+    at = np.nan_to_num(pixels - 0.5, nan=-1e4).astype(np.float32)
+    parts = [np.empty((0, *picture.shape[2:]), picture.dtype)]
+    for first in range(0, len(at), _MOST_ROWS):
+        x, y = at[first : first + _MOST_ROWS].T[:, :, None]
+        parts.append(
+            cv2.remap(
+                picture, np.ascontiguousarray(x), np.ascontiguousarray(y), interpolation,
+                borderMode=border, borderValue=np.nan,
+            )[:, 0]
+        )  # fmt: skip
+    return np.concatenate(parts)
 
 
 def _corrections(
@@ -240,27 +258,69 @@ def _corrections(
     at_seam[seam_pairs(wedges)] = True
     at_seam &= label >= 0
     groups = [np.flatnonzero(at_seam & (label == n)) for n in np.unique(label[at_seam])]
-    tasks = [
-        SeamTask(workspace=workspace, view=views[label[g[0]]], light=light, pixels=pixels[g])
-        for g in groups
-    ]
+    tasks = [(views[label[group[0]]], pixels[group]) for group in groups]
+    compare = partial(seam_colours, workspace, light)
     colours = np.full((len(label), 3), np.nan)
-    found = executor.map(seam_colours, tasks, label="compare seams")
+    found = executor.map(compare, tasks, label="compare seams")
     for group, colour in zip(groups, found, strict=True):
         colours[group] = colour
     return level_seams(wedges, colours, label >= 0)
 
 
+def seam_pairs(wedges: Wedges) -> NDArray[np.int64]:
+    """(S, 2) wedges of one vertex in different patches, each next to the one before."""
+    order = np.argsort(wedges.vertex, kind="stable")
+    same = wedges.vertex[order][1:] == wedges.vertex[order][:-1]
+    return np.stack([order[:-1][same], order[1:][same]], axis=1).astype(np.int64)
+
+
+@progress.step("level colours")
+def level_seams(wedges: Wedges, colours: Array, free: NDArray[np.bool_]) -> Array:
+    """Corrections (W, 3) to add to the colours of patches.
+
+    Args:
+        wedges: of the mesh.
+        colours: (W, 3) what the patch's picture shows around the wedge; used at seams only.
+        free: (W,) wedges that may be corrected; others stay at 0.
+    """
+    pairs = seam_pairs(wedges)
+    pairs = pairs[np.isfinite(colours[pairs]).all(axis=(1, 2))]
+    edges, _ = edges_of(wedges.triangles)
+    count = len(wedges.vertex)
+    gain = _laplacian(pairs, 1.0, count) + _laplacian(edges, _SMOOTHNESS, count)
+    gain = (gain + diags_array(np.full(count, _PULL))).tocsr()
+    kept = np.flatnonzero(free)
+    system = csr_array(gain[kept][:, kept])
+    inverse = diags_array(1.0 / system.diagonal())
+    result = np.zeros((count, 3))
+    for channel in range(3):
+        step = colours[pairs[:, 1], channel] - colours[pairs[:, 0], channel]
+        target = np.bincount(pairs[:, 0], step, count) - np.bincount(pairs[:, 1], step, count)
+        if not np.any(target[kept]):
+            continue
+        solution, failed = cg(system, target[kept], rtol=_TOLERANCE, maxiter=_MOST_STEPS, M=inverse)
+        if failed:
+            warn(f"colours of the mesh (channel {channel}) are not levelled to {_TOLERANCE:g}")
+        result[kept, channel] = solution
+    return result
+
+
+def _laplacian(pairs: NDArray[np.int64], weight: float, count: int) -> csr_array:
+    one, other = pairs[:, 0], pairs[:, 1]
+    values = np.full(len(pairs), weight)
+    rows = np.concatenate([one, other, one, other])
+    columns = np.concatenate([one, other, other, one])
+    entries = np.concatenate([values, values, -values, -values])
+    return coo_array((entries, (rows, columns)), (count, count)).tocsr()
+
+
 def _paint_tasks(
-    workspace: Path,
     atlas: Atlas,
     wedges: Wedges,
     charts: Charts,
     views: Sequence[View],
-    light: LightModel,
     placed: Array,
     corrections: Array,
-    pages: tuple[Path, ...],
 ) -> list[PagePaintTask]:
     """One task for each view with patches; the last for what no view sees."""
     count = len(charts.views)
@@ -277,17 +337,14 @@ def _paint_tasks(
         members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
             PagePaintTask(
-                workspace=workspace,
-                view=views[max(number, 0)],
-                light=light,
-                scale=atlas.scale if number >= 0 else 0.0,
-                sizes=atlas.sizes,
-                pages=pages,
-                charts=mine.astype(np.int32),
-                page=atlas.page[mine],
-                corner=atlas.corner[mine],
-                source=atlas.source[mine],
-                box=atlas.box[mine],
+                view=views[number] if number >= 0 else None,
+                atlas=replace(
+                    atlas,
+                    page=atlas.page[mine],
+                    corner=atlas.corner[mine],
+                    source=atlas.source[mine],
+                    box=atlas.box[mine],
+                ),
                 pixels=tuple(placed[m] for m in members),
                 corrections=tuple(corrections[m].astype(np.float32) for m in members),
                 triangles=tuple(
@@ -299,44 +356,52 @@ def _paint_tasks(
     return tasks
 
 
-def paint_view(task: PagePaintTask) -> None:
-    """Write the patches of one view into the pages; no two views write to the same pixel."""
-    plain = task.scale == 0.0
+def paint_view(
+    workspace: Path, light: LightModel, files: tuple[Path, ...], task: PagePaintTask
+) -> None:
+    """Write the patches of one view into the pages; no two views write to the same pixel.
+
+    Args:
+        workspace: with the pictures.
+        light: of the survey.
+        files: of the pages.
+        task: the patches.
+    """
+    atlas = task.atlas
     pages = [
         np.memmap(path, np.uint8, "r+", shape=(height, width, 3))
-        for path, (width, height) in zip(task.pages, task.sizes, strict=True)
+        for path, (width, height) in zip(files, atlas.sizes, strict=True)
     ]
     picture = np.zeros((1, 1, 3), np.float32)
     valid = np.ones((1, 1), np.uint8)
-    if not plain:
-        pictures = Pictures.open(task.workspace)
-        picture = even_colour(pictures, task.view, task.light)
+    if task.view is not None:
+        pictures = Pictures.open(workspace)
+        picture = even_colour(pictures, task.view, light)
         valid = pictures.valid(task.view.image).astype(np.uint8)
-        if task.scale < 1.0:
+        if atlas.scale < 1.0:
             size = (
-                max(1, round(picture.shape[1] * task.scale)),
-                max(1, round(picture.shape[0] * task.scale)),
+                max(1, round(picture.shape[1] * atlas.scale)),
+                max(1, round(picture.shape[0] * atlas.scale)),
             )
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
             valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
-    for i in range(len(task.charts)):
-        (width, height), (x, y) = task.box[i], task.source[i]
+    for i, (corners, values, triangles) in enumerate(
+        zip(task.pixels, task.corrections, task.triangles, strict=True)
+    ):
+        (width, height), (x, y) = atlas.box[i], atlas.source[i]
         columns = np.clip(np.arange(x, x + width), 0, picture.shape[1] - 1)
         rows = np.clip(np.arange(y, y + height), 0, picture.shape[0] - 1)
         crop = picture[np.ix_(rows, columns)]
         usable = valid[np.ix_(rows, columns)] > 0
         correction, covered = spread_corners(
-            task.pixels[i] - task.source[i],
-            task.triangles[i],
-            task.corrections[i],
-            (int(height), int(width)),
+            corners - atlas.source[i], triangles, values, (int(height), int(width))
         )
         nearest = _nearest(covered)
         patch = crop + correction[nearest]
         beyond = ~covered & ~usable
         patch[beyond] = patch[nearest][beyond]
-        left, top = task.corner[i]
-        pages[task.page[i]][top : top + height, left : left + width] = np.clip(
+        left, top = atlas.corner[i]
+        pages[atlas.page[i]][top : top + height, left : left + width] = np.clip(
             np.rint(patch), 0, 255
         ).astype(np.uint8)
     for page in pages:

@@ -24,6 +24,14 @@ def edges_of(triangles: Triangles) -> tuple[NDArray[np.int64], NDArray[np.int64]
     return np.stack([key // base, key % base], axis=1), edge.reshape(-1)
 
 
+def twin_sides(edge: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Both sides of each edge that has exactly two, by the edge of every side."""
+    order = np.argsort(edge, kind="stable")
+    count = np.bincount(edge)
+    first = (np.cumsum(count) - count)[count == 2]
+    return order[first], order[first + 1]
+
+
 def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
     """Quadrilaterals cut along their shorter diagonal."""
     corners = vertices[quads]
@@ -34,7 +42,7 @@ def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
 
 
 def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
-    """Triangles less those without area and those at edges that more than two share."""
+    """Triangles without those that have no area and those at edges that more than two share."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     longest = np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c))
@@ -55,15 +63,7 @@ def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles,
     Returns:
         Vertices, triangles, and of which vertex each is a copy.
     """
-    edges, edge = edges_of(triangles)
-    order = np.argsort(edge, kind="stable")
-    first = order[np.searchsorted(edge[order], np.arange(len(edges)))]
-    count = np.bincount(edge, minlength=len(edges))
-    twin = np.where(count == 2, order[np.minimum(
-        np.searchsorted(edge[order], np.arange(len(edges))) + 1, max(len(order) - 1, 0)
-    )], -1)  # fmt: skip
-    shared = twin >= 0
-    one, other = first[shared], twin[shared]
+    one, other = twin_sides(edges_of(triangles)[1])
     corner = np.arange(triangles.size)
     end = corner // 3 * 3 + (corner + 1) % 3
     flat = triangles.reshape(-1)
@@ -80,6 +80,11 @@ def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles,
     place[order] = np.arange(total, dtype=np.int32)
     split: Triangles = np.asarray(place[fan], np.int32).reshape(-1, 3)
     return vertices[source[order]], split, source[order]
+
+
+def clean(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:
+    """Without folds, and with fans split; returns as `split_fans`."""
+    return split_fans(vertices, without_folds(vertices, triangles))
 
 
 def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.int32], Array]:
@@ -100,31 +105,30 @@ def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.i
 
 def face_areas(vertices: Array, triangles: Triangles) -> Array:
     """(T,) areas in squared units of length."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    areas: Array = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas: Array = 0.5 * np.linalg.norm(_crosses(vertices, triangles), axis=1)
     return areas
 
 
 def face_normals(vertices: Array, triangles: Triangles) -> Array:
     """(T, 3) unit normals; 0 of a triangle without area."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    unit: Array = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    return unit
+    return _unit(_crosses(vertices, triangles))
 
 
 def vertex_normals(vertices: Array, triangles: Triangles) -> Array:
     """(V, 3) unit normals weighted by the area of the faces around."""
+    normal = np.repeat(_crosses(vertices, triangles), 3, axis=0)
+    around = [np.bincount(triangles.ravel(), normal[:, k], len(vertices)) for k in range(3)]
+    return _unit(np.stack(around, axis=1))
+
+
+def _crosses(vertices: Array, triangles: Triangles) -> Array:
+    """(T, 3) cross products of two sides: along the normals, twice the areas long."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    total = np.stack(
-        [
-            np.bincount(triangles.ravel(), np.repeat(normal[:, k], 3), len(vertices))
-            for k in range(3)
-        ],
-        axis=1,
-    )
-    unit: Array = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    return np.cross(b - a, c - a)
+
+
+def _unit(vectors: Array) -> Array:
+    unit: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
     return unit
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
-from reconstruct.mesh.topology import Triangles, face_normals
+from reconstruct.mesh.topology import Triangles, face_areas, face_normals
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 
@@ -30,29 +30,6 @@ _SHRINK = 0.8
 _ENU_TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-@dataclass(frozen=True, kw_only=True)
-class SightTask:
-    """One view to find the faces of."""
-
-    mesh: Path
-    """File of `save_geometry`."""
-    workspace: Path
-    number: int
-    view: View
-    lift: float
-    """How far over the surface lines of sight start, in the unit of the vertices."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Sight:
-    """Faces that one view sees."""
-
-    number: int
-    faces: NDArray[np.int32]
-    quality: NDArray[np.float32]
-    """(N,) pixels a unit of length, less towards the rim of the picture."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
     """The best views of every face, best first."""
@@ -69,55 +46,53 @@ def to_world(points_enu: Array, offset_enu: Array) -> Array:
     return world
 
 
-def save_geometry(path: Path, vertices: Array, triangles: Triangles, offset_enu: Array) -> None:
-    """Keep a mesh where processes find it."""
-    np.savez(path, vertices=vertices, triangles=triangles, offset=offset_enu)
-
-
 def find_candidates(
     mesh: Path, faces: int, workspace: Path, views: Sequence[View], lift: float, executor: Executor
 ) -> Candidates:
     """The best views of every face.
 
     Args:
-        mesh: file of `save_geometry`.
+        mesh: file of its vertices and triangles, and of the offset of its coordinates.
         faces: how many it has.
         workspace: with the pictures.
         views: to choose from.
-        lift: see `SightTask`.
+        lift: how far over the surface lines of sight start, in the unit of the vertices.
         executor: where tasks run.
     """
-    tasks = [
-        SightTask(mesh=mesh, workspace=workspace, number=number, view=view, lift=lift)
-        for number, view in enumerate(views)
-    ]
     numbers = np.full((faces, CANDIDATES), -1, np.int32)
     quality = np.zeros((faces, CANDIDATES), np.float32)
-    for sight in executor.map(see_faces, tasks, label="lines of sight"):
-        mine, rows = sight.quality, sight.faces
+    find = partial(see_faces, mesh, workspace, lift)
+    for number, (rows, mine) in enumerate(executor.map(find, views, label="lines of sight")):
         worst = quality[rows, -1] < mine
         rows, mine = rows[worst], mine[worst]
-        quality[rows, -1], numbers[rows, -1] = mine, sight.number
+        quality[rows, -1], numbers[rows, -1] = mine, number
         order = np.argsort(-quality[rows], axis=1, kind="stable")
         quality[rows] = np.take_along_axis(quality[rows], order, axis=1)
         numbers[rows] = np.take_along_axis(numbers[rows], order, axis=1)
     return Candidates(views=numbers, quality=quality)
 
 
-def see_faces(task: SightTask) -> Sight:
-    """The faces that a view sees whole, unmasked, from their front."""
-    vertices, triangles, offset, scene, spheres = _geometry(task.mesh, task.mesh.stat().st_mtime_ns)
-    view = task.view
+def see_faces(
+    mesh: Path, workspace: Path, lift: float, view: View
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The faces that a view sees whole, unmasked, from their front.
+
+    Args:
+        mesh: as `find_candidates` takes it.
+        workspace: with the pictures.
+        lift: of lines of sight.
+        view: that looks.
+
+    Returns:
+        (N,) faces, and (N,) pixels a unit of length, fewer towards the rim of the picture.
+    """
+    vertices, triangles, offset, scene, spheres = _geometry(mesh, mesh.stat().st_mtime_ns)
     near = vertices_near(view, vertices, spheres, offset)
-    valid = Pictures.open(task.workspace).valid(view.image)
+    valid = Pictures.open(workspace).valid(view.image)
     pixels = np.full((len(vertices), 2), np.nan)
     pixels[near] = view.project(to_world(vertices[near], offset))
-    inside = usable_pixels(pixels, valid)
-    faces = np.flatnonzero(inside[triangles].all(axis=1))
-    return Sight(
-        number=task.number,
-        **_quality(vertices, triangles, faces, pixels, view, offset, scene, task.lift),
-    )
+    faces = np.flatnonzero(usable_pixels(pixels, valid)[triangles].all(axis=1))
+    return _quality(vertices, triangles, faces, pixels, view, offset, scene, lift)
 
 
 def vertices_near(
@@ -167,7 +142,7 @@ def _quality(
     offset: Array,
     scene: Any,
     lift: float,
-) -> dict[str, Any]:
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     import open3d as o3d
 
     camera = view.world_from_cam.translation @ _ENU_TO_NED - offset
@@ -180,8 +155,7 @@ def _quality(
     p = pixels[triangles[faces]]
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area_px = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = 0.5 * np.linalg.norm(np.cross(e, f), axis=1)
+    area = face_areas(vertices, triangles[faces])
     facing = (cosine > _LEAST_COSINE) & (area > 0)
     towards = middle[:, None] * (1 - _SHRINK) + corners * _SHRINK
     spots = np.concatenate([middle[:, None], towards], axis=1)
@@ -197,10 +171,8 @@ def _quality(
     size = np.array([view.width_px, view.height_px])
     inset = np.minimum(p[seen], size - p[seen]).min(axis=(1, 2)) / (0.5 * size.min())
     taper = np.clip(inset, 0.02, 1.0)
-    return {
-        "faces": faces[seen].astype(np.int32),
-        "quality": (np.sqrt(area_px[seen] / area[seen]) * np.sqrt(taper)).astype(np.float32),
-    }
+    quality = np.sqrt(area_px[seen] / area[seen]) * np.sqrt(taper)
+    return faces[seen].astype(np.int32), quality.astype(np.float32)
 
 
 @lru_cache(maxsize=1)

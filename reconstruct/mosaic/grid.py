@@ -1,6 +1,6 @@
 """Pixels of the mosaic, its tiles, the views that reach each, and the surface below them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -175,17 +175,13 @@ def height_range(raster: rasterio.DatasetReader) -> tuple[float, float]:
         ReconstructionError: it has no cell.
     """
     low, high = np.inf, -np.inf
-    for block in _blocks(raster):
+    for _, window in raster.block_windows(1):
+        block = raster.read(1, window=window)
         if np.isfinite(block).any():
             low, high = min(low, float(np.nanmin(block))), max(high, float(np.nanmax(block)))
     if low > high:
         raise ReconstructionError(f"{raster.name} has no cell with a height to paint on")
     return low, high
-
-
-def _blocks(raster: rasterio.DatasetReader) -> Iterator[Float32]:
-    for _, window in raster.block_windows(1):
-        yield raster.read(1, window=window)
 
 
 def dem_around(

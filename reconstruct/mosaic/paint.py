@@ -257,23 +257,23 @@ def paint_tile(task: PaintTask) -> Painted:
     named = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
     named[~np.isfinite(surface.height)] = 0
     source = np.zeros((grid.rows, grid.columns), np.int32)
-    sights = {}
+    seen_by = {}
     for entry in used:  # pixels of a cell that its view does not see go to the best that does
         value = entry.number + 1
         wanted = cv2.dilate((label == value).astype(np.uint8), _AROUND) > 0
         part, box = _box(wanted)
         sight = _sight_of(task, entry, surface.part(*part), wanted[box])
-        sights[value] = (entry, part, sight, wanted[box])
+        seen_by[value] = (entry, part, sight, wanted[box])
         source[part][(named[part] == value) & (sight.quality > 0)] = value
     left = (named > 0) & (source == 0)
     if left.any():
         best = np.zeros(left.shape, np.float32)
-        for value, (_, part, sight, _) in sights.items():
+        for value, (_, part, sight, _) in seen_by.items():
             better = left[part] & (sight.quality > best[part])
             best[part][better] = sight.quality[better]
             source[part][better] = value
     blend = Blend(grid.rows, grid.columns)
-    for value, (entry, part, sight, wanted) in sights.items():
+    for value, (entry, part, sight, wanted) in seen_by.items():
         taken = source[part] == value
         if not taken.any():
             continue

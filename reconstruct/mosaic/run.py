@@ -236,6 +236,7 @@ def _dispersion(
     """The water through which colours are distinguished, or None, and what to say about it."""
     lenses = read_lenses(workspace / "sparse" / "cameras.json").values()
     ports = any(isinstance(lens, FlatPortLens) and lens.camera.n_water > 1 for lens in lenses)
+    about = workspace / "images" / "survey.json"
     reason = ""
     if wanted == "off":
         reason = "switched off"
@@ -243,7 +244,7 @@ def _dispersion(
         reason = "no flat port"
     elif grey:
         reason = "grey pictures"
-    elif wanted == "auto" and _simulated(workspace):
+    elif wanted == "auto" and PicturesRecord.read(about).source == "simulated":
         reason = "rendered pictures have none"
     if reason:
         return None, {"corrected": False, "reason": reason}
@@ -254,10 +255,6 @@ def _dispersion(
         "salinity_psu": water.salinity_psu,
         "water_stated": stated,
     }
-
-
-def _simulated(workspace: Path) -> bool:
-    return PicturesRecord.read(workspace / "images" / "survey.json").source == "simulated"
 
 
 def _sea(config: WaterConfig, depth_m: float) -> tuple[Water, bool]:

@@ -12,15 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from alice_survey.base.artefacts import need_stage, read_json
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig, read_rig
+from camera_calib.triangulate import nearest_to_rays
+from reconstruct.evaluate.elevation import read_elevation
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
@@ -203,12 +204,8 @@ def _in_pair(
     rig = read_rig(folder / "rig.json")
     with taken_from(folder / "pair.json"):
         first, second = (lens_from_json(lens) for lens in about["lenses"])
-        if not 0.0 < float(about["scale"]) <= 1.0:
-            raise ValueError(f"scale = {about['scale']}")
-        inflation = float(about["inflation"])
-        left, pictures = str(about["left"]), [str(name) for name in about["pictures"]]
-        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in pictures):
-            raise ValueError("pictures outside of its folder")
+        scale, inflation = float(about["scale"]), float(about["inflation"])
+        left, pictures = str(about["left"]), [folder / name for name in about["pictures"]]
     if not isinstance(first, FlatPortLens) or not isinstance(second, FlatPortLens):
         raise WorkspaceError(f"{folder / 'pair.json'}: its lenses are not those of a rig")
     optics = PairOptics(rig=stereo_rig(rig), lenses=(first, second))
@@ -217,16 +214,14 @@ def _in_pair(
             raise ReconstructionError("points of a pair are x,y in its left picture")
     taken = np.array([[p[0].x, p[0].y] for p in picks])
     _check_inside(taken, first, left)
-    views = tuple(scaled_view(view, about["scale"]) for view in optics.views)
-    paths = tuple(folder / name for name in pictures)
-    greys = pair_samplers(optics, (paths[0], paths[1]), (views[0], views[1]))
+    view, other = (scaled_view(view, scale) for view in optics.views)
+    greys = pair_samplers(optics, (pictures[0], pictures[1]), (view, other))
     depth_map = read_depth(folder)
-    view = views[0]
     ratio = np.array([view.width_px, view.height_px]) / [
         first.pinhole.width_px, first.pinhole.height_px
     ]  # fmt: skip
     pixels = first.to_pinhole(taken) * ratio
-    found = precise_depth((views[0], views[1]), greys, depth_map, pixels)
+    found = precise_depth((view, other), greys, depth_map, pixels)
     lost = np.flatnonzero(~np.isfinite(found.depth))
     if len(lost):
         x, y = taken[lost[0]] - 0.5
@@ -270,9 +265,7 @@ def _calibration(rig: Rig, pixels: Array, n_water_sigma: float) -> tuple[Array, 
         names = list(rig.cameras)[:2]
         water, _ = calibration_slopes(rig, pixels, {f"{n}.n_water": n_water_sigma for n in names})
         slopes = np.concatenate([slopes, water.sum(axis=0, keepdims=True)])
-        wider = np.zeros((len(matrix) + 1, len(matrix) + 1))
-        wider[:-1, :-1], wider[-1, -1] = matrix, n_water_sigma**2
-        matrix = wider
+        matrix = block_diag(matrix, [n_water_sigma**2])
     return slopes, matrix
 
 
@@ -294,7 +287,7 @@ def _in_workspace(
         raise ReconstructionError("the model has no scale: lengths in it are not metres")
     pictures = Pictures.open(workspace)
     views = {view.image: view for view in model.views}
-    points, own, notes = [], [], []
+    points, own = [], []
     surface = None
     for pick in picks:
         rays = []
@@ -310,11 +303,10 @@ def _in_workspace(
         if len(rays) == 2:
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
-            surface = surface or _DemSurface(need_stage(workspace, "dense", "reconstruct"))
+            surface = surface or _Surface(workspace)
             point, covariance = _on_surface(surface, *rays[0], pick_sigma_px)
         points.append(point)
         own.append(covariance)
-    notes.append("sigmas count pixels and surface, not the scale and bend of the whole model")
     turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     return Located(
         points=np.stack(points) @ turn,
@@ -322,7 +314,7 @@ def _in_workspace(
         shared=np.zeros((0, len(points), 3)),
         parameters=np.zeros((0, 0)),
         axes=("east", "north", "up"),
-        notes=tuple(notes),
+        notes=("sigmas count pixels and surface, not the scale and bend of the whole model",),
     )
 
 
@@ -336,7 +328,6 @@ def _ray(view: View, lens: Lens, taken: Array) -> tuple[Array, Array]:
 
 def _crossed(rays: list[tuple[View, Lens, Array]], sigma_px: float) -> tuple[Array, Array]:
     """The point nearest to two rays, and its covariance."""
-    from camera_calib.triangulate import nearest_to_rays
 
     def solve(taken: list[Array]) -> Array:
         ends = [_ray(v, lens, t) for (v, lens, _), t in zip(rays, taken, strict=True)]
@@ -363,48 +354,23 @@ def _crossed(rays: list[tuple[View, Lens, Array]], sigma_px: float) -> tuple[Arr
     return point, covariance
 
 
-class _DemSurface:
-    """The DEM and its standard deviation."""
+class _Surface:
+    """The DEM of a workspace, and its lowest and highest cell."""
 
-    def __init__(self, dense: Path) -> None:
-        from reconstruct.raster import opened_raster
-
-        with opened_raster(dense / "dem.tif") as raster:
-            self.height = raster.read(1).astype(np.float32)
-            self.transform = raster.transform
-        with opened_raster(dense / "sigma.tif") as raster:
-            self.sigma = raster.read(1).astype(np.float32)
-        self.cell = float(self.transform.a)
-        self.low, self.high = float(np.nanmin(self.height)), float(np.nanmax(self.height))
-
-    def at(self, raster: NDArray[np.float32], points_ned: Array) -> Array:
-        """Bilinear values (N,) under points; NaN outside."""
-        x = (points_ned[:, 1] - self.transform.c) / self.cell - 0.5
-        y = (self.transform.f - points_ned[:, 0]) / self.cell - 0.5
-        return np.concatenate(
-            [
-                cv2.remap(
-                    raster,
-                    x[i : i + 30_000].astype(np.float32)[:, None],
-                    y[i : i + 30_000].astype(np.float32)[:, None],
-                    cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_CONSTANT,
-                    borderValue=np.nan,
-                )[:, 0]
-                for i in range(0, len(x), 30_000)
-            ]
-        ).astype(np.float64)
+    def __init__(self, workspace: Path) -> None:
+        self.dem, _ = read_elevation(workspace)
+        self.low, self.high = float(np.nanmin(self.dem.height)), float(np.nanmax(self.dem.height))
 
     def hit(self, start: Array, direction: Array, lift: float = 0.0) -> Array | None:
         """Where a ray first meets the surface, raised by a height; None where it does not."""
-        down = float(direction[2])
+        down, cell = float(direction[2]), self.dem.cell
         if down <= 1e-6:
             return None
-        first = max(0.0, (-self.high - lift - self.cell - start[2]) / down)
-        last = (-self.low - lift + self.cell - start[2]) / down
-        along = np.arange(first, last + self.cell, _CELL_STEPS * self.cell)
+        first = max(0.0, (-self.high - lift - cell - start[2]) / down)
+        last = (-self.low - lift + cell - start[2]) / down
+        along = np.arange(first, last + cell, _CELL_STEPS * cell)
         points = start + along[:, None] * direction
-        over = -points[:, 2] - self.at(self.height, points) - lift
+        over = -points[:, 2] - self.dem.at(self.dem.height, points[:, [1, 0]]) - lift
         crossed = np.flatnonzero((over[:-1] > 0) & (over[1:] <= 0))
         if not len(crossed):
             return None
@@ -415,7 +381,7 @@ class _DemSurface:
 
 
 def _on_surface(
-    surface: _DemSurface, view: View, lens: Lens, taken: Array, sigma_px: float
+    surface: _Surface, view: View, lens: Lens, taken: Array, sigma_px: float
 ) -> tuple[Array, Array]:
     start, direction = _ray(view, lens, taken)
     point = surface.hit(start, direction)
@@ -424,7 +390,7 @@ def _on_surface(
             f"{view.image}:{taken[0] - 0.5:g},{taken[1] - 0.5:g}: its ray meets no known "
             "surface; pick another pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
         )
-    sigma = float(surface.at(surface.sigma, point[None])[0])
+    sigma = float(surface.dem.at(surface.dem.sigma, point[None, [1, 0]])[0])
     raised = surface.hit(start, direction, lift=sigma)
     moves = [raised - point if raised is not None else sigma * direction]
     for axis in range(2):

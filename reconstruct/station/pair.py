@@ -23,17 +23,22 @@ from alice_survey.base.errors import CalibrationError, ImageError, Reconstructio
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from alice_survey.base.run import progress
+from alice_survey.kit.figure import colour_bar, figure_style, new_figure, save_figure
 from camera_calib.rig import Rig, read_rig, write_rig
 from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
 from reconstruct.dense.matching_trial import matching_scale, shrunk
 from reconstruct.matching.features import find_features
 from reconstruct.matching.matches import match_descriptors
+from reconstruct.mesh.atlas import Wedges
+from reconstruct.mesh.decimate import decimate
+from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
+from reconstruct.mesh.surface import TriangleMesh
+from reconstruct.mesh.texture import Textured, remapped, write_jpeg
+from reconstruct.mesh.topology import clean, split_fans, without_folds
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures, read_colour
-from reconstruct.station.mesh import depth_mesh, write_station_mesh
-from reconstruct.station.plot import plot_pair
-from reconstruct.station.precise import Sampler, inflation, precise_depth, remapped, sampler
+from reconstruct.station.precise import Sampler, inflation, precise_depth, sampler
 from reconstruct.station.solve import PairOptics, matched_points, optics_for, stereo_rig
 from reconstruct.views.model import View, WorldFrame, scaled_view
 
@@ -46,6 +51,13 @@ _RATIO = 0.8
 _AGREE_SIGMAS = 3.0
 """Depths of left and right differ by at most this many standard deviations."""
 _LEAST_SHARE = 0.02
+_MOST_VERTICES = 600_000
+_STEEPEST = 8.0
+"""Change of depth over the length of a side across the picture beyond which a side is a jump."""
+_ERROR_SIGMAS = 0.3
+_GROWTH = 1.4
+_BARS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+"""Lengths of the scale bar to choose from."""
 _SAMPLE = 400
 """Pixels at which the precision of the pair is measured."""
 _FRAME = WorldFrame(
@@ -226,7 +238,12 @@ def dense_pair(
     """
     wanted = min(scale or matching_scale(optics.views[0]), 1.0)
     views = [scaled_view(view, wanted) for view in optics.views]
-    names, opened = open_pair(optics, pictures)
+    names = [str(path.absolute()) for path in pictures]
+    opened = Pictures(
+        Path(),
+        dict(zip(optics.rig.names, optics.lenses, strict=True)),
+        dict(zip(names, optics.rig.names, strict=True)),
+    )
     colours, looks = [], []
     for name, view in zip(names, views, strict=True):
         colour, valid = shrunk(opened, name, (view.width_px, view.height_px))
@@ -236,9 +253,10 @@ def dense_pair(
     for a, b in ((0, 1), (1, 0)):
         found = pair_depth((views[a], views[b]), (looks[a], looks[b]), points, MATCH_SIGMA_PX)
         if found is None:
+            angle = np.rad2deg(optics.rig.second_from_first.rotation.magnitude())
             raise ReconstructionError(
                 "the cameras of the rig share too little of their view for dense matching: their "
-                f"axes are {_angle_deg(optics):.0f} degrees apart"
+                f"axes are {angle:.0f} degrees apart"
             )
         maps.append(found)
     depth = _agreeing(views[0], views[1], maps)
@@ -255,17 +273,6 @@ def dense_pair(
         match_sigma_px=match_sigma,
         inflation=factor,
     )
-
-
-def open_pair(optics: PairOptics, pictures: tuple[Path, Path]) -> tuple[list[str], Pictures]:
-    """The pictures of a pair as their pinholes see them, and their names there."""
-    names = [str(path.absolute()) for path in pictures]
-    opened = Pictures(
-        Path(),
-        dict(zip(optics.rig.names, optics.lenses, strict=True)),
-        dict(zip(names, optics.rig.names, strict=True)),
-    )
-    return names, opened
 
 
 def pair_samplers(
@@ -319,10 +326,6 @@ def _agreeing(left: View, right: View, maps: list[tuple[Float32, Float32]]) -> F
 
 def _centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
     return np.column_stack([columns, rows]).astype(np.float64) + 0.5
-
-
-def _angle_deg(optics: PairOptics) -> float:
-    return float(np.rad2deg(optics.rig.second_from_first.rotation.magnitude()))
 
 
 def _write_depth(folder: Path, found: PairDepth) -> None:
@@ -382,3 +385,137 @@ def _write_cloud(path: Path, found: PairDepth) -> int:
     vertices["red"], vertices["green"], vertices["blue"] = rgb.T
     vertices["sigma"] = found.sigma[rows[known], columns[known]]
     return write_cloud(path, [vertices], (0.0, 0.0, 0.0), _FRAME)
+
+
+@progress.step("make the mesh")
+def depth_mesh(
+    view: View, depth: NDArray[np.float32], sigma: NDArray[np.float32], most: int
+) -> TriangleMesh:
+    """Triangles between the pixels of a depth map, without those across jumps, decimated.
+
+    Args:
+        view: of the depth.
+        depth: (H, W), NaN where unknown: holes stay holes.
+        sigma: (H, W) of it: the mesh keeps within a share of its median.
+        most: triangles.
+
+    Raises:
+        ReconstructionError: no triangle is left.
+    """
+    step = max(1, int(np.ceil(np.sqrt(np.isfinite(depth).sum() / _MOST_VERTICES))))
+    thinned = depth[::step, ::step].astype(np.float64)
+    rows, columns = np.nonzero(np.isfinite(thinned))
+    pixels: Array = np.column_stack([columns, rows]) * float(step) + np.array([0.5, 0.5])
+    vertices = view.at_depth(pixels, thinned[rows, columns])
+    number = np.full(thinned.shape, -1, np.int32)
+    number[rows, columns] = np.arange(len(rows), dtype=np.int32)
+    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
+    c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    # seen from the camera y points down: a, c, b turns left
+    triangles = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
+    triangles = triangles[(triangles >= 0).all(axis=1)]
+    z = thinned[rows, columns][triangles]
+    side = z.mean(axis=1) * step / np.sqrt(view.fx_px * view.fy_px)
+    triangles = triangles[np.ptp(z, axis=1) <= _STEEPEST * side]
+    triangles = without_folds(vertices, triangles)
+    if not len(triangles):
+        raise ReconstructionError("the pair's depths are too scattered to carry a surface")
+    vertices, triangles, _ = split_fans(vertices, triangles)
+    error = _ERROR_SIGMAS * float(np.nanmedian(sigma))
+    while True:
+        fewer = decimate(vertices, triangles, np.zeros(len(vertices), np.bool_), error)
+        vertices, triangles = fewer.vertices, fewer.triangles
+        if len(triangles) <= most:
+            break
+        error *= _GROWTH
+    vertices, triangles, _ = clean(vertices, triangles)
+    return TriangleMesh(vertices=vertices, triangles=triangles, error=error)
+
+
+def write_station_mesh(
+    folder: Path,
+    mesh: TriangleMesh,
+    view: View,
+    colour: NDArray[np.uint8],
+    facts: dict[str, Any],
+) -> None:
+    """Write `mesh.glb`, `mesh.obj` with `mesh.mtl` and `texture_0.jpg`, and `mesh.ply`."""
+    page = folder / "texture_0.jpg"
+    write_jpeg(page, colour)
+    pixels = view.project(mesh.vertices)
+    size = np.array([view.width_px, view.height_px], dtype=np.float64)
+    uv = np.clip(pixels / size, 0.0, 1.0)
+    uv[:, 1] = 1.0 - uv[:, 1]
+    count = len(mesh.vertices)
+    shown = remapped(colour, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+    rgb = np.ascontiguousarray(shown[:, ::-1])
+    vertices = mesh.vertices * [1.0, -1.0, -1.0]
+    textured = Textured(
+        vertices=vertices,
+        wedges=Wedges(
+            vertex=np.arange(count), chart=np.zeros(count, np.int32), triangles=mesh.triangles
+        ),
+        uv=uv,
+        page=np.zeros(len(mesh.triangles), np.int32),
+        pages=(page,),
+        colours=rgb,
+        label=np.zeros(len(mesh.triangles), np.int32),
+        scale=1.0,
+    )
+    comments = [
+        "origin at the left camera's entrance pupil, m",
+        "x right, y up, z towards the camera",
+    ]
+    axes = GLB_AXES.replace("east", "right").replace("north", "up in the picture")
+    about = {"unit": "m", "axes": axes, "left": facts["left"]}
+    write_glb(folder / "mesh.glb", textured, about)
+    write_obj(folder / "mesh.obj", textured, comments)
+    write_mesh_ply(folder / "mesh.ply", vertices, mesh.triangles, rgb, comments)
+
+
+@figure_style()
+def plot_pair(
+    path: Path,
+    view: View,
+    colour: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+) -> None:
+    """Draw the left picture and its depth.
+
+    Args:
+        path: of the picture.
+        view: of the depth.
+        colour: (H, W, 3) BGR.
+        depth: (H, W) m, NaN where unknown.
+        sigma: (H, W) m.
+    """
+    height, width = depth.shape
+    figure = new_figure(1.1 + 5.4 * height / width, 12.0)
+    first, second = figure.subplots(1, 2)
+    middle = float(np.nanmedian(depth))
+    ground = middle / np.sqrt(view.fx_px * view.fy_px)
+    first.imshow(np.ascontiguousarray(colour[..., ::-1]), interpolation="antialiased")
+    bar = max((b for b in _BARS_M if b <= 0.3 * width * ground), default=_BARS_M[0])
+    left, low = 0.06 * width, 0.92 * height
+    first.plot([left, left + bar / ground], [low, low], color="white", lw=4)
+    text = f"{bar:g} m" if bar >= 1 else f"{100 * bar:g} cm"
+    first.text(
+        left, low - 0.025 * height, f"{text} at {middle:.2f} m",
+        color="white", ha="left", va="bottom",
+    )  # fmt: skip
+    first.set_title("left picture, without refraction and distortion")
+    near, far = np.nanpercentile(depth, [1, 99])
+    shown = second.imshow(depth, cmap="viridis_r", vmin=near, vmax=far, interpolation="nearest")
+    second.set_facecolor("white")
+    colour_bar(shown, second, "distance along the axis (m)")
+    second.set_title(
+        f"depth: {np.isfinite(depth).mean():.0%} of the picture, matching sigma "
+        f"{1e3 * float(np.nanmedian(sigma)):.1f} mm",
+        fontsize=10,
+    )
+    for axes in (first, second):
+        axes.grid(visible=False)
+        axes.set_xticks([])
+        axes.set_yticks([])
+    save_figure(figure, path, dpi=120)

@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from reconstruct.mesh.texture import remapped
 from reconstruct.views.lens import Lens
 from reconstruct.views.model import View
 
@@ -34,8 +35,6 @@ _SLOPE_SIGMA_PX = 10.0
 """Sigma of the Gaussian that takes the slope of the surface from the depth map: wider than a patch,
 so that the noise of the map does not bend it."""
 _SPLINE = 5
-_MOST_ROWS = 30_000
-"""Most rows for `cv2.remap`, which takes at most 32767."""
 _LAG_PX = 1
 """Residuals farther apart are independent: the noise of a picture as taken is white, and the spline
 between its pixels joins neighbours only."""
@@ -53,8 +52,6 @@ class PreciseDepth:
     """(N,) before the left pinhole's centre."""
     sigma: Array
     """(N,) sigma from the noise of the pictures alone."""
-    sigma_px: Array
-    """(N,) the same sigma in pixels of disparity."""
     missed_sigmas: Array
     """(N,) how far the patches miss each other across the epipolar line; see `inflation`."""
 
@@ -140,7 +137,6 @@ def precise_depth(
     return PreciseDepth(
         depth=depth,
         sigma=sigma_px * np.abs(per_px) * depth * depth,
-        sigma_px=sigma_px,
         missed_sigmas=np.where(good & (bend > 0), missed, np.nan),
     )
 
@@ -208,24 +204,6 @@ def at_pixels(picture: Float32, pixels: Array) -> Array:
     with np.errstate(invalid="ignore"):
         inside = ((pixels >= 0) & (pixels <= size)).all(axis=1)
     return np.where(inside, found, np.nan)
-
-
-def remapped(picture: NDArray[Any], pixels: Array, interpolation: int, border: int) -> NDArray[Any]:
-    """What OpenCV finds in a picture (H, W, ...) at pixels (N, 2), (N, ...).
-
-    Beyond the picture it is what the border's mode says, NaN for a constant one.
-    """
-    at = np.nan_to_num(pixels - 0.5, nan=-1e4).astype(np.float32)
-    parts = [np.empty((0, *picture.shape[2:]), picture.dtype)]
-    for first in range(0, len(at), _MOST_ROWS):
-        x, y = at[first : first + _MOST_ROWS].T[:, :, None]
-        parts.append(
-            cv2.remap(
-                picture, np.ascontiguousarray(x), np.ascontiguousarray(y), interpolation,
-                borderMode=border, borderValue=np.nan,
-            )[:, 0]
-        )  # fmt: skip
-    return np.concatenate(parts)
 
 
 def _scatter(terms: Array) -> Array:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera
+from camera_calib.freedom import POSE
 from camera_calib.rig import Rig
 from camera_calib.triangulate import triangulate
 from reconstruct.mapping.working_range import ray_passes
@@ -174,14 +175,11 @@ def _changed(rig: Rig, camera: str, field: str, step: float) -> Rig:
         new = old.with_parameters({field: old.parameter(field) + step})
         return replace(rig, cameras={**rig.cameras, camera: new})
     pose = rig.cam_from_rig[camera]
-    if field not in ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m"):
+    if field not in POSE:
         raise ReconstructionError(f"the rig's covariance names {camera}.{field}: it is not known")
-    turn, shift = np.zeros(3), np.zeros(3)
-    if field.endswith("_rad"):
-        turn["xyz".index(field[1])] = step
-    else:
-        shift["xyz".index(field[0])] = step
+    motion = np.zeros(6)
+    motion[POSE.index(field)] = step
     moved = RigidTransform.from_components(
-        pose.translation + shift, Rotation.from_rotvec(turn) * pose.rotation
+        pose.translation + motion[3:], Rotation.from_rotvec(motion[:3]) * pose.rotation
     )
     return replace(rig, cam_from_rig={**rig.cam_from_rig, camera: moved})

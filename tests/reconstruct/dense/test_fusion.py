@@ -44,13 +44,6 @@ def test_majority_wins_over_one_wrong_match(true: float, wrong: float, sigma: fl
     assert agreeing[0, 0] >= 2
 
 
-def test_two_that_disagree_say_nothing():
-    depths = np.array([2.0, 2.5], np.float32).reshape(2, 1, 1)
-    depth, _, agreeing = merge_depths(depths, np.full((2, 1, 1), 0.01, np.float32), 3.0)
-    assert np.isnan(depth[0, 0])
-    assert agreeing[0, 0] == 0
-
-
 def witness(shift_m: float) -> tuple[np.ndarray, np.ndarray]:
     """The reference sees a plane 2 m away; the other, next to it, sees one `shift_m` farther."""
     depth = np.full((16, 20), 2.0, np.float32)

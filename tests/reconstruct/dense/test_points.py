@@ -101,7 +101,7 @@ def tilted():
     return port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
 
 
-def test_unknown_depth_gives_no_point_and_no_normal_beside_it():
+def test_unknown_depth_gives_no_point_and_no_normal_next_to_it():
     view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
     depth = depth_of(view)
     depth[100:110, 50:60] = np.nan

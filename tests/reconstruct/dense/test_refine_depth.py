@@ -81,7 +81,6 @@ def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
     assert before > 0.004
     assert 1e-4 < after < 0.4 * before  # 1.5 mm, rims that one neighbour sees included
     assert 0.3 < 1.4826 * np.median(np.abs(error / found.sigma[known])) < 3.0
-    assert np.median(found.likeness[known]) > 0.9
 
 
 def test_windows_across_a_step_keep_what_they_had():

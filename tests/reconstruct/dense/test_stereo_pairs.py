@@ -37,7 +37,7 @@ def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
     assert ((base_to_height[1:] > 0.15) & (base_to_height[1:] < 0.3)).all()
 
 
-def test_never_more_partners_than_asked_and_none_twice():
+def test_at_most_the_given_number_of_partners_and_none_twice():
     model = sparse_model(line(), SCENE)
     for most in (1, 2, 4):
         for partners in choose_partners(model, per_view=most):
@@ -52,20 +52,13 @@ def test_points_of_views_are_those_observed():
         np.testing.assert_array_equal(points, model.points_world[own])
 
 
-def test_one_picture_gives_one_line():
-    model = sparse_model(line(1)[:1], SCENE)
-    with pytest.raises(ReconstructionError, match="none of 1 registered pictures") as caught:
-        choose_partners(model, 4)
-    assert "\n" not in str(caught.value)
-
-
-def test_pictures_too_far_apart_give_one_line():
-    views = line(2)
-    model = sparse_model([views[0], views[1]], SCENE)
+def test_pictures_without_overlap_are_refused():
+    views = sparse_model(line(2)[:2], SCENE).views
     away = RigidTransform.from_translation([30.0, 0.0, 0.0])
-    far = replace(model.views[1], world_from_cam=away * model.views[1].world_from_cam)
-    with pytest.raises(ReconstructionError, match="overlap"):
-        choose_partners(replace(model, views=(model.views[0], far)), 4)
+    far = replace(views[1], world_from_cam=away * views[1].world_from_cam)
+    for model in (sparse_model(line(1)[:1], SCENE), sparse_model([views[0], far], SCENE)):
+        with pytest.raises(ReconstructionError):
+            choose_partners(model, 4)
 
 
 def test_points_in_sight_are_all_that_lie_in_the_frame_and_near():

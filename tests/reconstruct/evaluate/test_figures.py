@@ -27,7 +27,7 @@ def test_the_height_of_a_dome_is_found_whatever_tilt_and_shift() -> None:
     assert bowl.dome_m == pytest.approx(-found.dome_m, rel=1e-3)
 
 
-def test_a_trough_is_no_dome_but_is_reported() -> None:
+def test_a_trough_is_not_a_dome_but_is_reported() -> None:
     xy = places(np.random.default_rng(2))
     saddle = fit_doming(xy, 0.003 * ((xy[:, 0]) ** 2 - (xy[:, 1] - 7) ** 2))
     assert abs(saddle.dome_m) < 0.02 * 0.003 * saddle.radius_m**2
@@ -43,7 +43,7 @@ def test_outliers_do_not_bend_a_model() -> None:
     assert abs(fit_doming(xy, errors).dome_m) < 0.001
 
 
-def test_sigma_of_the_dome_holds_for_errors_that_go_together() -> None:
+def test_sigma_of_the_dome_holds_for_correlated_errors() -> None:
     rows, columns = np.mgrid[:120, :120] * 0.05
     xy = np.column_stack([rows.ravel(), columns.ravel()])
     ratios = []

@@ -66,7 +66,7 @@ def test_a_shift_is_measured_in_length_and_pixels(
     assert figures["position_rms_mm"] == pytest.approx(1e3 * np.hypot(0.006, 0.004), rel=0.05)
 
 
-def test_lengths_between_patches_tell_the_scale(
+def test_lengths_between_patches_give_the_scale(
     floor: tuple[Terrain, Texture], tmp_path: Path
 ) -> None:
     grown = score_mosaic(
@@ -76,7 +76,7 @@ def test_lengths_between_patches_tell_the_scale(
     assert found["scale_error_ppm"] == pytest.approx(4000, rel=0.05)
 
 
-def test_a_mosaic_of_something_else_is_not_believed(
+def test_a_mosaic_of_something_else_matches_nowhere(
     floor: tuple[Terrain, Texture], tmp_path: Path
 ) -> None:
     mosaic, dem = write(tmp_path, floor, (0.0, 0.0))

@@ -1,17 +1,13 @@
 """The score measures the error that was put in, and nothing else."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 import shapely
-from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.base.artefacts import write_csv
 from alice_survey.base.config import SeafloorConfig
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Datum
@@ -21,9 +17,10 @@ from missions.values.legs import Leg, Route
 from missions.values.line import Line, LineKind
 from missions.values.plan_file import Dive, Plan
 from reconstruct.evaluate.cameras import score_cameras
+from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.mosaic import area_in_world
 from reconstruct.evaluate.overlap import neighbours
-from reconstruct.evaluate.surface import score_surface
+from reconstruct.evaluate.surface import CountStations, SurfaceScore, score_surface
 from reconstruct.evaluate.truth import surface_depth, surface_distance
 
 HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]
@@ -42,9 +39,19 @@ def terrain() -> Terrain:
     return build_terrain(config, (-1.0, 4.0, -1.0, 4.0), 10.0, np.random.default_rng(1))
 
 
-def write_dem(
-    path: Path, terrain: Terrain, error_m: float, holes: float, elsewhere_m: float | None = None
-) -> None:
+def everywhere(points_ned: np.ndarray) -> np.ndarray:
+    """Three stations see every point."""
+    return np.full(len(points_ned), 3)
+
+
+def scored(
+    terrain: Terrain,
+    error_m: float,
+    *,
+    holes: float = 0.0,
+    elsewhere_m: float | None = None,
+    stations: CountStations = everywhere,
+) -> SurfaceScore:
     """The true surface as a model sees it whose world is shifted by SHIFT, with an error.
 
     Outside of the area the error is `elsewhere_m`, if that is given.
@@ -58,24 +65,21 @@ def write_dem(
     errors = np.where(outside, error_m if elsewhere_m is None else elsewhere_m, error_m)
     heights = (-depth + errors).reshape(norths.shape)
     heights[np.random.default_rng(2).random(heights.shape) < holes] = np.nan
-    with rasterio.open(
-        path, "w", driver="GTiff", width=len(east), height=len(north), count=1, dtype="float64",
-        transform=from_origin(-0.6, 3.4, CELL, CELL), nodata=np.nan,
-    ) as target:  # fmt: skip
-        target.write(heights, 1)
+    model = Elevation(
+        height=heights, sigma=np.full(heights.shape, 0.002), west=-0.6, north=3.4, cell=CELL
+    )
+    return score_surface(model, AREA, terrain, SHIFT, 0.0015, stations)
 
 
-def test_a_true_surface_scores_zero(terrain: Terrain, tmp_path: Path) -> None:
-    write_dem(tmp_path / "dem.tif", terrain, 0.0, 0.0)
-    score = score_surface(tmp_path / "dem.tif", AREA, terrain, SHIFT)
+def test_a_true_surface_scores_zero(terrain: Terrain) -> None:
+    score = scored(terrain, 0.0)
     assert score.completeness > 0.99
     assert np.abs(score.height_m).max() < 1e-5
     assert score.distance_m.max() < 1e-5
 
 
-def test_an_error_and_holes_are_measured(terrain: Terrain, tmp_path: Path) -> None:
-    write_dem(tmp_path / "dem.tif", terrain, 0.012, 0.25)
-    score = score_surface(tmp_path / "dem.tif", AREA, terrain, SHIFT)
+def test_an_error_and_holes_are_measured(terrain: Terrain) -> None:
+    score = scored(terrain, 0.012, holes=0.25)
     figures = score.to_json()
     assert figures["height_rms_mm"] == pytest.approx(12.0, abs=0.01)
     assert 8.0 < figures["distance_rms_mm"] < 12.0
@@ -83,23 +87,12 @@ def test_an_error_and_holes_are_measured(terrain: Terrain, tmp_path: Path) -> No
     assert np.all(score.distance_m <= np.abs(score.height_m) + 1e-5)  # depths are of 32 bits
 
 
-def test_sigmas_stations_and_ground_pixels_are_held_against_the_error(
-    terrain: Terrain, tmp_path: Path
-) -> None:
-    write_dem(tmp_path / "dem.tif", terrain, 0.004, 0.0)
-    with rasterio.open(tmp_path / "dem.tif") as source:
-        profile, shape = source.profile, source.shape
-    with rasterio.open(tmp_path / "sigma.tif", "w", **profile) as target:
-        target.write(np.full(shape, 0.002), 1)
-
+def test_sigmas_stations_and_ground_pixels_are_compared_with_the_error(terrain: Terrain) -> None:
     def western_half(points_ned: np.ndarray) -> np.ndarray:
         return np.where(points_ned[:, 1] < 1.25, 3, 2)
 
-    score = score_surface(
-        tmp_path / "dem.tif", AREA, terrain, SHIFT, sigma=tmp_path / "sigma.tif",
-        stations=western_half,
-    )  # fmt: skip
-    figures = score.to_json(0.0015)
+    score = scored(terrain, 0.004, stations=western_half)
+    figures = score.to_json()
     assert figures["error_over_sigma"]["rms"] == pytest.approx(2.0, abs=0.01)
     assert figures["error_over_sigma"]["within_1_sigma"] == 0
     assert figures["volume"]["mean_height_error_mm"] == pytest.approx(4.0, abs=0.01)
@@ -113,9 +106,8 @@ def test_sigmas_stations_and_ground_pixels_are_held_against_the_error(
     assert figures["completeness_within_px"]["1"] < 0.1
 
 
-def test_holes_and_the_gap_between_parts_are_not_scored(terrain: Terrain, tmp_path: Path) -> None:
-    write_dem(tmp_path / "dem.tif", terrain, 0.003, 0.0, elsewhere_m=0.5)
-    score = score_surface(tmp_path / "dem.tif", AREA, terrain, SHIFT)
+def test_holes_and_the_gap_between_parts_are_not_scored(terrain: Terrain) -> None:
+    score = scored(terrain, 0.003, elsewhere_m=0.5)
     # 2.25 - 0.36 in the part with the hole, 0.45 in the triangle, m2.
     assert score.cells == pytest.approx(2.34 / CELL**2, rel=0.01)
     assert score.completeness > 0.98
@@ -165,7 +157,7 @@ def line_at(
 
 
 @pytest.mark.parametrize("heading_rad", [0.0, 1.1, 4.0])
-def test_neighbours_are_the_lines_beside_not_the_next_ones(heading_rad: float) -> None:
+def test_neighbours_are_the_adjacent_lines_not_the_next_ones(heading_rad: float) -> None:
     lines = [
         line_at((0.0, 10.0), 0.0, heading_rad),
         line_at((12.0, 20.0), 1.0, heading_rad),  # of another cell, ahead
@@ -191,13 +183,7 @@ def test_distance_of_a_point_above_a_level_floor() -> None:
     assert np.isnan(surface_depth(flat, np.array([[5.0, 0.0]]))).all()
 
 
-def write_truth(path: Path, poses: dict[str, RigidTransform]) -> None:
-    header = ("image", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
-    rows = [[n, *p.translation, *p.rotation.as_quat()] for n, p in poses.items()]
-    write_csv(path, header, rows)
-
-
-def test_cameras_are_aligned_without_scale(tmp_path: Path) -> None:
+def test_cameras_are_aligned_without_scale() -> None:
     rng = np.random.default_rng(3)
     truth = {
         f"left/{i:03d}.png": RigidTransform.from_components(
@@ -205,15 +191,14 @@ def test_cameras_are_aligned_without_scale(tmp_path: Path) -> None:
         )
         for i in range(30)
     }
-    write_truth(tmp_path / "poses.csv", truth)
     world = {name: SHIFT.inv() * pose for name, pose in truth.items()}
 
-    exact = score_cameras(world, tmp_path / "poses.csv", 31)
+    exact = score_cameras(world, truth, 31)
     grown = {
         name: RigidTransform.from_components(1.002 * p.translation, p.rotation)
         for name, p in world.items()
     }
-    large = score_cameras(grown, tmp_path / "poses.csv", 31)
+    large = score_cameras(grown, truth, 31)
 
     assert exact.rms_m < 1e-9
     assert exact.turns_deg.max() < 1e-5
@@ -225,8 +210,7 @@ def test_cameras_are_aligned_without_scale(tmp_path: Path) -> None:
     assert large.rms_m == pytest.approx(0.002 * spread, rel=1e-2)
 
 
-def test_two_cameras_cannot_be_aligned(tmp_path: Path) -> None:
+def test_two_cameras_cannot_be_aligned() -> None:
     truth = {f"{i}.png": RigidTransform.from_translation([i, 0, 0]) for i in range(2)}
-    write_truth(tmp_path / "poses.csv", truth)
-    with pytest.raises(WorkspaceError, match="3 or more"):
-        score_cameras(truth, tmp_path / "poses.csv", 2)
+    with pytest.raises(WorkspaceError):
+        score_cameras(truth, truth, 2)

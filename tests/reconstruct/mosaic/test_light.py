@@ -67,7 +67,7 @@ def misfit(found: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_overlaps_alone_tell_the_lamp_from_the_sea_floor(outliers: float):
+def test_overlaps_alone_separate_the_lamp_from_the_sea_floor(outliers: float):
     gains, found = samples(outliers=outliers)
     light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
     for channel in range(3):
@@ -76,7 +76,7 @@ def test_overlaps_alone_tell_the_lamp_from_the_sea_floor(outliers: float):
     assert np.std([light.gains[n][0] for n in IMAGES]) == pytest.approx(np.std(gains), rel=0.6)
 
 
-def test_the_median_picture_tells_what_a_single_line_cannot():
+def test_the_median_picture_gives_what_a_single_line_cannot():
     _, found = samples(lines=1)
     rng = np.random.default_rng(9)
     shown = pattern(NODES_X, NODES_Y)[None, ..., None] + rng.normal(4.2, 0.1, (9, *GRID, 3))
@@ -169,7 +169,7 @@ def test_places_run_from_edge_to_edge():
     np.testing.assert_allclose(at_places(ramp, places)[:, 0], [25.0, 5.0], atol=0.02)
 
 
-def test_dark_and_burnt_spots_tell_nothing():
+def test_dark_and_burnt_spots_are_left_out():
     grey = np.full((40, 50, 3), 80, np.float32)
     half = grey.copy()
     half[:, :25] = 255

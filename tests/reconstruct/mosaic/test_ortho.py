@@ -18,37 +18,36 @@ def test_visible_cells_equal_a_walk_along_the_sight_line(camera: tuple[float, fl
     height, cell, tolerance = hills(), 0.1, 0.15
     place = np.array(camera)
     visible = visible_cells(height, place, 0.0, 0.0, cell, tolerance, (0, 40, 0, 50))
-    clear = doubtful = 0
+    clear = unsure = 0
     for row in range(0, 40, 3):
         for column in range(0, 50, 3):
             rise = sees(height, place, cell, row, column)
             if abs(rise - tolerance) < 0.1:  # cells are steps: the two walks meet others of them
-                doubtful += 1
+                unsure += 1
                 continue
             clear += 1
             assert visible[row, column] == (rise < tolerance), (row, column, rise)
-    assert clear > 2 * doubtful
+    assert clear > 2 * unsure
     assert 0.2 < visible.mean() < 0.98
 
 
-def test_a_wall_hides_what_is_behind_it_and_not_itself():
+def seen_over_wall(height_m: float) -> np.ndarray:
+    """From 2 m over column 10 of level ground with a wall at column 30."""
     height = np.zeros((21, 60), np.float32)
-    height[:, 30] = 1.0
-    # camera 2 m up over column 10: its line over the wall reaches the ground 20 cells behind
-    visible = visible_cells(
-        height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60)
-    )
+    height[:, 30] = height_m
+    camera = np.array([1.05, -1.05, 2.0])
+    return visible_cells(height, camera, 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60))
+
+
+def test_a_wall_hides_what_is_behind_it_and_not_itself():
+    visible = seen_over_wall(1.0)  # the line over the wall reaches the ground 20 cells behind
     assert visible[10, :31].all()
     assert not visible[10, 31:49].any()
     assert visible[10, 52:].all()
 
 
 def test_unknown_cells_are_neither_seen_nor_in_the_way():
-    height = np.zeros((21, 60), np.float32)
-    height[:, 30] = np.nan
-    visible = visible_cells(
-        height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60)
-    )
+    visible = seen_over_wall(np.nan)
     assert not visible[:, 30].any()
     assert visible[:, 31:].all()
 

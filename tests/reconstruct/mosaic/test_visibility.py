@@ -1,5 +1,6 @@
 """Look-ups in pictures as taken against the exact camera behind its port."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,14 @@ from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.flat_port import FlatPortCamera
 from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
-from reconstruct.mosaic.visibility import Ground, Water, camera_optics, channel_optics, see
+from reconstruct.mosaic.visibility import (
+    Ground,
+    SeenCells,
+    Water,
+    camera_optics,
+    channel_optics,
+    see,
+)
 from reconstruct.raster import DemGrid
 from reconstruct.views.lens import FlatPortLens, flat_port_lens
 from reconstruct.views.model import View
@@ -53,12 +61,14 @@ def relief() -> tuple[DemGrid, np.ndarray]:
     return grid, height.astype(np.float32)
 
 
-def exact(camera: FlatPortCamera, view: View, grid: DemGrid, height: np.ndarray) -> np.ndarray:
+def misses_px(sight: SeenCells, camera: FlatPortCamera, view: View) -> np.ndarray:
+    """How far from the exact pixel of a camera each cell of the relief is looked up."""
+    grid, height = relief()
     columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)
     world = np.stack([grid.north_of(rows), grid.east_of(columns), -height.astype(float)], axis=-1)
     points = view.world_from_cam.inv().apply(world.reshape(-1, 3))
-    taken = camera.project(lens().pinhole_from_cam.inv().apply(points))
-    return taken.reshape(150, 150, 2) - 0.5
+    taken = camera.project(lens().pinhole_from_cam.inv().apply(points)).reshape(150, 150, 2)
+    return np.hypot(sight.x + 0.5 - taken[..., 0], sight.y + 0.5 - taken[..., 1])
 
 
 def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them() -> None:
@@ -66,7 +76,7 @@ def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them()
     sight = see(view, camera_optics(lens(), True), Ground(height, grid).surface(grid))
     inside = sight.quality > 0
     assert inside.mean() > 0.3
-    error = np.hypot(*(np.stack([sight.x, sight.y], -1) - exact(CAMERA, view, grid, height)).T).T
+    error = misses_px(sight, CAMERA, view)
     assert 1e-5 < error[inside].max() < 0.02
     assert np.sqrt((error[inside] ** 2).mean()) < 0.008
     forgetful = see(view, camera_optics(lens(), False), Ground(height, grid).surface(grid))
@@ -75,13 +85,10 @@ def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them()
 
 
 def test_forgetting_the_range_would_show() -> None:
-    from dataclasses import replace
-
     view, (grid, height) = replace(view_of(lens()), shift=None), relief()
     sight = see(view, camera_optics(lens(), False), Ground(height, grid).surface(grid))
     inside = sight.quality > 0
-    error = np.hypot(*(np.stack([sight.x, sight.y], -1) - exact(CAMERA, view, grid, height)).T).T
-    assert error[inside].max() > 0.1
+    assert misses_px(sight, CAMERA, view)[inside].max() > 0.1
 
 
 def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
@@ -95,8 +102,7 @@ def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
     ):
         sight = see(view, optics, surface)
         inside = (sight.quality > 0) & (green.quality > 0)
-        error = np.stack([sight.x, sight.y], -1) - exact(cameras[name], view, grid, height)
-        assert np.hypot(*error[inside].T).max() < 0.05
+        assert misses_px(sight, cameras[name], view)[inside].max() < 0.05
         moved.append(np.hypot(sight.x - green.x, sight.y - green.y)[inside].max())
     assert moved[0] > 0.5
     assert moved[1] == 0
