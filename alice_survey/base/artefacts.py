@@ -177,8 +177,8 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
 def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
     """Do a stage's work; return the resources used, including those of an interrupted run."""
     try:
-        earlier = Spent.from_json(json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, KeyError):  # a kill may have come before the first
+        earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # a kill may have come before the first
         earlier = Spent()
     meter = Meter(time.monotonic)
 

@@ -4,11 +4,11 @@ import contextlib
 import ctypes
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import psutil
@@ -53,15 +53,6 @@ class Spent:
             "cpu_s": round(self.cpu_s, 2),
             "peak_mib": round(self.peak_mib, 1),
         }
-
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> "Spent":
-        """Read what `to_json` wrote.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is something else.
-        """
-        return Spent(**{name: float(data[name]) for name in ("took_s", "cpu_s", "peak_mib")})
 
 
 class Meter:
