@@ -78,9 +78,8 @@ def read_manifest(path: Path) -> list[ImageRecord]:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [
-                {name: cell for name, cell in row.items() if cell} for row in csv.DictReader(file)
-            ]
+            reader = csv.DictReader(file)
+            rows = [{name: cell for name, cell in row.items() if name and cell} for row in reader]
         records = _RECORDS.validate_python(rows)
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
