@@ -172,8 +172,9 @@ def read_shrunk(
             bands, out_shape=(len(bands), *shape), resampling=resampling, masked=True
         )
         opacity: Array = raster.dataset_mask(out_shape=shape)
-        scale = Affine.scale(raster.width / shape[1], raster.height / shape[0])
-        return values, opacity, raster.transform * scale
+        full = raster.transform
+        wide, high = full.a * raster.width / shape[1], full.e * raster.height / shape[0]
+        return values, opacity, Affine(wide, 0.0, full.c, 0.0, high, full.f)
 
 
 def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:
