@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -180,7 +179,7 @@ def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
         earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):  # a kill may have come before the first
         earlier = Spent()
-    meter = Meter(time.monotonic)
+    meter = Meter()
 
     def keep(spent: Spent) -> None:
         with contextlib.suppress(OSError):  # on a full disk the work itself will say so

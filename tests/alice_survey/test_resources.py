@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 
 from alice_survey.base.run.resources import Meter, Spent, cpu_s, family, memory_mib, versions
 
@@ -20,7 +19,7 @@ sys.stdin.read()
 
 
 def test_descendants_count_while_they_run_and_after_they_ended() -> None:
-    meter = Meter(time.monotonic)
+    meter = Meter()
     child = subprocess.Popen(
         [sys.executable, "-c", BUSY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -58,9 +59,8 @@ class Spent:
 class Meter:
     """Meter of the resources this process and its descendants use since its creation."""
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
-        self._started, self._cpu_s = clock(), sum(map(cpu_s, family()))
+    def __init__(self) -> None:
+        self._started_s, self._cpu_s = time.monotonic(), sum(map(cpu_s, family()))
         self._peak_mib = 0.0
         self._lock = threading.Lock()
 
@@ -71,7 +71,7 @@ class Meter:
         with self._lock:
             self._peak_mib = max(self._peak_mib, memory)
             return Spent(
-                took_s=self._clock() - self._started,
+                took_s=time.monotonic() - self._started_s,
                 cpu_s=max(0.0, sum(map(cpu_s, processes)) - self._cpu_s),
                 peak_mib=self._peak_mib,
             )
