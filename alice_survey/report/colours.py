@@ -134,13 +134,9 @@ def _sample(raster: Any) -> Iterator[Array]:
     blocks = columns * -(-raster.height // _WINDOW_PX)
     for block in np.random.default_rng(0).permutation(blocks):
         row, column = divmod(int(block), columns)
-        yield known_values(raster, block_window(raster, column, row, _WINDOW_PX))[::step, ::step]
-
-
-def block_window(raster: Any, column: int, row: int, side: int) -> Window:
-    """A square window of a raster's grid of such squares, cut off at the border."""
-    left, top = column * side, row * side
-    return Window(left, top, min(side, raster.width - left), min(side, raster.height - top))
+        left, top = column * _WINDOW_PX, row * _WINDOW_PX
+        wide, high = min(_WINDOW_PX, raster.width - left), min(_WINDOW_PX, raster.height - top)
+        yield known_values(raster, Window(left, top, wide, high))[::step, ::step]
 
 
 def known_values(raster: Any, window: Window) -> Array:

@@ -24,7 +24,6 @@ COMMANDS = (
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-log", "measure",
     "control", "quality", "mosaic-tiles", "report", "view",
 )  # fmt: skip
-PACKAGE = Path(__file__).parents[2] / "alice_survey"
 
 
 def fails(
