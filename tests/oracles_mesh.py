@@ -25,34 +25,11 @@ def implicit_value(points: Array, normals: Array, weights: Array, node: Array) -
     return over / total if total > 0 else math.nan
 
 
-def plane_distance_error(vertices: Array, triangles: Array, vertex: int, point: Array) -> float:
-    """`quadric_error` of a vertex without outline: its faces' planes, weighted by area."""
-    total = 0.0
-    for a, b, c in triangles:
-        if vertex not in (a, b, c):
-            continue
-        cross = np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])
-        area = 0.5 * np.linalg.norm(cross)
-        total += area * ((point - vertices[a]) @ cross / (2 * area)) ** 2
-    return float(total)
-
-
 def spread_value(corners: Array, values: Array, x: float, y: float) -> Array | None:
     """`spread_corners` of one triangle at one spot: None outside."""
     matrix = np.vstack([corners.T, np.ones(3)])
     shares = np.linalg.solve(matrix, [x, y, 1.0])
     return shares @ values if (shares >= 0).all() else None
-
-
-def potts_energy(label: Array, views: Array, cost: Array, neighbours: Array, seam: Array) -> float:
-    """What `smooth` lowers."""
-    total = 0.0
-    for face, wanted in enumerate(label):
-        total += cost[face, list(views[face]).index(wanted)]
-        for side, other in enumerate(neighbours[face]):
-            if other >= 0 and label[other] != wanted:
-                total += 0.5 * seam[face, side]
-    return total
 
 
 def boxes_overlap(corner: Array, box: Array) -> bool:

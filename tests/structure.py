@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 AVOIDED = (
@@ -101,31 +104,14 @@ def imports() -> dict[str, set[str]]:
 
 
 def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Sets of modules that import one another (strongly connected components, Tarjan 1972)."""
-    order: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-
-    def visit(node: str) -> None:
-        order[node] = low[node] = len(order)
-        stack.append(node)
-        for other in sorted(graph[node]):
-            if other not in order:
-                visit(other)
-                low[node] = min(low[node], low[other])
-            elif other in stack:
-                low[node] = min(low[node], order[other])
-        if low[node] == order[node]:
-            part = stack[stack.index(node) :]
-            del stack[stack.index(node) :]
-            if len(part) > 1:
-                found.append(sorted(part))
-
-    for node in graph:
-        if node not in order:
-            visit(node)
-    return found
+    """Sets of modules that import one another (strongly connected components)."""
+    number = {name: i for i, name in enumerate(graph)}
+    imported = np.zeros((len(graph), len(graph)), bool)
+    for name, others in graph.items():
+        imported[number[name], [number[other] for other in others]] = True
+    _, part = connected_components(imported, connection="strong")
+    found = [sorted(np.array(list(graph))[part == one].tolist()) for one in range(part.max() + 1)]
+    return [names for names in found if len(names) > 1]
 
 
 def layers() -> list[list[str]]:

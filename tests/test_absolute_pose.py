@@ -6,7 +6,6 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.camera_pose import PUBLISHED, run_level, simulated
 from camera_calib.flat_port import FlatPortCamera
@@ -205,28 +204,6 @@ def test_far_from_the_worlds_origin_nothing_is_lost() -> None:
     np.testing.assert_allclose(far_pose.covariance, near_pose.covariance, rtol=1e-4, atol=1e-12)
 
 
-def test_rows_without_numbers_are_left_out_and_counted() -> None:
-    rng = np.random.default_rng(9)
-    seen = sighting(rng, random_pose(rng), noise_px=0.2)
-    pixels, points = seen.pixels.copy(), seen.points_world.copy()
-    pixels[3, 0] = np.nan
-    points[7, 2] = np.inf
-    whole = np.setdiff1d(np.arange(120), [3, 7])
-    shorter = replace(seen, pixels=seen.pixels[whole], points_world=seen.points_world[whole])
-
-    found = absolute_pose(
-        [replace(seen, pixels=pixels, points_world=points)], np.random.default_rng(1)
-    )
-
-    expected = absolute_pose([shorter], np.random.default_rng(1))
-    assert found.ignored == 2
-    assert not found.inliers[0][[3, 7]].any()
-    np.testing.assert_array_equal(found.inliers[0][whole], expected.inliers[0])
-    np.testing.assert_array_equal(
-        found.rig_from_world.as_matrix(), expected.rig_from_world.as_matrix()
-    )
-
-
 def test_more_observations_than_ransac_scores_are_all_used() -> None:
     rng = np.random.default_rng(10)
     truth = random_pose(rng)
@@ -240,71 +217,3 @@ def test_more_observations_than_ransac_scores_are_all_used() -> None:
     assert found.inliers[0][:2000].sum() < 10
     angle_deg, _ = apart(truth, found.rig_from_world)
     assert angle_deg < 4 * math.degrees(found.sigma_rotation_rad) < 0.005
-
-
-def test_the_same_seed_gives_the_same_pose() -> None:
-    seen, _, _ = simulated(np.random.default_rng(11), 1.0)
-
-    first = absolute_pose([seen], np.random.default_rng(5))
-    second = absolute_pose([seen], np.random.default_rng(5))
-
-    np.testing.assert_array_equal(
-        first.rig_from_world.as_matrix(), second.rig_from_world.as_matrix()
-    )
-    np.testing.assert_array_equal(first.covariance, second.covariance)
-
-
-def test_random_pixels_have_no_pose() -> None:
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        nonsense = Sighting(
-            camera=CAMERA,
-            pixels=rng.uniform([0, 0], [1920, 1080], (60, 2)),
-            points_world=rng.normal(size=(60, 3)),
-        )
-        with pytest.raises(CalibrationError, match=r"pose: .* observations"):
-            absolute_pose([nonsense], rng)
-
-
-def test_chance_agreement_is_no_pose() -> None:
-    # Six of 400 that agree to 2 px can be found among random pixels; six of six cannot.
-    rng = np.random.default_rng(12)
-    truth = random_pose(rng)
-    few = sighting(rng, truth, count=6, noise_px=0.5)
-    crowd = Sighting(
-        camera=CAMERA,
-        pixels=np.concatenate([few.pixels, rng.uniform([0, 0], [1920, 1080], (394, 2))]),
-        points_world=np.concatenate([few.points_world, 3 * rng.normal(size=(394, 3))]),
-    )
-
-    assert absolute_pose([few], np.random.default_rng(1)).inliers[0].sum() == 6
-    with pytest.raises(CalibrationError, match="pose: "):
-        absolute_pose([crowd], np.random.default_rng(1))
-
-
-def test_what_leaves_the_pose_open_is_said() -> None:
-    rng = np.random.default_rng(13)
-    line = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.5, 0.5, 30)[:, None] * [1.0, 0.3, 0.2]
-    with pytest.raises(CalibrationError, match=r"30 points leave it open.*line"):
-        absolute_pose(
-            [Sighting(camera=CAMERA, pixels=CAMERA.project(line), points_world=line)], rng
-        )
-    spot = np.repeat([[0.1, 0.1, 2.0]], 30, axis=0)
-    with pytest.raises(CalibrationError, match="no three of 30 observations"):
-        absolute_pose(
-            [Sighting(camera=CAMERA, pixels=CAMERA.project(spot), points_world=spot)], rng
-        )
-
-
-def test_bad_input_is_said_in_one_line() -> None:
-    rng = np.random.default_rng(14)
-    seen = sighting(rng, random_pose(rng), count=8)
-    with pytest.raises(CalibrationError, match=r"\(8, 2\) and points \(7, 3\)"):
-        replace(seen, points_world=seen.points_world[:7])
-    nothing = replace(seen, pixels=np.where(np.arange(8)[:, None] < 5, seen.pixels, np.nan))
-    with pytest.raises(CalibrationError, match="5 of 8 observations are usable; at least 6"):
-        absolute_pose([nothing], rng)
-    with pytest.raises(CalibrationError, match="no sightings"):
-        absolute_pose([], rng)
-    with pytest.raises(CalibrationError, match="start_error_px = 0"):
-        absolute_pose([seen], rng, start_error_px=0.0)

@@ -50,7 +50,7 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @AS_ROOT
-def test_a_full_disk_is_told_and_the_same_command_goes_on(disk: Path) -> None:
+def test_a_full_disk_is_reported_and_the_same_command_goes_on(disk: Path) -> None:
     init_survey(disk, "demo.toml")
     line = one_line(plan(disk))
     assert "No space left" in line

@@ -52,7 +52,7 @@ def test_the_small_survey_is_reconstructed(undisturbed: Path) -> None:
     assert score["overlaps"]["forward_mean"] == pytest.approx(0.6, abs=0.06)
 
 
-def test_every_stage_is_told_of(undisturbed: Path) -> None:
+def test_every_stage_is_reported(undisturbed: Path) -> None:
     lines = undisturbed.with_suffix(".jsonl").read_text().splitlines()
     told = [json.loads(line) for line in lines]
     run = told[: 1 + next(i for i, event in enumerate(told) if event["event"] == "run_finished")]
@@ -173,7 +173,7 @@ def reconstruct(
     )  # fmt: skip
 
 
-def test_what_goes_wrong_half_way_is_told_in_a_line_and_nothing_is_lost(
+def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     """A picture that goes, one that changes, and memory that runs out."""

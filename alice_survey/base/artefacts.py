@@ -13,7 +13,6 @@ import json
 import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,10 +180,10 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
 def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
     """Do a stage's work; return the resources used, including those of an interrupted run."""
     try:
-        earlier = Spent.from_json(json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, KeyError):  # a kill may have come before the first
+        earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # a kill may have come before the first
         earlier = Spent()
-    meter = Meter(time.monotonic)
+    meter = Meter()
 
     def keep(spent: Spent) -> None:
         with contextlib.suppress(OSError):  # on a full disk the work itself will say so

@@ -395,7 +395,7 @@ def load_config(path: str | Path) -> SurveyConfig:
     # A number of thousands of digits is a ValueError.
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {one_line(error)}") from None
-    return parse_config(_with_files_beside(settings, path.parent), str(path))
+    return parse_config(_with_resolved_files(settings, path.parent), str(path))
 
 
 _FILES = (
@@ -404,7 +404,7 @@ _FILES = (
 )  # fmt: skip
 
 
-def _with_files_beside(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+def _with_resolved_files(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Settings whose relative file names are resolved from the folder of the settings file."""
     result = dict(settings)
     for section, key in _FILES:

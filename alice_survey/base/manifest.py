@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from pydantic import TypeAdapter, ValidationError
+
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.errors import ImageError
 
@@ -58,10 +60,8 @@ class ImageRecord:
         return not math.isnan(self.roll_deg + self.pitch_deg + self.heading_deg)
 
 
-_GREATEST = 1e15
-"""Largest number: integers up to here are exact, and no quantity needs more."""
-_TEXT = ("image", "camera", "mask")
 _COLUMNS = tuple(field.name for field in fields(ImageRecord))
+_RECORDS = TypeAdapter(list[ImageRecord])
 
 
 def write_manifest(path: Path, records: Sequence[ImageRecord]) -> None:
@@ -79,38 +79,20 @@ def read_manifest(path: Path) -> list[ImageRecord]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
-            missing = {"image", "camera", "station"} - set(reader.fieldnames or [])
-            if missing:
-                raise ImageError(f"{path}: column {min(missing)} is missing")
-            records = [_record(path, line, row) for line, row in enumerate(reader, 2)]
+            rows = [{name: cell for name, cell in row.items() if name and cell} for row in reader]
+        records = _RECORDS.validate_python(rows)
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ImageError(f"{path}: no CSV text in UTF-8: {error}") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        row, name = first["loc"]
+        raise ImageError(f"{path} line {int(row) + 2}: {name}: {first['msg']}") from None
     for name, count in Counter(record.image for record in records).items():
         if count > 1:
             raise ImageError(f"{path}: picture {name} is named twice")
+    for inside in {part for record in records for part in (record.image, record.mask)}:
+        if Path(inside).is_absolute() or ".." in Path(inside).parts:
+            raise ImageError(f"{path}: {inside!r} leaves its folder")
     return records
-
-
-def _record(path: Path, line: int, row: dict[str, str]) -> ImageRecord:
-    values: dict[str, str | float | int] = {}
-    for name in _COLUMNS:
-        cell = row.get(name) or ""
-        if name in _TEXT:
-            values[name] = cell
-            continue
-        try:
-            values[name] = int(cell) if name == "station" else float(cell) if cell else NAN
-            too_large = abs(float(values[name])) > _GREATEST
-        except (ValueError, OverflowError):
-            raise ImageError(f"{path} line {line}: {name} is {cell!r:.60}, not a number") from None
-        if too_large:
-            raise ImageError(f"{path} line {line}: {name} is {cell!r:.60}: too large")
-    for name in ("image", "mask"):
-        inside = Path(str(values[name]))
-        if inside.is_absolute() or ".." in inside.parts:
-            raise ImageError(f"{path} line {line}: {name} {values[name]!r} leaves its folder")
-        if not str(values[name]).isprintable():
-            raise ImageError(f"{path} line {line}: {name} {values[name]!r} is not a file name")
-    return ImageRecord(**values)  # type: ignore[arg-type]

@@ -14,6 +14,11 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+Temperature = Annotated[float, typer.Option(help="Temperature of the water, C.")]
+Salinity = Annotated[float, typer.Option(help="Salinity of the water, psu; 0 is fresh.")]
+Depth = Annotated[float, typer.Option(help="Depth below the surface, m.")]
+RigCamera = Annotated[str | None, typer.Option(help="Camera of the rig; its first if not given.")]
+
 
 @app.command(
     epilog=examples(
@@ -22,9 +27,9 @@ app = typer.Typer(
     )
 )
 def water(
-    temperature: Annotated[float, typer.Option(help="Of the water, C.")] = 20.0,
-    salinity: Annotated[float, typer.Option(help="psu; 0 is fresh.")] = 35.0,
-    depth: Annotated[float, typer.Option(help="Below the surface, m.")] = 10.0,
+    temperature: Temperature = 20.0,
+    salinity: Salinity = 35.0,
+    depth: Depth = 10.0,
     jerlov: Annotated[str, typer.Option(help="Type: I, II, III; coastal 1C to 9C.")] = "II",
     wavelength: Annotated[
         list[float] | None, typer.Option(help="nm; red, green and blue when not given.")
@@ -44,19 +49,19 @@ def water(
     )
 )
 def undisperse(
-    pictures: Annotated[list[Path], typer.Argument(metavar="PICTURE...", help="In colour.")],
+    pictures: Annotated[list[Path], typer.Argument(metavar="PICTURE...", help="Colour pictures.")],
     rig: Annotated[Path, typer.Option(help="rig.json; its indices hold for green.")],
     folder: Annotated[Path, typer.Option("-o", "--out", help="Folder for the corrected ones.")],
-    distance: Annotated[float, typer.Option("--range", min=0.0, help="To the scene, m.")],
-    camera: Annotated[str | None, typer.Option(help="Whose; the rig's first if none.")] = None,
-    temperature: Annotated[float, typer.Option(help="Of the water, C.")] = 20.0,
-    salinity: Annotated[float, typer.Option(help="psu; 0 is fresh.")] = 35.0,
-    depth: Annotated[float, typer.Option(help="Below the surface, m.")] = 10.0,
+    distance: Annotated[float, typer.Option("--range", min=0.0, help="Distance to the scene, m.")],
+    camera: RigCamera = None,
+    temperature: Temperature = 20.0,
+    salinity: Salinity = 35.0,
+    depth: Depth = 10.0,
     material: Annotated[
         str, typer.Option(help="Port: bk7, fused-silica, sapphire, pmma, polycarbonate.")
     ] = "bk7",
     wavelength: Annotated[
-        list[float] | None, typer.Option(help="nm, thrice: of red, green and blue.")
+        list[float] | None, typer.Option(help="nm, three times: of red, green and blue.")
     ] = None,
     threads: Threads = None,
     as_json: AsJson = False,
@@ -84,9 +89,9 @@ def undisperse(
 def residual(
     near: Annotated[float, typer.Option(help="Nearest distance, m.")],
     far: Annotated[float, typer.Option(help="Farthest distance, m.")],
-    survey: Annotated[Path | None, typer.Option("-s", "--survey", help="Its design.")] = None,
+    survey: Annotated[Path | None, typer.Option("-s", "--survey", help="With a design.")] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.json; instead of a design.")] = None,
-    camera: Annotated[str | None, typer.Option(help="The rig's first if none.")] = None,
+    camera: RigCamera = None,
     exact_at: Annotated[float | None, typer.Option(help="Range of the warp, m.")] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
     as_json: AsJson = False,
@@ -130,7 +135,7 @@ def convert(
     ] = None,
     extrinsics: Annotated[Path | None, typer.Option(help="OpenCV file of R and T.")] = None,
     unit_m: Annotated[float, typer.Option(help="Metres in one unit of IN's translations.")] = 1.0,
-    camera: Annotated[str | None, typer.Option(help="Only this one.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Convert this camera alone.")] = None,
     names: Annotated[str | None, typer.Option(help="New names, such as left,right.")] = None,
     port_distance: Annotated[
         float | None, typer.Option(min=0.0, help="Entrance pupil to inner glass, mm.")
@@ -142,17 +147,17 @@ def convert(
         tuple[float, float] | None,
         typer.Option(metavar="NEAR FAR", help="m: fit cameras without port for these distances."),
     ] = None,
-    model: Annotated[str, typer.Option(help="To fit: OPENCV or FULL_OPENCV.")] = "OPENCV",
+    model: Annotated[str, typer.Option(help="Model to fit: OPENCV or FULL_OPENCV.")] = "OPENCV",
     drop_port: Annotated[bool, typer.Option("--drop-port", help="Cameras as in air.")] = False,
     drop_covariance: Annotated[
-        bool, typer.Option("--drop-covariance", help="Where OUT cannot hold it.")
+        bool, typer.Option("--drop-covariance", help="Leave it out where OUT cannot hold it.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Convert between tools.
 
-    OpenCV, COLMAP, Refractive COLMAP (flatport), Kalibr, ROS and rig.json; nothing is lost unasked.
+    OpenCV, COLMAP, Refractive COLMAP (flatport), Kalibr, ROS, rig.json; nothing is lost silently.
     """
     from camera_calib.formats.convert import Conversion
     from camera_calib.formats.convert import convert as work
@@ -180,7 +185,7 @@ def uncertainty(
     ] = None,
     near: Annotated[float, typer.Option(help="Nearest of what poses are found from, m.")] = 1.0,
     far: Annotated[float, typer.Option(help="Farthest, m.")] = 3.0,
-    noise: Annotated[float, typer.Option(min=0.0, help="Of a measured coordinate, px.")] = 0.1,
+    noise: Annotated[float, typer.Option(min=0.0, help="Sigma of a coordinate, px.")] = 0.1,
     as_json: AsJson = False,
 ) -> None:
     """Show what a calibration's sigmas mean.

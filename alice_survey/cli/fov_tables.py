@@ -69,10 +69,10 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
         camera, n_water = _sensor_of(rig, settings.camera, options)
     lenses = options.lens_mm or ((camera.focal_mm,) if options.survey else PAPER_LENSES_MM)
 
-    def table(altitudes_m: Sequence[float], asked: FovChoices) -> list[FovRow]:
+    def table(altitudes_m: Sequence[float], chosen: FovChoices) -> list[FovRow]:
         if rig is not None:
-            return rig_fov_table(rig, altitudes_m, camera, asked)
-        return fov_table(lenses, altitudes_m, n_water, camera, asked)
+            return rig_fov_table(rig, altitudes_m, camera, chosen)
+        return fov_table(lenses, altitudes_m, n_water, camera, chosen)
 
     altitudes = options.altitude_m or (settings.plan.altitude_m,)
     speeds = options.speed_mps or (settings.plan.speed_mps,)
@@ -124,7 +124,7 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
         )
         draw_fov(
             output.plot,
-            lambda altitudes, asked: fov_table(PAPER_LENSES_MM, altitudes, n_water, camera, asked),
+            lambda heights, chosen: fov_table(PAPER_LENSES_MM, heights, n_water, camera, chosen),
             [altitude], FovChoices(), speeds_mps=[0.2, 0.5],
             exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, angles=angles, paper=True,
         )  # fmt: skip

@@ -93,12 +93,12 @@ def init(
 )
 def fov(
     lens: Annotated[list[float] | None, typer.Option(help="Focal length, mm.")] = None,
-    altitude: Annotated[list[float] | None, typer.Option(help="Of the outer glass, m.")] = None,
+    altitude: Annotated[list[float] | None, typer.Option(help="Altitude of the glass, m.")] = None,
     n_water: Annotated[
         float | None, typer.Option(min=1, max=1.4, help="Index of the water.")
     ] = None,
-    temperature: Annotated[float | None, typer.Option(help="Of the water, C.")] = None,
-    salinity: Annotated[float | None, typer.Option(help="Of the water, psu.")] = None,
+    temperature: Annotated[float | None, typer.Option(help="Temperature of the water, C.")] = None,
+    salinity: Annotated[float | None, typer.Option(help="Salinity of the water, psu.")] = None,
     port_distance: Annotated[
         float | None, typer.Option(min=0, max=500, help="Pupil to glass, mm.")
     ] = None,
@@ -227,7 +227,7 @@ def target(
     paper: Annotated[
         str | None, typer.Option(help="A4, A3, A2, A1, A0 or letter; as needed if not given.")
     ] = None,
-    dpi: Annotated[float, typer.Option(min=50, max=2400, help="Of a PNG.")] = 300.0,
+    dpi: Annotated[float, typer.Option(min=50, max=2400, help="Resolution of a PNG.")] = 300.0,
     as_json: AsJson = False,
 ) -> None:
     """Print a calibration target.
@@ -252,20 +252,20 @@ def target(
 def calibrate(
     workspace: Workspace = WORK,
     left: Annotated[str | None, typer.Option(help="Folder or 'pattern' of pictures.")] = None,
-    right: Annotated[str | None, typer.Option(help="Those of the right camera.")] = None,
-    pictures: Annotated[str | None, typer.Option(help="Those of a single camera.")] = None,
-    target: Annotated[str | None, typer.Option(help="In words, or target.json.")] = None,
+    right: Annotated[str | None, typer.Option(help="Pictures of the right camera.")] = None,
+    pictures: Annotated[str | None, typer.Option(help="Pictures of a single camera.")] = None,
+    target: Annotated[str | None, typer.Option(help="A target in words, or target.json.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     lens: Annotated[
         str, typer.Option(help="pinhole, k1, k2, opencv4, opencv5, rational, prism or full.")
     ] = "opencv5",
     water: Annotated[
-        bool, typer.Option("--water/--air", help="Where: under water through ports, or in air.")
+        bool, typer.Option("--water/--air", help="Under water through ports, or in air.")
     ] = False,
     start: Annotated[Path | None, typer.Option(help="rig.json calibrated in air.")] = None,
     intrinsics: Annotated[
         Literal["held", "prior", "free"] | None,
-        typer.Option(help="What is done with those of --start; prior where it has sigmas."),
+        typer.Option(help="Treatment of the intrinsics of --start; prior where it has sigmas."),
     ] = None,
     port_distance: Annotated[
         float | None, typer.Option(min=0, max=500, help="Pupil to glass, first value, mm.")

@@ -4,7 +4,7 @@ import functools
 import inspect
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -44,7 +44,7 @@ WORK = Path("work")
 Folder = Annotated[
     Path | None, typer.Argument(metavar="WORKSPACE", help="The same as -w.", show_default=False)
 ]
-_SESSION = {"quiet": Quiet, "log_file": LogFile, "events": Events}
+_SESSION = {"quiet": (Quiet, False), "log_file": (LogFile, None), "events": (Events, None)}
 
 
 def executor_of(threads: int | None) -> "Executor":
@@ -98,12 +98,22 @@ def _with_folder(command: Callable[..., Any]) -> Callable[..., Any]:
             raise typer.BadParameter(f"two workspaces are given: {folder} and -w {workspace}")
         return command(*args, workspace=folder or workspace, **kwargs)
 
-    own = inspect.Parameter(
-        "folder", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Folder
-    )
-    parameters = [*signature.parameters.values(), own]
+    return _declared(wrapped, command, {"folder": (Folder, None)})
+
+
+def _declared(
+    wrapped: Callable[..., Any], command: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]
+) -> Callable[..., Any]:
+    """A command with the options of another and more of its own: their types and defaults."""
+    signature = inspect.signature(command)
+    more = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in options.items()
+    ]
+    parameters = [*signature.parameters.values(), *more]
     vars(wrapped)["__signature__"] = signature.replace(parameters=parameters)
-    wrapped.__annotations__ = {**command.__annotations__, "folder": Folder}
+    kinds = {name: kind for name, (kind, _) in options.items()}
+    wrapped.__annotations__ = {**command.__annotations__, **kinds}
     return wrapped
 
 
@@ -123,17 +133,4 @@ def _in_session(command: Callable[..., Any]) -> Callable[..., Any]:
         with session(sys.argv[1:], quiet=quiet, log_file=log_file, events=events):
             return command(*args, **kwargs)
 
-    signature = inspect.signature(command)
-    own = [
-        inspect.Parameter(
-            name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=False if name == "quiet" else None,
-            annotation=kind,
-        )
-        for name, kind in _SESSION.items()
-    ]
-    parameters = [*signature.parameters.values(), *own]
-    vars(wrapped)["__signature__"] = signature.replace(parameters=parameters)
-    wrapped.__annotations__ = {**command.__annotations__, **_SESSION}
-    return wrapped
+    return _declared(wrapped, command, _SESSION)

@@ -139,7 +139,8 @@ def check(
         typer.Option(help="CSV with the times of the pictures; the plan's interval if not given."),
     ] = None,
     monte_carlo: Annotated[
-        int, typer.Option(min=0, max=10_000, help="Also fly the plan so many times in simulation.")
+        int,
+        typer.Option(min=0, max=10_000, help="Also simulate this many flights of the plan."),
     ] = 0,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     threads: Threads = None,
@@ -179,7 +180,7 @@ def export(
     camera_on: Annotated[
         str | None, typer.Option(help="COLA2's service that starts pictures.")
     ] = None,
-    camera_off: Annotated[str | None, typer.Option(help="The one that stops them.")] = None,
+    camera_off: Annotated[str | None, typer.Option(help="COLA2's service that stops them.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     as_json: AsJson = False,
 ) -> None:

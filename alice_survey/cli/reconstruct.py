@@ -58,7 +58,9 @@ def reconstruct(
 )
 def pair(
     left: Annotated[Path, typer.Argument(help="Picture of the rig's first camera, as taken.")],
-    right: Annotated[Path, typer.Argument(help="Of its second, of the same moment.")],
+    right: Annotated[
+        Path, typer.Argument(help="Picture of the second camera, of the same moment.")
+    ],
     rig: Annotated[Path, typer.Option(help="The rig.json of these cameras.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")] = Path("pair"),
     near: Annotated[float | None, typer.Option(min=0.01, help="Nearest distance, m.")] = None,
@@ -96,7 +98,7 @@ def measure(
             "or 'IMAGE:x,y=IMAGE:x,y' where two pictures show the spot."
         ),
     ],
-    pick_sigma: Annotated[float, typer.Option(min=0, help="Of a picked pixel, px.")] = 0.0,
+    pick_sigma: Annotated[float, typer.Option(min=0, help="Sigma of a picked pixel, px.")] = 0.0,
     n_water_sigma: Annotated[
         float, typer.Option(min=0, help="Of the water's index, where the rig does not say.")
     ] = 0.0,
@@ -220,8 +222,8 @@ def evaluate(
 def mosaic_tiles(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     workspace: Workspace = WORK,
-    side: Annotated[int, typer.Option(min=256, max=32_767, help="Of a tile, px.")] = 8192,
-    overlap: Annotated[int, typer.Option(min=0, help="Of neighbours, px.")] = 0,
+    side: Annotated[int, typer.Option(min=256, max=32_767, help="Side of a tile, px.")] = 8192,
+    overlap: Annotated[int, typer.Option(min=0, help="Overlap of neighbours, px.")] = 0,
     kind: Annotated[Literal["png", "jpg", "tif"], typer.Option(help="Format.")] = "png",
     scale_bar: Annotated[
         bool, typer.Option("--scale-bar", help="Draw one into every tile.")

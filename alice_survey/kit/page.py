@@ -9,11 +9,13 @@ them as the page carries them. To write them again, with the same bytes:
 
 import base64
 import hashlib
+import io
 import re
-import struct
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 from alice_survey.kit.document import PictureLayer, Report, Section, SurveyMap, Table
 from alice_survey.kit.map import map_data
@@ -160,15 +162,9 @@ def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
 
 
 def png_size(png: bytes) -> tuple[int, int]:
-    """Width and height in pixels.
-
-    Raises:
-        ValueError: it is not a PNG.
-    """
-    if png[:8] != b"\x89PNG\r\n\x1a\n":
-        raise ValueError("a figure is not a PNG")
-    width, height = struct.unpack(">II", png[16:24])
-    return width, height
+    """Width and height in pixels."""
+    with Image.open(io.BytesIO(png)) as picture:
+        return picture.size
 
 
 def numeric_columns(table: Table) -> list[bool]:

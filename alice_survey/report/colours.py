@@ -2,11 +2,15 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import rasterio
 from numpy.typing import NDArray
+from rasterio.enums import Resampling
+from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from alice_survey.base.frames import Array
@@ -130,13 +134,9 @@ def _sample(raster: Any) -> Iterator[Array]:
     blocks = columns * -(-raster.height // _WINDOW_PX)
     for block in np.random.default_rng(0).permutation(blocks):
         row, column = divmod(int(block), columns)
-        yield known_values(raster, block_window(raster, column, row, _WINDOW_PX))[::step, ::step]
-
-
-def block_window(raster: Any, column: int, row: int, side: int) -> Window:
-    """A square window of a raster's grid of such squares, cut off at the border."""
-    left, top = column * side, row * side
-    return Window(left, top, min(side, raster.width - left), min(side, raster.height - top))
+        left, top = column * _WINDOW_PX, row * _WINDOW_PX
+        wide, high = min(_WINDOW_PX, raster.width - left), min(_WINDOW_PX, raster.height - top)
+        yield known_values(raster, Window(left, top, wide, high))[::step, ::step]
 
 
 def known_values(raster: Any, window: Window) -> Array:
@@ -145,6 +145,32 @@ def known_values(raster: Any, window: Window) -> Array:
     if raster.nodata is not None and np.isfinite(raster.nodata):
         values[values == np.float32(raster.nodata)] = np.nan
     return values
+
+
+def read_shrunk(
+    path: Path, bands: list[int], most_px: float, resampling: Resampling = Resampling.average
+) -> tuple[Array, Array, Affine]:
+    """A raster, shrunk to about so many pixels at most.
+
+    Args:
+        path: its file.
+        bands: their numbers.
+        most_px: most pixels of one band.
+        resampling: how pixels are merged.
+
+    Returns:
+        (B, H, W) masked values, (H, W) opacity from 0 to 255, and the transform of a pixel.
+    """
+    with rasterio.open(path) as raster:
+        shrink = max(1.0, float(np.sqrt(raster.height * raster.width / most_px)))
+        shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
+        values: Array = raster.read(
+            bands, out_shape=(len(bands), *shape), resampling=resampling, masked=True
+        )
+        opacity: Array = raster.dataset_mask(out_shape=shape)
+        full = raster.transform
+        wide, high = full.a * raster.width / shape[1], full.e * raster.height / shape[0]
+        return values, opacity, Affine(wide, 0.0, full.c, 0.0, high, full.f)
 
 
 def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:

@@ -18,6 +18,7 @@ from alice_survey.base.run import progress
 from alice_survey.kit.document import Figure, Mesh
 from alice_survey.kit.figure import shrunk_png
 from alice_survey.kit.words import count
+from alice_survey.report.colours import read_shrunk
 from alice_survey.report.held import Held
 
 _MOST_TRIANGLES = 250_000
@@ -90,14 +91,11 @@ def _relief(held: Held) -> Any:
     import trimesh
     from PIL import Image
 
-    with rasterio.open(held.workspace / "dense" / "dem.tif") as raster:
-        shrink = max(1.0, float(np.sqrt(raster.width * raster.height / _MOST_CELLS)))
-        shape = (max(2, round(raster.height / shrink)), max(2, round(raster.width / shrink)))
-        heights = raster.read(1, out_shape=shape, resampling=Resampling.average)
-        bounds = raster.bounds
-    east = np.linspace(bounds.left, bounds.right, 2 * shape[1] + 1)[1::2]
-    north = np.linspace(bounds.top, bounds.bottom, 2 * shape[0] + 1)[1::2]
-    points, faces, used = grid_mesh(east, north, heights.astype(np.float64))
+    (heights,), _, cell = read_shrunk(held.workspace / "dense" / "dem.tif", [1], _MOST_CELLS)
+    rows, columns = heights.shape
+    east = cell.c + cell.a * (np.arange(columns) + 0.5)
+    north = cell.f + cell.e * (np.arange(rows) + 0.5)
+    points, faces, used = grid_mesh(east, north, heights.astype(np.float64).filled(np.nan))
     with rasterio.open(held.workspace / "mosaic" / "mosaic.tif") as raster:
         shrink = max(1.0, max(raster.width, raster.height) / _MOST_TEXTURE_PX)
         size = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from rasterio.enums import Resampling
 
 from alice_survey.base.frames import Array
 from alice_survey.kit.document import Figure
 from alice_survey.kit.figure import INKS, MARKS, colour_bar, drawn
 from alice_survey.kit.words import digits, length, share
+from alice_survey.report.colours import read_shrunk
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, number
 
@@ -266,15 +268,9 @@ def paired(held: Held, first: str, second: str) -> tuple[Array, Array] | None:
 
 def _read(held: Held, path: str) -> Array | None:
     """A raster, thinned so that the largest fits."""
-    import rasterio
-    from rasterio.enums import Resampling
-
     file = held.file(path)
     if file is None:
         return None
-    with rasterio.open(file) as raster:
-        shrink = max(1.0, float(np.sqrt(raster.width * raster.height / 4e6)))
-        shape = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))
-        values = raster.read(1, out_shape=shape, resampling=Resampling.nearest)
-    whole: Array = values.astype(np.float64)
+    (values,), _, _ = read_shrunk(file, [1], 4e6, Resampling.nearest)
+    whole: Array = np.ma.getdata(values).astype(np.float64)
     return whole

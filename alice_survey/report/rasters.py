@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from rasterio.enums import Resampling
+from rasterio.transform import Affine
 
 from alice_survey.kit.document import PictureLayer, Scale
 from alice_survey.report.colours import (
@@ -22,6 +22,7 @@ from alice_survey.report.colours import (
     encoded,
     limits_of,
     number_rasters,
+    read_shrunk,
     scale_of,
 )
 from alice_survey.report.held import Held
@@ -48,52 +49,35 @@ def picture_layers(held: Held) -> Iterator[PictureLayer]:
 def mosaic_layer(path: Path, most_px: int = _MOST_PAINTED_PX) -> PictureLayer:
     """The mosaic; what no picture saw is transparent."""
     with rasterio.open(path) as raster:
-        height, width = _shrunk(raster.height, raster.width, most_px)
-        bands = raster.read([1, 2, 3], out_shape=(3, height, width), resampling=Resampling.average)
-        clear = raster.dataset_mask(out_shape=(height, width))
-        west, north = raster.transform.c, raster.transform.f
-        pixel = raster.transform.a * raster.width / width
         full = raster.transform.a
-    picture = np.dstack([*bands, np.where(clear > 0, 255, 0)]).astype(np.uint8)
-    shrunk = "" if width == raster.width else f" Shrunk {pixel / full:.1f} times."
+    bands, opacity, transform = read_shrunk(path, [1, 2, 3], most_px)
+    picture = np.dstack([*np.ma.getdata(bands), np.where(opacity > 0, 255, 0)]).astype(np.uint8)
+    shrunk = "" if transform.a == full else f" Shrunk {transform.a / full:.1f} times."
     return _layer(
-        picture, name="mosaic", title=MOSAIC_TITLE, west=west, north=north, pixel=pixel,
-        about=f"{MOSAIC_ABOUT}{shrunk}",
+        picture, transform, name="mosaic", title=MOSAIC_TITLE, about=f"{MOSAIC_ABOUT}{shrunk}",
         shown=True,
     )  # fmt: skip
 
 
 def _number_layer(path: Path, numbers: Numbers, *, shown: bool) -> PictureLayer:
     with rasterio.open(path) as raster:
-        height, width = _shrunk(raster.height, raster.width, _MOST_COLOURED_PX)
-        values = raster.read(
-            1, out_shape=(height, width), resampling=Resampling.average, masked=True
-        )
-        west, north = raster.transform.c, raster.transform.f
-        pixel = raster.transform.a * raster.width / width
         limits = limits_of(raster, numbers)
+    (values,), _, transform = read_shrunk(path, [1], _MOST_COLOURED_PX)
     level = numbers.levels(values.astype(np.float64).filled(np.nan))
     return _layer(
-        coloured(level, numbers, limits, pixel),
-        name=numbers.name, title=numbers.title, about=numbers.about, west=west, north=north,
-        pixel=pixel, shown=shown, scale=scale_of(numbers, limits),
+        coloured(level, numbers, limits, transform.a), transform,
+        name=numbers.name, title=numbers.title, about=numbers.about, shown=shown,
+        scale=scale_of(numbers, limits),
     )  # fmt: skip
-
-
-def _shrunk(height: int, width: int, most_px: int) -> tuple[int, int]:
-    shrink = max(1.0, float(np.sqrt(height * width / most_px)))
-    return max(1, round(height / shrink)), max(1, round(width / shrink))
 
 
 def _layer(
     picture: Rgba,
+    transform: Affine,
     *,
     name: str,
     title: str,
     about: str,
-    west: float,
-    north: float,
-    pixel: float,
     shown: bool,
     scale: Scale | None = None,
 ) -> PictureLayer:
@@ -111,7 +95,8 @@ def _layer(
                     tiles[f"{level}/{x // TILE_PX}/{y // TILE_PX}"] = encoded(tile)
         picture = _halved(picture)
     return PictureLayer(
-        name=name, title=title, about=about, west_m=west, north_m=north, pixel_m=pixel,
+        name=name, title=title, about=about,
+        west_m=transform.c, north_m=transform.f, pixel_m=transform.a,
         width_px=width, height_px=height, tile_px=TILE_PX, levels=levels, tiles=tiles,
         scale=scale, shown=shown,
     )  # fmt: skip

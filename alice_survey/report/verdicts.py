@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from alice_survey.base.records import CalibrationReportRecord, FlightRecord
-from alice_survey.kit.document import Verdict, worst_first
+from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import (
     count,
     digits,
@@ -50,6 +50,12 @@ def verdicts(figures: Figures) -> list[Verdict]:
     ])  # fmt: skip
 
 
+def _judged(text: str, action: str, *, good: bool, bad: bool = False) -> Verdict:
+    """Good, or else bad or something to look at, with what to do."""
+    level: Level = "good" if good else "bad" if bad else "look"
+    return Verdict(level=level, text=text, action="" if good else action)
+
+
 def _flight(figures: Figures) -> Iterator[Verdict]:
     flight = figures.held.read(FlightRecord)
     if flight is None:
@@ -64,14 +70,12 @@ def _flight(figures: Figures) -> Iterator[Verdict]:
             text=f"{text}; it ended early: {flight.ending}",
             action="Fly what is left: 'alice-survey plan check' writes a plan for it.",
         )
-    elif flight.coverage.share_at_overlap < _WELL_COVERED:
-        yield Verdict(
-            level="look",
-            text=text,
-            action="Fly the holes again: 'alice-survey plan check' writes a plan for them.",
-        )
     else:
-        yield Verdict(level="good", text=text)
+        yield _judged(
+            text,
+            "Fly the holes again: 'alice-survey plan check' writes a plan for them.",
+            good=flight.coverage.share_at_overlap >= _WELL_COVERED,
+        )
 
 
 def _calibration(figures: Figures) -> Iterator[Verdict]:
@@ -107,17 +111,15 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
     if not figures.held.has("sparse"):
         return
     registered, total = figures.registered, figures.total
-    text = f"pictures in the model: {registered} of {total}"
-    if registered == total:
-        yield Verdict(level="good", text=text)
-    else:
-        rare = registered < _LEAST_REGISTERED * total
-        yield Verdict(
-            level="bad" if rare else "look",
-            text=f"{text}; the others share too little with their neighbours",
-            action="Fly with more overlap where pictures were lost (see the map), or with more "
-            "light if they are dark.",
-        )
+    whole = registered == total
+    yield _judged(
+        f"pictures in the model: {registered} of {total}"
+        + ("" if whole else "; the others share too little with their neighbours"),
+        "Fly with more overlap where pictures were lost (see the map), or with more light if they "
+        "are dark.",
+        good=whole,
+        bad=registered < _LEAST_REGISTERED * total,
+    )
     mapping = figures.mapping
     for note in () if mapping.acceptance is None else mapping.acceptance.notes:
         yield Verdict(
@@ -150,16 +152,12 @@ def _scale(figures: Figures) -> Iterator[Verdict]:
         yield Verdict(level="good" if "rig" in source else "look", text=source)
         return
     off = 1.0 / navigation - 1.0
-    text = f"{source}; navigation's differs by {parts_with_sigma(-off, sigma)}"
-    if abs(off) > _SURE_SIGMAS * sigma:
-        yield Verdict(
-            level="look",
-            text=text,
-            action="Measure a known length in the water: either the rig has moved since its "
-            "calibration, or navigation's scale is off.",
-        )
-    else:
-        yield Verdict(level="good", text=text)
+    yield _judged(
+        f"{source}; navigation's differs by {parts_with_sigma(-off, sigma)}",
+        "Measure a known length in the water: either the rig has moved since its calibration, or "
+        "navigation's scale is off.",
+        good=abs(off) <= _SURE_SIGMAS * sigma,
+    )
 
 
 def _shape(figures: Figures) -> Iterator[Verdict]:
@@ -189,26 +187,23 @@ def _surface(figures: Figures) -> Iterator[Verdict]:
         return
     unit = figures.held.unit
     if math.isfinite(surface.covered):
-        text = f"the surface covers {share(surface.covered)} of the planned area"
-        if surface.covered < _WELL_COVERED:
-            yield Verdict(
-                level="bad" if surface.covered < _LEAST_COVERED else "look",
-                text=text,
-                action="Fly the holes again: the map shows them, and 'alice-survey plan check' "
-                "writes a plan for them.",
-            )
-        else:
-            yield Verdict(level="good", text=text)
+        yield _judged(
+            f"the surface covers {share(surface.covered)} of the planned area",
+            "Fly the holes again: the map shows them, and 'alice-survey plan check' writes a plan "
+            "for them.",
+            good=surface.covered >= _WELL_COVERED,
+            bad=surface.covered < _LEAST_COVERED,
+        )
     if math.isfinite(surface.sigma_median):
         text = (
             f"heights are good to {length(surface.sigma_median, unit)} (one sigma, median; 95 % of "
             f"the cells to {length(surface.sigma_95, unit)}), within the survey"
         )
         fine = not surface.sigma_median > figures.pixel_m
-        yield Verdict(
-            level="good" if fine else "look",
-            text=text if fine else f"{text}; the mosaic's pixel is {length(figures.pixel_m, unit)}",
-            action="" if fine else "Fly lower or with more overlap for better heights.",
+        yield _judged(
+            text if fine else f"{text}; the mosaic's pixel is {length(figures.pixel_m, unit)}",
+            "Fly lower or with more overlap for better heights.",
+            good=fine,
         )
     if surface.stations_median < _LEAST_STATIONS:
         yield Verdict(
@@ -225,21 +220,20 @@ def _truth(figures: Figures) -> Iterator[Verdict]:
         return
     surface, cameras = score.surface, score.cameras
     miss = surface.distance_rms_mm
-    good = miss <= surface.ground_pixel_mm
-    yield Verdict(
-        level="good" if good else "bad",
-        text=f"against the truth: surface {millimetres(miss)} rms, cameras "
+    yield _judged(
+        f"against the truth: surface {millimetres(miss)} rms, cameras "
         f"{millimetres(cameras.rms_mm)} rms, scale {parts(1e-6 * cameras.scale_error_ppm)}, "
         f"domed by {millimetres(surface.doming.dome_mm)}",
-        action="" if good else "Look where on the map of errors.",
+        "Look where on the map of errors.",
+        good=miss <= surface.ground_pixel_mm,
+        bad=True,
     )
     ratio = None if surface.error_over_sigma is None else surface.error_over_sigma.rms
     if ratio is not None:
-        honest = _HONEST[0] <= ratio <= _HONEST[1]
-        yield Verdict(
-            level="good" if honest else "look",
-            text=f"errors of heights over their stated sigmas: {ratio:.2f} rms (1 is expected)",
-            action="" if honest else "Multiply the stated sigmas by this factor where it matters.",
+        yield _judged(
+            f"errors of heights over their stated sigmas: {ratio:.2f} rms (1 is expected)",
+            "Multiply the stated sigmas by this factor where it matters.",
+            good=_HONEST[0] <= ratio <= _HONEST[1],
         )
 
 
@@ -248,12 +242,12 @@ def _reference(figures: Figures) -> Iterator[Verdict]:
     if found is None:
         return
     miss = found.survey_to_reference
-    yield Verdict(
-        level="good" if miss.median_px <= 2.0 else "look",
-        text=f"against {found.reference.rsplit('/', 1)[-1]}: {length(miss.median_m)} median "
+    yield _judged(
+        f"against {found.reference.rsplit('/', 1)[-1]}: {length(miss.median_m)} median "
         f"({miss.median_px:.1f} ground pixels), after a {found.registration.transform} "
         "registration",
-        action="" if miss.median_px <= 2.0 else "See where in reference/reference.png.",
+        "See where in reference/reference.png.",
+        good=miss.median_px <= 2.0,
     )
 
 

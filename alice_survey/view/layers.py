@@ -183,7 +183,7 @@ class Layers:
         self._tile = lru_cache(_KEPT_TILES)(self._read_tile)
 
     def picture_layers(self) -> Sequence[PictureLayer]:
-        """The layers that are there, for a page that asks for their tiles."""
+        """The layers that are there, for a page that requests their tiles."""
         found: list[PictureLayer] = []
         for name in FILES:
             try:

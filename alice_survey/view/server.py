@@ -35,7 +35,7 @@ _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
 _CHANGED = "the survey was worked on meanwhile: load the page again"
 _KEEP = "private, max-age=86400, immutable"
 """Cache policy of requests that state a version."""
-_ASK_AGAIN = "no-cache"
+_REVALIDATE = "no-cache"
 _CHUNK = 1 << 20
 _NOTHING = "default-src 'none'; sandbox"
 _COMMON = {
@@ -233,8 +233,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> None:
         path, _, query = self.path.partition("?")
-        asked = _VERSION.fullmatch(query)
-        token = asked.group(1) if asked else None
+        requested = _VERSION.fullmatch(query)
+        token = requested.group(1) if requested else None
         tile = _TILE.fullmatch(path)
         if path == "/":
             self._send(*self._made_page(self.headers["Host"].strip()), "text/html; charset=utf-8")
@@ -288,7 +288,7 @@ class Handler(BaseHTTPRequestHandler):
                 headers["Content-Range"] = f"bytes {first}-{first + count - 1}/{size}"
             elif code == 416:
                 headers["Content-Range"] = f"bytes */{size}"
-            self._begin(code, policy_of(names[-1]), count, _ASK_AGAIN, headers)
+            self._begin(code, policy_of(names[-1]), count, _REVALIDATE, headers)
             if self.command == "GET":
                 file.seek(first)
                 while count and (chunk := file.read(min(_CHUNK, count))):
@@ -298,12 +298,12 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, content: bytes, policy: str, kind: str) -> None:
         """A page that is made for each request."""
-        self._begin(200, policy, len(content), _ASK_AGAIN, {"Content-Type": kind})
+        self._begin(200, policy, len(content), _REVALIDATE, {"Content-Type": kind})
         self._write(content)
 
-    def _send_versioned(self, content: bytes, found: str, kind: str, asked: str | None) -> None:
+    def _send_versioned(self, content: bytes, found: str, kind: str, requested: str | None) -> None:
         headers = {"Content-Type": kind, "ETag": f'"{found}"'}
-        keep = _KEEP if asked is not None else _ASK_AGAIN
+        keep = _KEEP if requested is not None else _REVALIDATE
         if self.headers.get("If-None-Match") == headers["ETag"]:
             self._begin(304, _NOTHING, 0, keep, headers)
             return
@@ -311,7 +311,7 @@ class Handler(BaseHTTPRequestHandler):
         self._write(content)
 
     def _go_to(self, place: str) -> None:
-        self._begin(HTTPStatus.MOVED_PERMANENTLY, _NOTHING, 0, _ASK_AGAIN, {"Location": place})
+        self._begin(HTTPStatus.MOVED_PERMANENTLY, _NOTHING, 0, _REVALIDATE, {"Location": place})
 
     def _send_line(self, status: HTTPStatus, text: str) -> None:
         """Answer with a line."""

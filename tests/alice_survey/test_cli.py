@@ -5,7 +5,6 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -25,7 +24,6 @@ COMMANDS = (
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-log", "measure",
     "control", "quality", "mosaic-tiles", "report", "view",
 )  # fmt: skip
-PACKAGE = Path(__file__).parents[2] / "alice_survey"
 
 
 def fails(
@@ -106,15 +104,6 @@ def test_the_template_states_every_default(tmp_path: Path) -> None:
             assert re.search(rf"^(# )?{key} = ", text, re.MULTILINE), f"{section}.{key}"
 
 
-def test_the_demo_is_a_survey() -> None:
-    text = (PACKAGE / "demo.toml").read_text()
-    config = SurveyConfig.model_validate(tomllib.loads(text))
-    assert config.imaging.scale == 4
-    assert config.plan.forward_overlap >= 0.6
-    assert config.plan.side_overlap >= 0.3
-    assert config.seafloor.relief_m >= 0.3
-
-
 def test_init_never_overwrites(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,34 +133,6 @@ def test_what_the_file_system_refuses_is_one_line(
     monkeypatch.chdir(tmp_path)
     assert said in fails(arguments, capsys, monkeypatch)
     assert (tmp_path / "FILE").read_text() == "a file"
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (
-            "[plan]\naltitud_m = 2",
-            "plan.altitud_m is not a known setting; did you mean altitude_m?",
-        ),
-        ("[plan]\naltitude_m = -1", "plan.altitude_m = -1"),
-        ("[plan]\nforward_overlap = 1.2", "less than or equal to 0.95"),
-        ("[plan]\nspeed_mps = nan", "plan.speed_mps = nan"),
-        ("[area]\nlength_m = 0", "area.length_m = 0"),
-        ("[plan\naltitude_m = 2", "not valid TOML"),
-        ("[water]\njerlov = 'X'", "water.jerlov = 'X'"),
-    ],
-)
-def test_a_wrong_setting_is_one_line(
-    text: str,
-    said: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    (tmp_path / "survey.toml").write_text(text)
-    shown = fails(["plan", "-w", str(tmp_path)], capsys, monkeypatch)
-    assert said in shown
-    assert str(tmp_path / "survey.toml") in shown
 
 
 def test_stages_name_the_command_that_is_missing(
@@ -232,24 +193,6 @@ def test_calibrate_does_not_forget_options_when_pictures_are_missing(
 ) -> None:
     shown = fails(["calibrate", *option], capsys, monkeypatch)
     assert "--left and --right, or --pictures" in shown
-
-
-def commands_in_a_workspace() -> list[str]:
-    """Those without arguments of their own; groups have commands below them instead."""
-    return [
-        name
-        for name, command in get_command(app).commands.items()  # type: ignore[attr-defined]
-        if not hasattr(command, "commands")
-        and any(option.name == "workspace" for option in command.params)
-        and all(p.name == "folder" for p in command.params if p.param_type_name == "argument")
-    ]
-
-
-@pytest.mark.parametrize("name", commands_in_a_workspace())
-def test_a_workspace_is_an_option_and_an_argument_of_each_command(name: str) -> None:
-    parameters = get_command(app).commands[name].params  # type: ignore[attr-defined]
-    assert [p.opts for p in parameters if p.name == "workspace"] == [["-w", "--workspace"]]
-    assert [p.name for p in parameters if p.param_type_name == "argument"] == ["folder"]
 
 
 def test_a_workspace_as_argument_is_the_same_as_by_option(tmp_path: Path) -> None:

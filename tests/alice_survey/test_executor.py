@@ -155,16 +155,11 @@ def test_workers_die_with_a_killed_parent(tmp_path: Path) -> None:
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     for _ in range(50):
-        if not any(_alive(pid) for pid in pids):
+        if not any(psutil.pid_exists(pid) and _runs(pid) for pid in pids):
             return
         time.sleep(0.1)
     pytest.fail("workers outlive their parent")
 
 
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    status = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    return status != "Z"
+def _runs(pid: int) -> bool:
+    return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE

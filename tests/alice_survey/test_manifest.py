@@ -17,33 +17,19 @@ def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "told"),
+    "row",
     [
-        ("a.png,left,1e3,,0", "station is '1e3', not a number"),
-        (f"a.png,left,{'9' * 25},,0", "too large"),
-        (f"a.png,left,{'9' * 400},,0", "too large|not a number"),
-        (f"a.png,left,{'9' * 5000},,0", "not a number"),
-        ("a.png,left,0,,1e300", "too large"),
-        ("a.png,left,0,,inf", "too large"),
-        ("../a.png,left,0,,0", "leaves its folder"),
-        ("/a.png,left,0,,0", "leaves its folder"),
-        ("a.png,left,0,../m.png,0", "leaves its folder"),
-        ("a\0.png,left,0,,0", "not a file name|NUL"),
-        ("a\x1b.png,left,0,,0", "not a file name"),
-        ("x" * 200_000 + ",left,0,,0", "no CSV text"),
+        "a.png,left,1e3,,0", "a.png,left,0,,soon", "a.png,left,,,0", "../a.png,left,0,,0",
+        "/a.png,left,0,,0", "a.png,left,0,../m.png,0", "x" * 200_000 + ",left,0,,0",
+        "a.png,left,0,,0\na.png,left,0,,0", "\udcff,left,0,,0",
     ],
+    ids=lambda row: ascii(row[:12]),
 )  # fmt: skip
-def test_wrong_rows_are_one_line(row: str, told: str, tmp_path: Path) -> None:
+def test_wrong_rows_are_one_line(row: str, tmp_path: Path) -> None:
     path = tmp_path / "manifest.csv"
-    path.write_text(HEAD + row + "\n")
-    with pytest.raises(ImageError, match=told) as fault:
+    path.write_text(f"{HEAD}{row}\n", encoding="utf-8", errors="surrogateescape")
+    with pytest.raises(ImageError) as fault:
         read_manifest(path)
+    assert str(path) in str(fault.value)
     assert "\n" not in str(fault.value)
     assert len(str(fault.value)) < 400
-
-
-def test_what_is_no_text_is_said(tmp_path: Path) -> None:
-    path = tmp_path / "manifest.csv"
-    path.write_bytes(HEAD.encode() + b"\xff\xfe,left,0,,0\n")
-    with pytest.raises(ImageError, match="UTF-8"):
-        read_manifest(path)

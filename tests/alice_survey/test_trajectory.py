@@ -91,7 +91,7 @@ def test_a_file_without_rows_gives_empty_columns(tmp_path: Path) -> None:
         ("a,b\nten,1\n", "line 2: a is 'ten'"),
     ],
 )
-def test_a_fault_is_told_with_its_line(tmp_path: Path, content: str, words: str) -> None:
+def test_a_fault_is_reported_with_its_line(tmp_path: Path, content: str, words: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(content)
     with pytest.raises(NavigationError) as fault:
@@ -109,21 +109,21 @@ def test_a_missing_or_binary_file_is_named(tmp_path: Path) -> None:
         read_columns(tmp_path / "bin.csv", ("a",))
 
 
-def test_a_track_whose_times_repeat_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_track_whose_times_repeat_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "track.csv"
     path.write_text(",".join(TRACK_COLUMNS) + "\n0,0,0,0,0,0,0\n0,0,0,0,0,0,0\n")
     with pytest.raises(NavigationError, match="line 3: time_s 0 does not increase"):
         read_track(path)
 
 
-def test_an_empty_track_is_told_in_one_line(tmp_path: Path) -> None:
+def test_an_empty_track_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "track.csv"
     path.write_text(",".join(TRACK_COLUMNS) + "\n")
     with pytest.raises(NavigationError, match="no rows"):
         read_track(path)
 
 
-def test_a_cell_without_end_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_cell_without_end_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "track.csv"
     path.write_text(",".join(TRACK_COLUMNS) + "\n" + "1" * 200_000)
     with pytest.raises(NavigationError, match=r"track\.csv: cannot be read"):

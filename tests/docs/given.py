@@ -1,7 +1,6 @@
 """Files that pages take for granted: made here, before a page's commands run."""
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -30,8 +29,6 @@ class Run:
     returncode: int
     stdout: str
     stderr: str
-    cpu_s: float
-    """Computing of its commands: what else the machine does is not in it."""
 
 
 class Made:
@@ -49,7 +46,6 @@ class Made:
         prepare = GIVEN.get(page)
         if prepare is not None:
             prepare(folder, self)
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         ended = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", script_of(DOCS / page)],
             cwd=folder,
@@ -64,13 +60,11 @@ class Made:
             timeout=LONGEST_S,
             preexec_fn=_on_one_core,
         )
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
         return Run(
             folder=folder,
             returncode=ended.returncode,
             stdout=ended.stdout,
             stderr=ended.stderr,
-            cpu_s=after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
         )
 
     def after(self, page: str) -> Path:

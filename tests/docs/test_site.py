@@ -70,16 +70,6 @@ def fetched(page: str) -> list[str]:
     return parser.addresses
 
 
-def test_what_a_page_fetches_is_found() -> None:
-    page = (
-        '<link rel="stylesheet" href="https://a/x.css"><a href="https://b/">b</a>'
-        '<script src="//c/y.js"></script><img src="d.png"><link rel="canonical" href="https://e/">'
-        '<p style="background: url(https://f/z.png)">'
-    )
-    foreign = [address for address in fetched(page) if FOREIGN.match(address)]
-    assert foreign == ["https://a/x.css", "//c/y.js", "https://f/z.png"]
-
-
 def test_no_page_names_another_host(site: Path) -> None:
     held = sorted(site.rglob("*.html"))
     assert len(held) > len(pages())
@@ -115,14 +105,6 @@ def test_the_api_page_shows_each_public_name_with_all_its_fields(site: Path) -> 
             assert f'id="{home}.{name}"' in page, name
     for field in ("fx_px", "k6", "port_distance_m", "n_water"):
         assert f'id="camera_calib.flat_port.FlatPortCamera.{field}"' in page, field
-
-
-def test_a_wrapped_return_value_is_one_value(site: Path) -> None:
-    page = (site / "api" / "index.html").read_text(encoding="utf-8")
-    start = page.index('id="camera_calib.flat_port.FlatPortCamera.project"')
-    returned = page[page.index("Returns:", start) :]
-    rows = re.findall(r"<tr\b.*?</tr>", returned[: returned.index("</tbody>")], re.S)
-    assert len(rows) == 2, rows  # the head, and one value however its text is wrapped
 
 
 def test_modules_that_the_theory_names_exist() -> None:
@@ -187,14 +169,6 @@ def test_formulas_within_and_between_lines(hooks: ModuleType) -> None:
     assert "$" not in made
 
 
-def test_code_and_prices_are_no_formulas(hooks: ModuleType) -> None:
-    text = "`$a$` costs $5 or 6 $.\n\n```bash\necho $HOME $$ $b$\n```\n\n    $$c$$\n"
-    made = html_of(text, hooks)
-    assert "<math" not in made
-    assert "<code>$a$</code>" in made
-    assert "$$c$$" in made
-
-
 @pytest.mark.parametrize("wrong", [r"$\frok{a}{b}$", r"$\left(a$", "$a_{b$"])
 def test_a_wrong_formula_stops_the_build(wrong: str, hooks: ModuleType) -> None:
     with pytest.raises(PluginError, match=r"page\.md"):
@@ -220,14 +194,3 @@ def test_pages_open_from_disk_and_ask_for_nothing_else(
     tab.close()
     assert heard.complaints == []
     assert [asked for asked in heard.requests if not asked.startswith(("file:", "data:"))] == []
-
-
-def test_the_search_finds_from_disk(site: Path, browser: Any) -> None:
-    tab = browser.new_page(viewport={"width": 1280, "height": 900})
-    tab.goto((site / "index.html").as_uri())
-    tab.locator(".md-search__input").click()
-    tab.locator(".md-search__input").press_sequentially("altitude", delay=50)
-    first = tab.locator(".md-search-result__link").first
-    first.wait_for(state="visible", timeout=20_000)
-    assert first.get_attribute("href").startswith("file:")
-    tab.close()

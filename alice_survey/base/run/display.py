@@ -54,8 +54,8 @@ def _line_of(event: Event, *, alive: bool) -> str | None:
     """Permanent text of an event on the screen, if any.
 
     Args:
-        event: what has happened, or how far running work is.
-        alive: whether the latter is shown too.
+        event: what has happened, or the progress of running work.
+        alive: whether that progress is shown too.
     """
     match event["event"]:
         case "warning":

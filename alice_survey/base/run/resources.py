@@ -4,11 +4,12 @@ import contextlib
 import ctypes
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import psutil
@@ -54,22 +55,12 @@ class Spent:
             "peak_mib": round(self.peak_mib, 1),
         }
 
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> "Spent":
-        """Read what `to_json` wrote.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is something else.
-        """
-        return Spent(**{name: float(data[name]) for name in ("took_s", "cpu_s", "peak_mib")})
-
 
 class Meter:
     """Meter of the resources this process and its descendants use since its creation."""
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
-        self._started, self._cpu_s = clock(), sum(map(cpu_s, family()))
+    def __init__(self) -> None:
+        self._started_s, self._cpu_s = time.monotonic(), sum(map(cpu_s, family()))
         self._peak_mib = 0.0
         self._lock = threading.Lock()
 
@@ -80,7 +71,7 @@ class Meter:
         with self._lock:
             self._peak_mib = max(self._peak_mib, memory)
             return Spent(
-                took_s=self._clock() - self._started,
+                took_s=time.monotonic() - self._started_s,
                 cpu_s=max(0.0, sum(map(cpu_s, processes)) - self._cpu_s),
                 peak_mib=self._peak_mib,
             )

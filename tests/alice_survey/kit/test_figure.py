@@ -10,8 +10,6 @@ from alice_survey.kit.figure import (
     figure_style,
     map_axes,
     new_figure,
-    palette_colours,
-    palette_steps,
     png_of,
     save_figure,
     scale_bar,
@@ -71,13 +69,6 @@ def test_a_map_of_a_model_without_positions_has_no_north() -> None:
     map_axes(axes, "unit", placed=False)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, unit", "y, unit")
     assert "N" not in [text.get_text() for text in axes.texts]
-
-
-def test_palettes_run_from_their_first_colour_to_their_last() -> None:
-    steps = palette_steps("viridis", 5)
-    ends = palette_colours("viridis", np.array([0.0, 1.0]))
-    assert (steps[0], steps[-1]) == ("#440154", "#fde725")
-    np.testing.assert_allclose(ends, [(0x44, 0x01, 0x54, 255), (0xFD, 0xE7, 0x25, 255)], atol=1)
 
 
 def test_a_scale_about_zero_shows_small_errors_next_to_few_large_ones() -> None:

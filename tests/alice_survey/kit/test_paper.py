@@ -60,12 +60,6 @@ def test_a_screen_reader_gets_what_figures_show(report: Report, pdf: bytes) -> N
     assert b"pdfuaid" in pdf or reader.xmp_metadata is not None
 
 
-def test_all_of_a_map_is_in_print(report: Report, pdf: bytes) -> None:
-    text = printed(pdf)
-    for words in ("north,m", "east,m", "heightabovethedatum,m", "Surveyarea", "page1of"):
-        assert words in text, words
-
-
 def test_files_stay_out_of_the_folder_of_the_caller(
     report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

