@@ -206,9 +206,9 @@ def tiles_of(grid: DemGrid, size: int) -> list[Window]:
     ]
 
 
-def hillshade(height: Array, cell: float, exaggeration: float = 1.0) -> Array:
+def hillshade(height: Array, cell: float) -> Array:
     """Shade (0 to 1) of a surface lit from the north-west, 45 degrees up; NaN stays NaN."""
-    down, right = np.gradient(height * exaggeration, cell)
+    down, right = np.gradient(height, cell)
     normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     light = np.array([-0.5, 0.5, np.sqrt(0.5)])

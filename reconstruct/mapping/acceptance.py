@@ -18,10 +18,12 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.robust import CAUCHY_TUNING
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
+from reconstruct.mapping.arrays import first_pictures
 from reconstruct.mapping.database import as_transform
-from reconstruct.mapping.doming import ScaleTrend
+from reconstruct.mapping.doming import Doming, ScaleTrend, measure_doming, navigation_rotations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import pinhole_positions
+from reconstruct.pictures.files import named
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
 """A station is off navigation when it misses by more than both."""
@@ -31,7 +33,6 @@ _LEAST_STATIONS = 5
 _ROUNDS = 20
 _MEDIAN_SIGMAS = 1.5382
 """Median length of a vector of three independent unit normal numbers."""
-_NAMED = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +65,11 @@ class Acceptance:
         """A line for every fault."""
         notes = []
         if self.far:
-            names = ", ".join(f"{f.image} ({f.off_m:.2f} m)" for f in self.far[:_NAMED])
-            more = len(self.far) - _NAMED
+            names = named([f"{f.image} ({f.off_m:.2f} m)" for f in self.far])
             notes.append(
                 f"{len(self.far)} of {self.checked} stations lie more than {FAR_SIGMAS:.0f} sigmas "
                 f"and {FAR_M} m from where navigation has them, which others miss by "
-                f"{self.usual_m:.2f} m: {names}{f' and {more} more' if more > 0 else ''}; look at "
+                f"{self.usual_m:.2f} m: {names}; look at "
                 "these pictures and at navigation's log"
             )
         if abs(self.rig_error) > SCALE_BOUND:
@@ -96,11 +96,34 @@ class Acceptance:
         }
 
 
+@progress.step("judge the model")
+def judge_model(
+    mapped: Mapped, records: Sequence[ImageRecord], rig: Rig, datum: Datum | None
+) -> tuple[Doming, Acceptance]:
+    """How bent a model on a known rig is, and whether it is credible, by all that is known of it.
+
+    Args:
+        mapped: scaled by its rig; picture i of `records` has the id i + 1.
+        records: pictures.
+        rig: on which it was mapped.
+        datum: of navigation's positions; None without.
+    """
+    positions = sigmas = np.full((len(records), 3), np.nan)
+    if datum is not None:
+        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
+    rotations = navigation_rotations(records, rig, mapped.lenses)
+    doming = measure_doming(mapped.model, positions, sigmas, rotations)
+    # What adjustments made of the rig, before its size was put back.
+    rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
+    accepted = check_mapping(mapped.model, records, positions, sigmas, rig_error, doming.scale)
+    return doming, accepted
+
+
 def check_mapping(
     model: pycolmap.Reconstruction,
     records: Sequence[ImageRecord],
-    positions: Array | None,
-    sigmas: Array | None,
+    positions: Array,
+    sigmas: Array,
     rig_error: float,
     scale: ScaleTrend | None,
 ) -> Acceptance:
@@ -110,49 +133,22 @@ def check_mapping(
         model: in metres; picture i of `records` has the id i + 1.
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
-            unknown; None without navigation.
+            unknown.
         sigmas: (N, 3); the same for these.
         rig_error: relative error of the rig's baseline in the model; NaN without one.
         scale: of the model against its stations' own stereo.
     """
-    checked, usual = 0, float("nan")
-    far: tuple[FarStation, ...] = ()
-    if positions is not None and sigmas is not None:
-        checked, usual, far = _far_stations(model, records, positions, sigmas)
+    checked, usual, far = _far_stations(model, records, positions, sigmas)
     found = Acceptance(checked=checked, usual_m=usual, far=far, rig_error=rig_error, scale=scale)
     for note in found.notes():
         warn(note)
     return found
 
 
-@progress.step("judge the model")
-def check_survey(
-    mapped: Mapped,
-    records: Sequence[ImageRecord],
-    rig: Rig | None,
-    datum: Datum | None,
-    scale: ScaleTrend | None,
-) -> Acceptance | None:
-    """Check a mapping with what its survey knows; None without a calibrated rig."""
-    if rig is None or not mapped.scaled:
-        return None
-    positions = sigmas = None
-    if datum is not None:
-        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
-    # What adjustments made of the rig, before its size was put back.
-    rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
-    return check_mapping(mapped.model, records, positions, sigmas, rig_error, scale)
-
-
 def _far_stations(
     model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
 ) -> tuple[int, float, tuple[FarStation, ...]]:
-    first: dict[int, int] = {}
-    for number, image in sorted(model.images.items()):
-        given = np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
-        if image.has_pose and given:
-            first.setdefault(image.frame_id, number)
-    numbers = sorted(first.values())
+    numbers = sorted(first_pictures(model, np.isfinite(positions + sigmas).all(axis=1)).values())
     if len(numbers) < _LEAST_STATIONS:
         return len(numbers), float("nan"), ()
     rows = np.array(numbers) - 1

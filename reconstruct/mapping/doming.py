@@ -15,15 +15,12 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.robust import CAUCHY_TUNING, MAD_TO_SIGMA
-from alice_survey.base.run import progress
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Observed, observed
+from reconstruct.mapping.arrays import Observed, first_pictures, observed
 from reconstruct.mapping.database import as_transform
-from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.views.lens import Lens
 
@@ -122,33 +119,30 @@ class Doming:
 
 def measure_doming(
     model: pycolmap.Reconstruction,
-    records: Sequence[ImageRecord],
-    positions: Array | None,
-    sigmas: Array | None,
+    positions: Array,
+    sigmas: Array,
     rotations: Mapping[int, Rotation],
 ) -> Doming:
     """Measure how bent a model is, and warn where that is significant.
 
     Args:
-        model: in metres; picture i of `records` has the id i + 1.
-        records: pictures.
+        model: in metres; picture i of N has the id i + 1.
         positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
-            unknown; None without navigation.
+            unknown.
         sigmas: (N, 3); the same for these.
         rotations: `ned_from_pinhole` by picture's index, as navigation has it.
     """
     seen = observed(model)
     pixel = ground_pixel(model, seen)
     down = down_of(model, rotations)
-    reference = _references(model)
-    numbers = sorted(reference.values())
-    centres = np.array([model.images[n].projection_center() for n in numbers]).reshape(-1, 3)
-    along = across = None
-    if positions is not None and sigmas is not None and len(numbers):
-        rows = np.array(numbers) - 1
-        given, sigma = positions[rows], sigmas[rows]
-        known = np.isfinite(given + sigma).all(axis=1)
-        along, across = bend_of(centres[known], given[known, 2], sigma[known, 2], down)
+    reference = first_pictures(model)
+    numbers = np.array(sorted(reference.values()), dtype=np.int64)
+    centres = np.array([model.images[n].projection_center() for n in numbers.tolist()])
+    known = np.isfinite(positions + sigmas).all(axis=1)[numbers - 1]
+    rows = numbers[known] - 1
+    along, across = bend_of(
+        centres.reshape(-1, 3)[known], positions[rows, 2], sigmas[rows, 2], down
+    )
     found = Doming(
         along=along,
         across=across,
@@ -158,20 +152,6 @@ def measure_doming(
     for note in found.notes():
         warn(note)
     return found
-
-
-@progress.step("look for doming")
-def doming_of_survey(
-    mapped: Mapped, records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
-) -> Doming | None:
-    """Measure a mapping's bend with what its survey knows; None without a calibrated rig."""
-    if rig is None or not mapped.scaled:
-        return None
-    positions = sigmas = None
-    if datum is not None:
-        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
-    rotations = navigation_rotations(records, rig, mapped.lenses)
-    return measure_doming(mapped.model, records, positions, sigmas, rotations)
 
 
 def bend_of(
@@ -194,10 +174,8 @@ def bend_of(
     """
     if len(centres) < _LEAST_STATIONS:
         return None, None
-    plane, sizes = _principal(centres, down)
+    design, sizes = _quadratic(centres, down)
     heights = depths_m - centres @ down  # of the model, above where navigation has it
-    wide = sizes[1] > _THIN * sizes[0]
-    design = _quadratic(plane, wide=wide)
     if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
         return None, None
     fitted, covariance = _robust_fit(design, heights, sigmas_m)
@@ -210,7 +188,7 @@ def bend_of(
         for k, size in zip((2, 4), sizes, strict=True)
         if k < len(fitted)
     ]
-    return bends[0], bends[1] if wide else None
+    return bends[0], bends[1] if len(bends) > 1 else None
 
 
 def scale_trend(
@@ -236,8 +214,7 @@ def scale_trend(
         return None
     centres = np.array([row[0] for row in local])
     scale, sigma = np.array([row[1:] for row in local]).T
-    plane, sizes = _principal(centres, down)
-    design = _quadratic(plane, wide=sizes[1] > _THIN * sizes[0])
+    design, _ = _quadratic(centres, down)
     if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
         return None
     fitted, covariance = _robust_fit(design, scale, sigma)
@@ -288,29 +265,21 @@ def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
     return float(np.median(rows)) if rows else float("nan")
 
 
-def _references(model: pycolmap.Reconstruction) -> dict[int, int]:
-    """The first posed picture of every frame."""
-    found: dict[int, int] = {}
-    for number in sorted(model.images):
-        if model.images[number].has_pose:
-            found.setdefault(model.images[number].frame_id, number)
-    return found
+def _quadratic(centres: Array, down: Array) -> tuple[Array, Array]:
+    """Columns 1, u, u^2 / 2 and, of a wide block, v, v^2 / 2, u v; and its extents, (2,).
 
-
-def _principal(centres: Array, down: Array) -> tuple[Array, Array]:
-    """Horizontal places about their middle in principal axes, (N, 2), and extents, (2,)."""
+    Here u and v are horizontal places about their middle in principal axes.
+    """
     flat = centres - centres.mean(axis=0)
     flat = flat - np.outer(flat @ down, down)
     axes = np.linalg.svd(flat, full_matrices=False)[2][:2]
     plane = flat @ axes.T
-    return plane, np.ptp(plane, axis=0)
-
-
-def _quadratic(plane: Array, *, wide: bool) -> Array:
-    """Columns 1, u, u^2 / 2 and, if wide, v, v^2 / 2, u v."""
+    sizes = np.ptp(plane, axis=0)
     u, v = plane.T
     columns = [np.ones(len(u)), u, u**2 / 2]
-    return np.column_stack([*columns, v, v**2 / 2, u * v] if wide else columns)
+    if sizes[1] > _THIN * sizes[0]:
+        columns += [v, v**2 / 2, u * v]
+    return np.column_stack(columns), sizes
 
 
 def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:

@@ -23,18 +23,20 @@ from camera_calib.freedom import Prior, pose_names, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
-from reconstruct.mapping.exact_sights import (
+from reconstruct.mapping.exact_observations import (
     Pixels,
     RigState,
+    calibrated_parameters,
     choose_pixels,
-    exact_sights,
+    exact_observations,
     start_state,
 )
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     POSE,
+    TURN_INFORMATION,
+    LinearObservations,
     ReducedSystem,
-    Sights,
     moved_points,
     reduce_points,
     solver_of,
@@ -51,8 +53,6 @@ _MOST_CORRELATED = 0.98
 """Correlation of navigation's errors from one station to the next."""
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
-_TURN_INFORMATION = 1.0
-"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 _ROUNDS = 20
 _SETTLED = 3e-2
 """Steps of all parameters, in their sigmas, at which the adjustment ends."""
@@ -146,15 +146,15 @@ def fit_rig(
     drift = np.zeros(len(first))
     variance = np.nan
     for _ in range(_ROUNDS):
-        sights = exact_sights(state, pixels, fields, names, lever=fixes is not None)
+        linear = exact_observations(state, pixels, fields, names, lever=fixes is not None)
         left = _spare(pixels, len(frames), len(first)) / (2 * len(pixels.station))
-        sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
-        weights = cauchy_weights(sights.miss, sigma)
-        now = variance_of(sights.miss, weights, left)
-        sights = sights.weighted(weights)
+        sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
+        weights = cauchy_weights(linear.miss, sigma)
+        now = variance_of(linear.miss, weights, left)
+        linear = linear.weighted(weights)
         variance = now if np.isnan(variance) else min(variance, now)
-        step = _step(sights, state, variance, information, drift, fixes)
-        state = _moved(state, pixels, step, sights, fields, names)
+        step = _step(linear, state, variance, information, drift, fixes)
+        state = _moved(state, pixels, step, linear, fields, names)
         drift = drift + step.shared
         if np.all(np.abs(step.shared) < _SETTLED * np.sqrt(np.diag(step.covariance))):
             break
@@ -208,9 +208,7 @@ def _spare(pixels: Pixels, stations: int, shared: int) -> int:
 
 def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
     """What is known before the pictures of what may move."""
-    known: tuple[str, ...] = ()
-    if rig.covariance is not None:
-        known = tuple(n for n in rig.covariance.parameters if n.split(".")[0] in names)
+    known = calibrated_parameters(rig, names)
     wide: dict[str, float] = {}
     if port:
         for name in names:
@@ -266,7 +264,7 @@ class _RigStep:
 
 
 def _step(
-    sights: Sights,
+    linear: LinearObservations,
     state: RigState,
     variance: float,
     information: Array,
@@ -275,7 +273,7 @@ def _step(
 ) -> _RigStep:
     """One Gauss-Newton step of stations and shared parameters, and the shared ones' covariance."""
     count = len(state.centres)
-    reduced = reduce_points(sights, count)
+    reduced = reduce_points(linear, count)
     shared = reduced.shared / variance + information
     pull = reduced.shared_slope / variance + information @ drift
     border, slope = reduced.border / variance, reduced.slope / variance
@@ -292,7 +290,7 @@ def _step(
             rows = rows / fixes.sigmas[s][:, None]
             off = (state.centres[s] + arm - fixes.positions[s]) / fixes.sigmas[s]
             extra[s] = rows[:, :POSE].T @ rows[:, :POSE]
-            extra[s][[0, 1, 2], [0, 1, 2]] += _TURN_INFORMATION
+            extra[s][[0, 1, 2], [0, 1, 2]] += TURN_INFORMATION
             at = slice(POSE * s, POSE * s + POSE)
             border[at, -3:] += rows[:, :POSE].T @ rows[:, POSE:]
             slope[at] += rows[:, :POSE].T @ off
@@ -329,12 +327,12 @@ def _moved(
     state: RigState,
     pixels: Pixels,
     step: _RigStep,
-    sights: Sights,
+    linear: LinearObservations,
     fields: Sequence[str],
     names: Sequence[str],
 ) -> RigState:
     points = moved_points(
-        sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
+        linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
         step.reduced.point_inverse, step.stations, step.shared,
     )  # fmt: skip
     cameras, poses = list(state.cameras), list(state.cam_from_rig)

@@ -14,11 +14,11 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array, Datum
+from alice_survey.base.frames import Datum
 from alice_survey.base.records import PortRecord
 from camera_calib.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
-from reconstruct.mapping.arrays import frames_of
+from reconstruct.mapping.arrays import first_pictures, frames_of
 from reconstruct.mapping.bundle import move_points
 from reconstruct.mapping.database import Observations, rigid3d
 from reconstruct.mapping.mapper import Mapped, model_baseline
@@ -28,7 +28,7 @@ from reconstruct.mapping.rig_refinement import NavigationFixes, RigFit, fit_rig
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.matches import as_seen
 from reconstruct.matching.pairs import positions_ned
-from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
+from reconstruct.views.lens import Lens, flat_port_lens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,7 +66,7 @@ def _frees_poses(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) ->
     return settings.refine_rig == "on"
 
 
-def refine_as_set(
+def refine_rig(
     mapped: Mapped,
     seen: Observations,
     rig: Rig,
@@ -76,7 +76,7 @@ def refine_as_set(
     folder: Path,
     settings: ReconstructConfig,
 ) -> RefinedSurvey | str:
-    """Refine a rig as far as `frees_rig` calls for it.
+    """Refine a rig from a model, as far as `frees_rig` calls for it, and map again on it.
 
     Args:
         mapped: model on the rig, near its end; picture i of `seen` has the id i + 1.
@@ -89,73 +89,40 @@ def refine_as_set(
         settings: `refine_port` and `refine_rig`.
 
     Returns:
-        The survey on its own rig; or what prevented it, where the settings do not insist.
+        The survey on its refined rig; or what prevented it, where the settings do not insist.
 
     Raises:
-        ReconstructionError: as `refine_rig`, where the settings insist.
+        ReconstructionError: the settings insist, and the model has no scale, or the survey does not
+            determine what is to be refined.
     """
-    pose = _frees_poses(settings, rig, list(seen.cameras))
+    names = list(seen.cameras)
+    fixes = None
+    if datum is not None and adjust.sigmas is not None:
+        fixes = navigation_fixes(mapped.model, seen, datum)
     try:
-        return refine_rig(
-            mapped, seen, rig, distances, adjust, datum, folder,
-            port=settings.refine_port, pose=pose,
-        )  # fmt: skip
+        if not mapped.scaled or distances is None:
+            raise ReconstructionError(
+                "refine_port and refine_rig need two cameras, whose known baseline gives the "
+                'scale: set refine_port = false and refine_rig = "off" in survey.toml'
+            )
+        pose = _frees_poses(settings, rig, names)
+        fit = fit_rig(mapped, seen, rig, port=settings.refine_port, pose=pose, fixes=fixes)
     except ReconstructionError as error:
         if settings.refine_port or settings.refine_rig == "on":
             raise
         return f"rig as calibrated: {error}"
-
-
-def refine_rig(
-    mapped: Mapped,
-    seen: Observations,
-    rig: Rig,
-    distances: WorkingDistances | None,
-    adjust: NavigationAdjuster,
-    datum: Datum | None,
-    folder: Path,
-    *,
-    port: bool,
-    pose: bool,
-) -> RefinedSurvey:
-    """Refine a rig from a finished model and build the model again on it.
-
-    Args:
-        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
-        seen: keypoints as warped by the model's lenses.
-        rig: as calibrated or designed.
-        distances: for which the new lenses are the best.
-        adjust: that adjusted the model.
-        datum: of the positions of navigation.
-        folder: where `port.json` and `rig.json` go.
-        port: refine ports and water.
-        pose: refine the poses of the cameras and the lever arm.
-
-    Raises:
-        ReconstructionError: the model has no scale, or the survey does not determine what is to
-            be refined.
-    """
-    if not mapped.scaled or distances is None:
-        raise ReconstructionError(
-            "refine_port and refine_rig need two cameras, whose known baseline gives the scale: "
-            'set refine_port = false and refine_rig = "off" in survey.toml'
-        )
-    fixes = None
-    if datum is not None and adjust.sigmas is not None:
-        fixes = navigation_fixes(mapped.model, seen, datum)
-    fit = fit_rig(mapped, seen, rig, port=port, pose=pose, fixes=fixes)
     lenses: dict[str, Lens] = {
         name: flat_port_lens(fit.rig.cameras[name], distances.near_m, distances.far_m)
-        for name in seen.cameras
+        for name in names
     }
-    again = on_rig(mapped, seen, fit, lenses)
+    mapped, seen = on_rig(mapped, seen, fit, lenses)
     adjust = NavigationAdjuster(seen.images, fit.rig, lenses, datum)
-    poses = {name: fit.rig.cam_from_rig[name] for name in seen.cameras}
-    refined, convergence = refract(again[0], again[1], folder, adjust, poses, near=True)
+    poses = {name: fit.rig.cam_from_rig[name] for name in names}
+    mapped, convergence = refract(mapped, seen, folder, adjust, poses, near=True)
     PortRecord.save(folder / "port.json", fit.to_json())
     write_rig(folder / "rig.json", fit.rig)
     return RefinedSurvey(
-        mapped=refined, seen=again[1], rig=fit.rig, convergence=convergence, adjust=adjust
+        mapped=mapped, seen=seen, rig=fit.rig, convergence=convergence, adjust=adjust
     )
 
 
@@ -166,7 +133,7 @@ def on_rig(
     model = pycolmap.Reconstruction(mapped.model)
     names = list(seen.cameras)
     pixels = [
-        as_seen(_taken(mapped.lenses[record.camera], rows), lenses[record.camera])
+        as_seen(mapped.lenses[record.camera].from_pinhole(rows), lenses[record.camera])
         for record, rows in zip(seen.images, seen.pixels, strict=True)
     ]
     pinhole_from_rig: dict[str, RigidTransform] = {
@@ -210,18 +177,10 @@ def navigation_fixes(
     bodies = positions_ned(seen.images, datum)
     frames = frames_of(model).tolist()
     positions, sigmas = np.full((len(frames), 3), np.nan), np.full((len(frames), 3), np.nan)
-    for number, image in sorted(model.images.items(), reverse=True):
-        if image.has_pose:
-            record, row = seen.images[number - 1], frames.index(image.frame_id)
-            positions[row] = bodies[number - 1]
-            level = record.sigma_horizontal_m
-            sigmas[row] = [level, level, record.sigma_depth_m]
+    for frame, number in first_pictures(model).items():
+        record, row = seen.images[number - 1], frames.index(frame)
+        positions[row] = bodies[number - 1]
+        level = record.sigma_horizontal_m
+        sigmas[row] = [level, level, record.sigma_depth_m]
     sigmas[~(sigmas > 0).all(axis=1)] = np.nan
     return NavigationFixes(positions=positions, sigmas=sigmas)
-
-
-def _taken(lens: Lens, warped: Array) -> Array:
-    """Pixels of the picture as taken; those that the lens did not reach stay out of reach."""
-    if not isinstance(lens, FlatPortLens):
-        raise ReconstructionError("refine_port and refine_rig need a calibrated rig")
-    return lens.from_pinhole(warped)

@@ -8,10 +8,11 @@ import numpy as np
 
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
+from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
 from reconstruct.placing.control_file import Control, KnownLength
 from reconstruct.placing.generalised_fit import Extra
-from reconstruct.placing.navigation_equations import PARAMETERS, SCALE, cross_matrices
+from reconstruct.placing.navigation_equations import PARAMETERS, SCALE
 from reconstruct.placing.picked_points import Spot
 
 _DOUBTFUL_SIGMAS = 4.0

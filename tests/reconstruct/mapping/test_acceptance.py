@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.mapping.acceptance import check_mapping, check_survey, misses
+from reconstruct.mapping.acceptance import check_mapping, judge_model, misses
 from reconstruct.mapping.doming import ScaleTrend
 from reconstruct.mapping.priors import pinhole_positions
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
@@ -72,27 +72,30 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
 
 def test_a_rig_that_came_out_another_size_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     scene, mapped = block(), block_mapped()
-    assert check_mapping(mapped.model, scene.records, None, None, 0.9e-3, SURE).notes() == []
-    found = check_mapping(mapped.model, scene.records, None, None, -2e-3, SURE)
-    assert "-0.20 %" in found.notes()[0]
-    assert "lengths are not to be trusted" in capsys.readouterr().err
+    unknown = np.full((len(scene.records), 3), NAN)
+
+    def notes(rig_error: float, scale: ScaleTrend) -> list[str]:
+        records = scene.records
+        return check_mapping(mapped.model, records, unknown, unknown, rig_error, scale).notes()
+
+    assert notes(0.9e-3, SURE) == []
+    assert "-0.20 %" in notes(-2e-3, SURE)[0]
+    assert "-0.20 %" in capsys.readouterr().err
     long = replace(SURE, mean=1.002)
-    assert (
-        "+0.20 +/- 0.01 %"
-        in check_mapping(mapped.model, scene.records, None, None, NAN, long).notes()[0]
-    )
-    vague = replace(long, mean_sigma=1e-3)
-    assert check_mapping(mapped.model, scene.records, None, None, NAN, vague).notes() == []
+    assert "+0.20 +/- 0.01 %" in notes(NAN, long)[0]
+    assert notes(NAN, replace(long, mean_sigma=1e-3)) == []
 
 
 def test_a_survey_is_checked_with_what_it_knows() -> None:
     scene, mapped = block(), block_mapped()
-    found = check_survey(mapped, scene.records, scene.rig, DATUM, None)
-    assert found is not None
+    doming, found = judge_model(mapped, scene.records, scene.rig, DATUM)
     assert found.far == ()
     assert abs(found.rig_error) < 1e-6
+    assert doming.across is not None and doming.scale is not None
+    stated = json.loads(json.dumps(doming.to_json(), allow_nan=False))
+    assert stated["across"]["sag_m"] == doming.across.sag_m
     shrunk = replace(mapped, rig_factor=1.01)
-    stated = check_survey(shrunk, scene.records, scene.rig, DATUM, None)
-    assert stated is not None
-    assert stated.rig_error == pytest.approx(-0.01, abs=2e-4)
-    assert check_survey(mapped, scene.records, None, None, None) is None
+    blind, stated_error = judge_model(shrunk, scene.records, scene.rig, None)
+    assert stated_error.rig_error == pytest.approx(-0.01, abs=2e-4)
+    assert stated_error.checked == 0
+    assert blind.along is None

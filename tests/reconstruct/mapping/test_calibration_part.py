@@ -11,11 +11,15 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import Gauge
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.uncertainty import estimate, sights_of
+from reconstruct.mapping.uncertainty import (
+    CalibrationPart,
+    calibration_part,
+    estimate,
+    pinhole_observations,
+)
 from reconstruct.placing.alignment import align_rigid
 from tests.oracles_refraction import laid_onto
 from tests.reconstruct.scenes import Scene, make_scene
@@ -118,7 +122,7 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
 
 def depth_of(mapped: Mapped) -> float:
     frames = np.array(sorted(mapped.model.frames), dtype=np.int64)
-    arm = sights_of(mapped.model, observed(mapped.model), frames)[0].arm
+    arm = pinhole_observations(mapped.model, observed(mapped.model), frames)[0].arm
     return float(np.median(np.linalg.norm(arm, axis=1)))
 
 

@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pycolmap
 import pytest
@@ -9,7 +7,6 @@ from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.doming import (
     Bend,
     bend_of,
-    doming_of_survey,
     down_of,
     ground_pixel,
     measure_doming,
@@ -97,8 +94,7 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     scene, mapped = block(), block_mapped()
     positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
     rotations = navigation_rotations(scene.records, scene.rig, mapped.lenses)
-    stated = (mapped.model, scene.records)
-    straight = measure_doming(*stated, positions, sigmas, rotations)
+    straight = measure_doming(mapped.model, positions, sigmas, rotations)
     assert straight.notes() == []
     assert "bent" not in capsys.readouterr().err
     assert straight.along is not None
@@ -108,7 +104,7 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     bent = positions.copy()
     north = positions[:, 0] - positions[:, 0].mean()
     bent[:, 2] += 0.5 * 0.05 * north**2
-    found = measure_doming(*stated, bent, sigmas, rotations)
+    found = measure_doming(mapped.model, bent, sigmas, rotations)
     assert found.along is not None and straight.along is not None
     gained = found.along.curvature_per_m - straight.along.curvature_per_m
     assert gained == pytest.approx(0.05, rel=0.05)
@@ -118,7 +114,8 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
 
 def test_without_navigation_only_the_scale_is_measured() -> None:
     scene, mapped = block(), block_mapped()
-    found = measure_doming(mapped.model, scene.records, None, None, {})
+    unknown = np.full((len(scene.records), 3), np.nan)
+    found = measure_doming(mapped.model, unknown, unknown, {})
     assert found.along is None and found.across is None and found.scale is not None
     assert found.scale.mean == pytest.approx(1.0, abs=2e-3)
     assert found.notes() == []
@@ -149,17 +146,6 @@ def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
     assert after.range == pytest.approx(0.01, rel=0.25)
     assert after.significant
     assert ground_pixel(model, observed(model)) > 0
-
-
-def test_a_survey_tells_its_bend_in_numbers_that_json_takes() -> None:
-    scene, mapped = block(), block_mapped()
-    found = doming_of_survey(mapped, scene.records, scene.rig, DATUM)
-    assert found is not None and found.across is not None and found.scale is not None
-    stated = json.loads(json.dumps(found.to_json(), allow_nan=False))
-    assert stated["across"]["sag_m"] == found.across.sag_m
-    assert doming_of_survey(mapped, scene.records, None, None) is None
-    blind = doming_of_survey(mapped, scene.records, scene.rig, None)
-    assert blind is not None and blind.along is None
 
 
 def test_sag_is_that_of_a_parabola() -> None:

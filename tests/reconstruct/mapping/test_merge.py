@@ -6,8 +6,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from reconstruct.mapping.database import rigid3d, write_database
-from reconstruct.mapping.mapper import _options, as_transform
-from reconstruct.mapping.merge import merge_models, report_left_out, second_from_first
+from reconstruct.mapping.mapper import (
+    _options,
+    as_transform,
+    merge_models,
+    report_left_out,
+    second_from_first,
+)
 from tests.reconstruct.mapping.test_mapper import mapped_scene, seen_by_pinholes
 from tests.reconstruct.scenes import make_scene
 

@@ -1,7 +1,6 @@
 import numpy as np
 
-from reconstruct.mapping.bundle import adjust_freely
-from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
+from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
 from reconstruct.mapping.robust import pixel_sigma
 from tests.reconstruct.mapping.test_mapper import camera_rms, mapped_scene
 from tests.reconstruct.scenes import DATUM, make_scene

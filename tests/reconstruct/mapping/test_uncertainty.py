@@ -10,13 +10,13 @@ import pytest
 from alice_survey.base.frames import Array
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import Sights, moved_points, reduce_points
+from reconstruct.mapping.normal_equations import LinearObservations, moved_points, reduce_points
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.uncertainty import (
     estimate,
+    pinhole_observations,
     read_uncertainty,
     save_uncertainty,
-    sights_of,
     write_uncertainty,
 )
 from tests.oracles_refraction import dense_normal_equations, laid_onto
@@ -156,21 +156,21 @@ def _points_of(mapped: Mapped, number: int) -> list[int]:
     return [p.point3D_id for p in mapped.model.images[number].get_observation_points2D()]
 
 
-def _sights(mapped: Mapped) -> Sights:
+def _sights(mapped: Mapped) -> LinearObservations:
     frames = np.array(sorted(mapped.model.frames), dtype=np.int64)
-    return sights_of(mapped.model, observed(mapped.model), frames)[0]
+    return pinhole_observations(mapped.model, observed(mapped.model), frames)[0]
 
 
-def _few(sights: Sights, points: int, rng: np.random.Generator) -> Sights:
+def _few(linear: LinearObservations, points: int, rng: np.random.Generator) -> LinearObservations:
     """The first points only, with two parameters that all share."""
-    end = int(sights.starts[points])
-    return Sights(
-        starts=sights.starts[: points + 1],
-        station=sights.station[:end],
-        by_point=sights.by_point[:end],
-        arm=sights.arm[:end],
+    end = int(linear.starts[points])
+    return LinearObservations(
+        starts=linear.starts[: points + 1],
+        station=linear.station[:end],
+        by_point=linear.by_point[:end],
+        arm=linear.arm[:end],
         by_shared=rng.normal(0, 100, (end, 2, 2)),
-        miss=sights.miss[:end],
+        miss=linear.miss[:end],
     )
 
 

@@ -164,7 +164,7 @@ def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
     assert all(how.factor < 1.3 for how in honest.correlation.values())
 
 
-def test_the_mount_adds_its_sigma_and_a_turning_vehicle_tells_it() -> None:
+def test_the_mount_adds_its_sigma_and_a_turning_vehicle_shows_it() -> None:
     body = flight()
     records = records_of(
         body, SIGMA * gauss_markov(np.random.default_rng(2), len(body), 1.0), SIGMA
@@ -267,13 +267,6 @@ def test_placing_is_the_same_twice() -> None:
     )
     first, second = (place(body, records, 1)[0] for _ in range(2))
     assert first.to_json() == second.to_json()
-
-
-def test_similarity_of_the_truth_is_found_when_nothing_errs() -> None:
-    body = flight()
-    fit, error, _ = place(body, records_of(body, np.zeros((len(body), 6)), SIGMA), 4)
-    assert fit.ned_from_model.scale == 1.0
-    assert 0 < np.linalg.norm(error[:3]) < 5e-4  # the model's own noise
 
 
 @pytest.mark.slow
