@@ -138,7 +138,7 @@ def measure_doming(
     reference = first_pictures(model)
     numbers = np.array(sorted(reference.values()), dtype=np.int64)
     centres = np.array([model.images[n].projection_center() for n in numbers.tolist()])
-    known = np.isfinite(positions + sigmas).all(axis=1)[numbers - 1]
+    known = np.flatnonzero(np.isfinite((positions + sigmas)[numbers - 1]).all(axis=1))
     rows = numbers[known] - 1
     along, across = bend_of(
         centres.reshape(-1, 3)[known], positions[rows, 2], sigmas[rows, 2], down

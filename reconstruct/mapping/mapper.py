@@ -125,7 +125,9 @@ def _map_rig(
     """Models, largest first, and how they came about."""
     total = len(seen.images)
     if method == "incremental" or len(seen.cameras) < 2:
-        why = "as asked for" if method == "incremental" else "one camera has no stereo pairs"
+        why = "one camera has no stereo pairs"
+        if method == "incremental":
+            why = "as set in survey.toml"
         if method == "global":
             warn("one camera has no stereo pairs to map globally from: incremental mapping instead")
         return run_mapper(seen, cam_from_rig, folder, seed, free="nothing"), [
@@ -244,7 +246,7 @@ def run_mapper(
             moves by itself.
         folder: for scratch files.
         seed: of the mapper.
-        free: what of the cameras is refined besides their poses.
+        free: what of the cameras is refined in addition to their poses.
 
     Returns:
         All models, largest first.
@@ -467,7 +469,7 @@ def report_left_out(models: Sequence[pycolmap.Reconstruction]) -> list[str]:
         have |= set(names)
         if names:
             notes.append(
-                f"{len(names)} pictures make a model of their own that could not be joined to the "
+                f"{len(names)} pictures make a separate model that could not be joined to the "
                 f"largest: {named(names)}"
             )
             warn(notes[-1])

@@ -35,7 +35,7 @@ _ADVICE = {
     "HEIC": "save them as JPEG first",
     "video": "take its frames with --video, into a workspace of their own",
     IN_FOLDERS: "give these folders too",
-    "other files": "they are no pictures by their names",
+    "other files": "their names are not those of pictures",
 }
 _NAMED = 3
 _YEARS = range(1970, 2200)
@@ -166,7 +166,7 @@ def inspect(path: Path) -> PictureFacts:
     """Decode a picture whole and read when and where it was taken; never raises for a bad file."""
     try:
         if not path.is_file():
-            return PictureFacts(path=path, fault="no regular file")
+            return PictureFacts(path=path, fault="not a regular file")
         pixels = decode(path)
     except (ImageError, OSError) as error:
         return PictureFacts(path=path, fault=str(error))

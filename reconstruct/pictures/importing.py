@@ -404,7 +404,7 @@ def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> lis
     """Write a frame at a fixed interval in seconds as PNG."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
-        raise ImageError(f"{video}: no video that can be read")
+        raise ImageError(f"{video}: not a video that can be read")
     entries: list[_Incoming] = []
     try:
         total = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))

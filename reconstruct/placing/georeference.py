@@ -178,7 +178,7 @@ def level(points: Array, centres: Array) -> Similarity:
 
 
 ExtraOf = Callable[[Similarity, Array], Extra]
-"""Equations besides navigation's at a placement, whose rotation acts about a point (3,)."""
+"""Equations in addition to navigation's, at a placement, whose rotation acts about a point (3,)."""
 
 
 def fit_navigation(

@@ -104,7 +104,7 @@ def test_groups_without_a_link_stay_apart() -> None:
     links, _ = ring(np.random.default_rng(3))
     far = linked(40, 41, RigidTransform.identity())
     assert station_groups([*links, far]) == [list(range(12)), [40, 41]]
-    with pytest.raises(ValueError, match="more than one group"):
+    with pytest.raises(ValueError):
         average_poses([*links, far])
 
 
