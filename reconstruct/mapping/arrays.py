@@ -57,13 +57,14 @@ def frames_of(model: pycolmap.Reconstruction) -> Indices:
     return np.array(sorted(frames), dtype=np.int64)
 
 
-def first_pictures(
-    model: pycolmap.Reconstruction, known: NDArray[np.bool_] | None = None
-) -> dict[int, int]:
-    """The first posed picture of every frame, among those with the ids i + 1 of `known` (N,)."""
+def first_pictures(model: pycolmap.Reconstruction, given: Array | None = None) -> dict[int, int]:
+    """The first posed picture of every frame; where `given` (N, K), of those without a NaN in it.
+
+    Row i of `given` is of the picture with the id i + 1.
+    """
     found: dict[int, int] = {}
     for number, image in sorted(model.images.items()):
-        if image.has_pose and (known is None or known[number - 1]):
+        if image.has_pose and (given is None or np.isfinite(given[number - 1]).all()):
             found.setdefault(image.frame_id, number)
     return found
 

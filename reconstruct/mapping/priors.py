@@ -143,7 +143,7 @@ def refine_with_positions(
     model.update_point_3d_errors()
     before = model.compute_mean_reprojection_error()
     # One picture of each frame, since navigation measured it once.
-    known = sorted(first_pictures(model, np.isfinite(positions + sigmas).all(axis=1)).values())
+    known = sorted(first_pictures(model, positions + sigmas).values())
     if len(known) < _LEAST_STATIONS:
         return mapped
     given = positions[[number - 1 for number in known]]

@@ -27,8 +27,8 @@ from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
+from reconstruct.mapping.rig_refinement import RefinedSurvey, frees_rig, refine_rig
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
-from reconstruct.mapping.survey_rig import RefinedSurvey, frees_rig, refine_rig
 from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import WorkingDistances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
@@ -38,9 +38,8 @@ from reconstruct.matching.matches import (
     coarse_matches,
     match_pair,
 )
-from reconstruct.matching.pairs import SMALL_SET, choose_pairs, placed_pictures
+from reconstruct.matching.pairs import SMALL_SET, alike_pairs, choose_pairs, placed_pictures
 from reconstruct.matching.refinement import refine_tracks
-from reconstruct.matching.retrieval import alike_pairs
 from reconstruct.pictures.files import exif_focal_px, named
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask

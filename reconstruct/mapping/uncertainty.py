@@ -337,7 +337,7 @@ def navigation_information(model: pycolmap.Reconstruction, sigmas: Array | None)
         return None
     frames = frames_of(model)
     given = np.zeros((len(frames), POSE))
-    for frame, number in first_pictures(model, np.isfinite(sigmas).all(axis=1)).items():
+    for frame, number in first_pictures(model, sigmas).items():
         row = int(np.searchsorted(frames, frame))
         given[row] = [*[TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
     return given if given.any() else None

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.mapping.acceptance import check_mapping, judge_model, misses
-from reconstruct.mapping.doming import ScaleTrend
+from reconstruct.mapping.acceptance import ScaleTrend, check_mapping, judge_model, misses
 from reconstruct.mapping.priors import pinhole_positions
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
 from tests.reconstruct.scenes import DATUM

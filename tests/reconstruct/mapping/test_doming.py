@@ -3,8 +3,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.doming import (
+from reconstruct.mapping.acceptance import (
     Bend,
     bend_of,
     down_of,
@@ -13,6 +12,7 @@ from reconstruct.mapping.doming import (
     navigation_rotations,
     scale_trend,
 )
+from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.priors import pinhole_positions
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM

@@ -20,9 +20,11 @@ from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.rig_refinement import NavigationFixes, RigFit, fit_rig
-from reconstruct.mapping.survey_rig import (
+from reconstruct.mapping.rig_refinement import (
+    NavigationFixes,
     RefinedSurvey,
+    RigFit,
+    fit_rig,
     frees_rig,
     on_rig,
     refine_rig,

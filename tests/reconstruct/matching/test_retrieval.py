@@ -4,7 +4,7 @@ import numpy as np
 
 from alice_survey.base.executor import SERIAL
 from reconstruct.matching.features import Features, save_features
-from reconstruct.matching.retrieval import _WordsTask, alike_pairs, describe, make_codebook
+from reconstruct.matching.pairs import _WordsTask, alike_pairs, describe, make_codebook
 from tests.oracles_matching import vlad_slowly
 
 
