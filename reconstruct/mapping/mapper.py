@@ -97,9 +97,10 @@ def map_calibrated(
     }
     found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
     model = largest(found, seen.images)
-    known = _baseline(list(pinhole_from_rig.values())[:2])
-    factor = 1.0
+    known, factor = float("nan"), 1.0
     if len(seen.cameras) > 1:
+        first, second, *_ = pinhole_from_rig.values()
+        known = float(np.linalg.norm((second * first.inv()).translation))
         factor = known / model_baseline(model)
         if abs(factor - 1.0) > 1e-12:
             scale_model(model, factor)
@@ -389,13 +390,6 @@ def largest(
 def sizes(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, ...]:
     """Pictures in each model."""
     return tuple(int(model.num_reg_images()) for model in models)
-
-
-def _baseline(cam_from_rig: Sequence[RigidTransform]) -> float:
-    if len(cam_from_rig) < 2:
-        return float("nan")
-    first, second = cam_from_rig
-    return float(np.linalg.norm((second * first.inv()).translation))
 
 
 @progress.step("merge models")

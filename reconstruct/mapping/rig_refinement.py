@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csc_matrix, diags_array
+from scipy.sparse import block_diag, csc_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
@@ -310,7 +310,7 @@ def _step(
             slope[at] += rows[:, :POSE].T @ off
             shared[-3:, -3:] += rows[:, POSE:].T @ rows[:, POSE:]
             pull[-3:] += rows[:, POSE:].T @ off
-        matrix = csc_matrix(matrix + _block_diagonal(extra))
+        matrix = csc_matrix(matrix + block_diag(list(extra), format="csc"))
     solve = solver_of(matrix, free)
     back, plain = solve(border), solve(slope)
     covariance = _inverse(shared - border.T @ back)
@@ -328,13 +328,6 @@ def _inverse(matrix: Array) -> Array:
     scale = 1.0 / np.sqrt(np.diag(matrix))
     inverse: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
     return (inverse + inverse.T) / 2.0
-
-
-def _block_diagonal(blocks: Array) -> Any:
-    """Sparse matrix from (F, 6, 6) blocks."""
-    from scipy.sparse import block_diag
-
-    return block_diag(list(blocks), format="csc") if len(blocks) else diags_array([])
 
 
 def _moved(
@@ -423,12 +416,6 @@ class RefinedSurvey:
     """What adjusted the model."""
 
 
-def poses_are_calibrated(rig: Rig, names: Sequence[str]) -> bool:
-    """Whether a rig states how well the poses of these cameras on it are known."""
-    moving = [n for n in pose_names(rig) if n.split(".")[0] in names]
-    return bool(moving) and set(moving) <= set(rig.sigmas)
-
-
 def frees_rig(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
     """Whether the settings, or the calibration, call for a refinement of the rig.
 
@@ -440,7 +427,8 @@ def frees_rig(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bo
 
 def _frees_poses(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
     if settings.refine_rig == "auto":
-        return poses_are_calibrated(rig, names)
+        moving = [n for n in pose_names(rig) if n.split(".")[0] in names]
+        return bool(moving) and set(moving) <= set(rig.sigmas)
     return settings.refine_rig == "on"
 
 

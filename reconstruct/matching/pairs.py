@@ -9,7 +9,7 @@ the mean of the vectors is taken off.
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -268,12 +268,6 @@ def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:
     }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _WordsTask:
-    features: Path
-    words: NDArray[np.float32]
-
-
 def alike_pairs(
     features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, executor: Executor
 ) -> list[Pair]:
@@ -292,8 +286,7 @@ def alike_pairs(
     if len(features) < 2 or not len(wanted):
         return []
     words = make_codebook(features, seed)
-    tasks = [_WordsTask(features=path, words=words) for path in features]
-    rows = executor.map(describe, tasks, label="looks of pictures")
+    rows = executor.map(partial(describe, words=words), features, label="looks of pictures")
     looks = np.stack(list(rows))
     looks = looks - looks.mean(axis=0)
     looks = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
@@ -332,13 +325,13 @@ def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
     return words
 
 
-def describe(task: _WordsTask) -> NDArray[np.float32]:
+def describe(features: Path, words: NDArray[np.float32]) -> NDArray[np.float32]:
     """The vector of a picture, (W * 128,); zeros without features."""
-    descriptors = load_features(task.features).descriptors[:_LARGEST].astype(np.float32)
+    descriptors = load_features(features).descriptors[:_LARGEST].astype(np.float32)
     if not len(descriptors):
-        return np.zeros(task.words.size, np.float32)
-    word = _nearest_words(descriptors, task.words)
-    sums = _sums(descriptors - task.words[word], word, len(task.words))
+        return np.zeros(words.size, np.float32)
+    word = _nearest_words(descriptors, words)
+    sums = _sums(descriptors - words[word], word, len(words))
     norms = np.linalg.norm(sums, axis=1, keepdims=True)
     vector = (sums / np.maximum(norms, 1e-9)).ravel()
     found: NDArray[np.float32] = vector.astype(np.float32)

@@ -4,7 +4,7 @@ import numpy as np
 
 from alice_survey.base.executor import SERIAL
 from reconstruct.matching.features import Features, save_features
-from reconstruct.matching.pairs import _WordsTask, alike_pairs, describe, make_codebook
+from reconstruct.matching.pairs import alike_pairs, describe, make_codebook
 from tests.oracles_matching import vlad_slowly
 
 
@@ -31,8 +31,8 @@ def strip(folder: Path, pictures: int = 40, shared: int = 60) -> list[Path]:
 def test_neighbours_look_most_alike(tmp_path: Path) -> None:
     files = strip(tmp_path)
     found = alike_pairs(files, range(len(files)), 2, seed=3, executor=SERIAL)
-    beside = {(i, i + 1) for i in range(len(files) - 1)}
-    assert len(beside & set(found)) >= 0.9 * len(beside)
+    near = {(i, i + 1) for i in range(len(files) - 1)}
+    assert len(near & set(found)) >= 0.9 * len(near)
     assert len(found) <= 2 * len(files)
     assert found == alike_pairs(files, range(len(files)), 2, seed=3, executor=SERIAL)
 
@@ -50,9 +50,7 @@ def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:
     words = make_codebook(files, seed=4)
     with np.load(files[1]) as data:
         slow = vlad_slowly(data["descriptors"], words)
-    np.testing.assert_allclose(
-        describe(_WordsTask(features=files[1], words=words)), slow, atol=1e-5
-    )
+    np.testing.assert_allclose(describe(files[1], words), slow, atol=1e-5)
 
 
 def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
@@ -64,4 +62,4 @@ def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
     )
     save_features(files[2], empty)
     words = make_codebook(files, seed=4)
-    assert not describe(_WordsTask(features=files[2], words=words)).any()
+    assert not describe(files[2], words).any()
