@@ -1,6 +1,6 @@
 """The sparse model as the later stages see it: views through ideal pinholes, and points."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -117,7 +117,7 @@ def write_frame(path: Path, frame: WorldFrame) -> None:
     datum = frame.datum
     FrameRecord(
         name=frame.name,
-        datum=None if datum is None else PlaceRecord(**vars(datum)),
+        datum=None if datum is None else PlaceRecord(**asdict(datum)),
         scaled=frame.scaled,
         vertical_datum=frame.vertical_datum,
         notes=frame.notes,
