@@ -364,13 +364,8 @@ class Gauge:
         arms = centres - self.middle
         count = len(arms)
         self.motions = np.zeros((count, POSE, 7 if scale_free else 6))
-        for axis in range(3):
-            unit = np.eye(3)[axis]
-            self.motions[:, :3, axis] = unit
-            self.motions[:, 3:, axis] = np.cross(unit, arms)
-            self.motions[:, 3:, 3 + axis] = unit
-        if scale_free:
-            self.motions[:, 3:, 6] = arms
+        self.motions[:, :3, :3] = np.eye(3)
+        self.motions[:, 3:] = self.of_points(centres)
         self.weights = np.tile([depth**2] * 3 + [1.0] * 3, count)
         flat = self.flat
         self.spread = np.linalg.inv(flat.T @ (self.weights[:, None] * flat))
