@@ -23,8 +23,9 @@ import pycolmap
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
-from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
+from reconstruct.mapping.bundle import all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.priors import adjust_freely
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.views.lens import self_calibrated_lens

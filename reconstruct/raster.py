@@ -10,7 +10,7 @@ resampled or lengths are wrong; any GIS reprojects on the fly.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,23 +61,12 @@ class DemGrid:
 
     def window(self, row: int, column: int, rows: int, columns: int) -> "DemGrid":
         """A part of the grid, clipped to it only where the caller does."""
-        return DemGrid(
-            west=self.west + column * self.cell,
-            north=self.north - row * self.cell,
-            cell=self.cell,
-            rows=rows,
-            columns=columns,
-        )
+        moved = self.moved(column * self.cell, -row * self.cell)
+        return replace(moved, rows=rows, columns=columns)
 
     def moved(self, east: float, north: float) -> "DemGrid":
         """The same cells, in coordinates in which they lie elsewhere."""
-        return DemGrid(
-            west=self.west + east,
-            north=self.north + north,
-            cell=self.cell,
-            rows=self.rows,
-            columns=self.columns,
-        )
+        return replace(self, west=self.west + east, north=self.north + north)
 
 
 def grid_over(bounds: Sequence[tuple[float, float, float, float]], cell: float) -> DemGrid:
@@ -206,9 +195,9 @@ def tiles_of(grid: DemGrid, size: int) -> list[Window]:
     ]
 
 
-def hillshade(height: Array, cell: float, exaggeration: float = 1.0) -> Array:
+def hillshade(height: Array, cell: float) -> Array:
     """Shade (0 to 1) of a surface lit from the north-west, 45 degrees up; NaN stays NaN."""
-    down, right = np.gradient(height * exaggeration, cell)
+    down, right = np.gradient(height, cell)
     normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     light = np.array([-0.5, 0.5, np.sqrt(0.5)])

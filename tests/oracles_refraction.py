@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from reconstruct.mapping.database import as_transform
-from reconstruct.mapping.normal_equations import Sights
+from reconstruct.mapping.normal_equations import LinearObservations
 from reconstruct.mapping.uncertainty import Uncertainty
 from tests.reconstruct.scenes import Scene
 
@@ -80,23 +80,23 @@ def adjust_through_ports(
     return unpack(x)
 
 
-def dense_normal_equations(sights: Sights, stations: int) -> tuple[Array, Array]:
+def dense_normal_equations(linear: LinearObservations, stations: int) -> tuple[Array, Array]:
     """J^T J and J^T r of stations, points and shared parameters, in that order, from a full J."""
-    points, count = len(sights.starts) - 1, sights.by_shared.shape[2]
+    points, count = len(linear.starts) - 1, linear.by_shared.shape[2]
     size = 6 * stations + 3 * points + count
-    jacobian = np.zeros((2 * len(sights.station), size))
+    jacobian = np.zeros((2 * len(linear.station), size))
     for point in range(points):
-        for o in range(sights.starts[point], sights.starts[point + 1]):
-            x, y, z = sights.arm[o]
+        for o in range(linear.starts[point], linear.starts[point + 1]):
+            x, y, z = linear.arm[o]
             cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            rows, first = slice(2 * o, 2 * o + 2), 6 * int(sights.station[o])
+            rows, first = slice(2 * o, 2 * o + 2), 6 * int(linear.station[o])
             # R^T (X - c) with R' = exp(turn) R moves by R^T (X - c) x turn.
-            jacobian[rows, first : first + 3] = sights.by_point[o] @ cross
-            jacobian[rows, first + 3 : first + 6] = -sights.by_point[o]
+            jacobian[rows, first : first + 3] = linear.by_point[o] @ cross
+            jacobian[rows, first + 3 : first + 6] = -linear.by_point[o]
             at = 6 * stations + 3 * point
-            jacobian[rows, at : at + 3] = sights.by_point[o]
-            jacobian[rows, size - count :] = sights.by_shared[o]
-    return jacobian.T @ jacobian, jacobian.T @ sights.miss.ravel()
+            jacobian[rows, at : at + 3] = linear.by_point[o]
+            jacobian[rows, size - count :] = linear.by_shared[o]
+    return jacobian.T @ jacobian, jacobian.T @ linear.miss.ravel()
 
 
 def laid_onto(

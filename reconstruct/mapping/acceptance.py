@@ -3,9 +3,15 @@
 Both are reported, not repaired: a station far off navigation may be a jump of navigation as well
 as a wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent
 model.
+
+Near-parallel views bend a model like a dome while every reprojection error stays small (James &
+Robson 2014, "Mitigating systematic error in topographic models derived from UAV and ground-based
+image networks"). A pressure sensor does not bend, so that the curvature of a paraboloid fitted to
+camera heights minus navigation's heights measures it; and a stereo rig carries its own yardstick to
+every station.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,15 +19,18 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array, Datum
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.robust import CAUCHY_TUNING
+from alice_survey.base.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
+from reconstruct.mapping.arrays import Observed, first_pictures, observed
 from reconstruct.mapping.database import as_transform
-from reconstruct.mapping.doming import ScaleTrend
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import pinhole_positions
+from reconstruct.mapping.working_range import ray_passes
+from reconstruct.pictures.files import named
+from reconstruct.views.lens import Lens
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
 """A station is off navigation when it misses by more than both."""
@@ -31,7 +40,311 @@ _LEAST_STATIONS = 5
 _ROUNDS = 20
 _MEDIAN_SIGMAS = 1.5382
 """Median length of a vector of three independent unit normal numbers."""
-_NAMED = 8
+_LEAST_OF_PARABOLOID = 8
+"""A paraboloid has six coefficients."""
+_THIN = 0.1
+"""Width over length of a block below which it has no curvature across."""
+_SIGMAS = 3.0
+_FIT_ROUNDS = 10
+_LEAST_STEREO_POINTS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bend:
+    """Curvature of a block along one of its axes."""
+
+    curvature_per_m: float
+    """Second derivative of the model's height error: positive where ends are too high."""
+    sigma_per_m: float
+    length_m: float
+    """Length of the block along the axis."""
+
+    @property
+    def sag_m(self) -> float:
+        """How far the middle is off against the ends: `curvature * length^2 / 8`."""
+        return self.curvature_per_m * self.length_m**2 / 8.0
+
+    @property
+    def sag_sigma_m(self) -> float:
+        """Standard deviation of the sag."""
+        return self.sigma_per_m * self.length_m**2 / 8.0
+
+    def significant(self, pixel_m: float) -> bool:
+        """Whether it is beyond its noise and larger than a ground pixel."""
+        return abs(self.sag_m) > max(_SIGMAS * self.sag_sigma_m, pixel_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleTrend:
+    """How the model's scale, against the rig's baseline, varies over a block."""
+
+    mean: float
+    """Lengths of the model over those of its stations' own stereo; 1 when they agree."""
+    mean_sigma: float
+    range: float
+    """Largest minus smallest value of the fitted paraboloid over the stations."""
+    range_sigma: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is beyond its noise."""
+        return self.range > _SIGMAS * self.range_sigma
+
+    def off_by_more_than(self, bound: float) -> bool:
+        """Whether the mean is off by this much and beyond its noise."""
+        return abs(self.mean - 1.0) > max(bound, _SIGMAS * self.mean_sigma)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doming:
+    """Evidence of a bent model; what could not be measured is None."""
+
+    along: Bend | None
+    across: Bend | None
+    """Perpendicular to the block's longest axis; None for a single line."""
+    scale: ScaleTrend | None
+    pixel_m: float
+    """Ground pixel, metres."""
+
+    def to_json(self) -> dict[str, object]:
+        """Figures for `mapping.json`."""
+        bends: dict[str, object] = {
+            name: None
+            if bend is None
+            else {**vars(bend), "sag_m": bend.sag_m, "sag_sigma_m": bend.sag_sigma_m}
+            for name, bend in (("along", self.along), ("across", self.across))
+        }
+        scale = None if self.scale is None else vars(self.scale)
+        return {
+            **bends,
+            "scale": scale,
+            "pixel_m": self.pixel_m if np.isfinite(self.pixel_m) else None,
+            "notes": self.notes(),
+        }
+
+    def notes(self) -> list[str]:
+        """A line for every significant bend."""
+        return [
+            f"the model is bent {name} the block: {1e3 * bend.sag_m:+.1f} +/- "
+            f"{1e3 * bend.sag_sigma_m:.1f} mm over {bend.length_m:.1f} m against navigation's "
+            "depth; fly cross lines, or give navigation a smaller sigma_depth_m if it deserves it"
+            for name, bend in (("along", self.along), ("across", self.across))
+            if bend is not None and bend.significant(self.pixel_m)
+        ]
+
+
+def measure_doming(
+    model: pycolmap.Reconstruction,
+    positions: Array,
+    sigmas: Array,
+    rotations: Mapping[int, Rotation],
+) -> Doming:
+    """Measure how bent a model is, and warn where that is significant.
+
+    Args:
+        model: in metres; picture i of N has the id i + 1.
+        positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
+            unknown.
+        sigmas: (N, 3); the same for these.
+        rotations: `ned_from_pinhole` by picture's index, as navigation has it.
+    """
+    seen = observed(model)
+    pixel = ground_pixel(model, seen)
+    down = down_of(model, rotations)
+    reference = first_pictures(model)
+    numbers = np.array(sorted(reference.values()), dtype=np.int64)
+    centres = np.array([model.images[n].projection_center() for n in numbers.tolist()])
+    known = np.flatnonzero(np.isfinite((positions + sigmas)[numbers - 1]).all(axis=1))
+    rows = numbers[known] - 1
+    along, across = bend_of(
+        centres.reshape(-1, 3)[known], positions[rows, 2], sigmas[rows, 2], down
+    )
+    found = Doming(
+        along=along,
+        across=across,
+        scale=scale_trend(model, seen, reference, down),
+        pixel_m=pixel,
+    )
+    for note in found.notes():
+        warn(note)
+    return found
+
+
+def bend_of(
+    centres: Array, depths_m: Array, sigmas_m: Array, down: Array
+) -> tuple[Bend | None, Bend | None]:
+    """Curvature of camera heights minus navigation's heights, along and across the block.
+
+    A quadratic in the block's principal axes is fitted robustly (Cauchy's weights); sigmas are
+    those of the depths or, where larger, of the fit's residuals. Errors of depth are taken as
+    independent between stations.
+
+    Args:
+        centres: (N, 3) of one camera per station in the model's frame, metres.
+        depths_m: (N,) as navigation has them.
+        sigmas_m: (N,) of those.
+        down: (3,) unit vector in the model's frame.
+
+    Returns:
+        Along and across; None where stations are too few or lie in one line.
+    """
+    if len(centres) < _LEAST_OF_PARABOLOID:
+        return None, None
+    design, sizes = _quadratic(centres, down)
+    heights = depths_m - centres @ down  # of the model, above where navigation has it
+    if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
+        return None, None
+    fitted, covariance = _robust_fit(design, heights, sigmas_m)
+    bends = [
+        Bend(
+            curvature_per_m=float(fitted[k]),
+            sigma_per_m=float(np.sqrt(covariance[k, k])),
+            length_m=float(size),
+        )
+        for k, size in zip((2, 4), sizes, strict=True)
+        if k < len(fitted)
+    ]
+    return bends[0], bends[1] if len(bends) > 1 else None
+
+
+def scale_trend(
+    model: pycolmap.Reconstruction, seen: Observed, reference: Mapping[int, int], down: Array
+) -> ScaleTrend | None:
+    """The model's scale at every station against that station's stereo, as a trend over the block.
+
+    Args:
+        model: on one rig.
+        seen: its observations.
+        reference: picture by frame.
+        down: (3,) unit vector in the model's frame.
+
+    Returns:
+        None where too few stations have points that both their cameras show.
+    """
+    local = [
+        (model.images[reference[frame]].projection_center(), *given)
+        for frame in sorted(reference)
+        if (given := _station_scale(model, seen, frame)) is not None
+    ]
+    if len(local) < _LEAST_OF_PARABOLOID:
+        return None
+    centres = np.array([row[0] for row in local])
+    scale, sigma = np.array([row[1:] for row in local]).T
+    design, _ = _quadratic(centres, down)
+    if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
+        return None
+    fitted, covariance = _robust_fit(design, scale, sigma)
+    values = design @ fitted
+    between = design[np.argmax(values)] - design[np.argmin(values)]
+    mean, mean_cov = _robust_fit(np.ones((len(scale), 1)), scale, sigma)
+    return ScaleTrend(
+        mean=float(mean[0]),
+        mean_sigma=float(np.sqrt(mean_cov[0, 0])),
+        range=float(np.ptp(values)),
+        range_sigma=float(np.sqrt(between @ covariance @ between)),
+    )
+
+
+def navigation_rotations(
+    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens]
+) -> dict[int, Rotation]:
+    """`ned_from_pinhole` by picture's index, where navigation has attitudes."""
+    return {
+        i: rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg]))
+        * (rig.body_from_cam(r.camera) * lenses[r.camera].pinhole_from_cam.inv()).rotation
+        for i, r in enumerate(records)
+        if r.has_attitude
+    }
+
+
+def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -> Array:
+    """Down in the model's frame: by navigation's attitudes, else the mean way that cameras look."""
+    posed = [n for n in sorted(model.images) if model.images[n].has_pose]
+    given = [n for n in posed if n - 1 in rotations]
+    rows = [
+        model.images[n].cam_from_world().matrix()[:, :3].T
+        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if given else [0.0, 0.0, 1.0])
+        for n in given or posed
+    ]
+    mean = np.median(np.array(rows), axis=0)
+    unit: Array = mean / np.linalg.norm(mean)
+    return unit
+
+
+def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
+    """Median size of a pixel on the ground, in units of the model; NaN without points."""
+    rows = []
+    for n, number in enumerate(seen.pictures.tolist()):
+        depth = seen.in_cameras[seen.of(n), 2]
+        if len(depth):
+            rows.append(np.median(depth) / model.images[number].camera.mean_focal_length())
+    return float(np.median(rows)) if rows else float("nan")
+
+
+def _quadratic(centres: Array, down: Array) -> tuple[Array, Array]:
+    """Columns 1, u, u^2 / 2 and, of a wide block, v, v^2 / 2, u v; and its extents, (2,).
+
+    Here u and v are horizontal places about their middle in principal axes.
+    """
+    flat = centres - centres.mean(axis=0)
+    flat = flat - np.outer(flat @ down, down)
+    axes = np.linalg.svd(flat, full_matrices=False)[2][:2]
+    plane = flat @ axes.T
+    sizes = np.ptp(plane, axis=0)
+    u, v = plane.T
+    columns = [np.ones(len(u)), u, u**2 / 2]
+    if sizes[1] > _THIN * sizes[0]:
+        columns += [v, v**2 / 2, u * v]
+    return np.column_stack(columns), sizes
+
+
+def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Coefficients and their covariance."""
+    weight = np.ones(len(values))
+    for _ in range(_FIT_ROUNDS):
+        root = np.sqrt(weight) / sigmas
+        fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
+        left = (values - design @ fitted) / sigmas
+        spread = max(MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-12)
+        weight = np.asarray(1.0 / (1.0 + (left / (CAUCHY_TUNING * spread)) ** 2), np.float64)
+    free = len(values) - design.shape[1]
+    root = np.sqrt(weight) / sigmas
+    variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
+    normal = (root[:, None] * design).T @ (root[:, None] * design)
+    covariance = np.asarray(np.linalg.inv(normal) * max(1.0, variance), np.float64)
+    return np.asarray(fitted, np.float64), covariance
+
+
+def _station_scale(
+    model: pycolmap.Reconstruction, seen: Observed, frame: int
+) -> tuple[float, float] | None:
+    """Depths of a frame's points over their depths by its first two cameras alone, and sigma."""
+    numbers = sorted(d.id for d in model.frames[frame].image_ids if model.images[d.id].has_pose)[:2]
+    if len(numbers) < 2:
+        return None
+    first, second = (model.images[n] for n in numbers)
+    theirs = [seen.of(seen.row(n)) for n in numbers]
+    both, *at = np.intersect1d(seen.point[theirs[0]], seen.point[theirs[1]], return_indices=True)
+    if len(both) < _LEAST_STEREO_POINTS:
+        return None
+    poses = [as_transform(i.cam_from_world()) for i in (first, second)]
+    first_from_second = poses[0] * poses[1].inv()
+    starts, rays = [], []
+    for image, pixels, pose in (
+        (first, seen.pixels[theirs[0]][at[0]], RigidTransform.identity()),
+        (second, seen.pixels[theirs[1]][at[1]], first_from_second),
+    ):
+        at_one = image.camera.cam_from_img(pixels)
+        ray = np.column_stack([at_one, np.ones(len(both))])
+        ray = pose.rotation.apply(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+        starts.append(np.broadcast_to(pose.translation, ray.shape))
+        rays.append(ray)
+    along, _ = ray_passes(starts[0], rays[0], starts[1], rays[1])
+    # Noise of pixels is that of 1 / depth: its mean, unlike that of depths, is not pulled away.
+    ratio = seen.in_cameras[theirs[0]][at[0], 2] / (along * rays[0][:, 2])
+    ratio = ratio[np.isfinite(ratio)]
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(ratio - np.median(ratio))))
+    return float(np.median(ratio)), max(1.2533 * spread / np.sqrt(len(ratio)), 1e-9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +377,11 @@ class Acceptance:
         """A line for every fault."""
         notes = []
         if self.far:
-            names = ", ".join(f"{f.image} ({f.off_m:.2f} m)" for f in self.far[:_NAMED])
-            more = len(self.far) - _NAMED
+            names = named([f"{f.image} ({f.off_m:.2f} m)" for f in self.far])
             notes.append(
                 f"{len(self.far)} of {self.checked} stations lie more than {FAR_SIGMAS:.0f} sigmas "
                 f"and {FAR_M} m from where navigation has them, which others miss by "
-                f"{self.usual_m:.2f} m: {names}{f' and {more} more' if more > 0 else ''}; look at "
+                f"{self.usual_m:.2f} m: {names}; look at "
                 "these pictures and at navigation's log"
             )
         if abs(self.rig_error) > SCALE_BOUND:
@@ -96,11 +408,34 @@ class Acceptance:
         }
 
 
+@progress.step("judge the model")
+def judge_model(
+    mapped: Mapped, records: Sequence[ImageRecord], rig: Rig, datum: Datum | None
+) -> tuple[Doming, Acceptance]:
+    """How bent a model on a known rig is, and whether it is credible, by all that is known of it.
+
+    Args:
+        mapped: scaled by its rig; picture i of `records` has the id i + 1.
+        records: pictures.
+        rig: on which it was mapped.
+        datum: of navigation's positions; None without.
+    """
+    positions = sigmas = np.full((len(records), 3), np.nan)
+    if datum is not None:
+        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
+    rotations = navigation_rotations(records, rig, mapped.lenses)
+    doming = measure_doming(mapped.model, positions, sigmas, rotations)
+    # What adjustments made of the rig, before its size was put back.
+    rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
+    accepted = check_mapping(mapped.model, records, positions, sigmas, rig_error, doming.scale)
+    return doming, accepted
+
+
 def check_mapping(
     model: pycolmap.Reconstruction,
     records: Sequence[ImageRecord],
-    positions: Array | None,
-    sigmas: Array | None,
+    positions: Array,
+    sigmas: Array,
     rig_error: float,
     scale: ScaleTrend | None,
 ) -> Acceptance:
@@ -110,49 +445,22 @@ def check_mapping(
         model: in metres; picture i of `records` has the id i + 1.
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
-            unknown; None without navigation.
+            unknown.
         sigmas: (N, 3); the same for these.
         rig_error: relative error of the rig's baseline in the model; NaN without one.
         scale: of the model against its stations' own stereo.
     """
-    checked, usual = 0, float("nan")
-    far: tuple[FarStation, ...] = ()
-    if positions is not None and sigmas is not None:
-        checked, usual, far = _far_stations(model, records, positions, sigmas)
+    checked, usual, far = _far_stations(model, records, positions, sigmas)
     found = Acceptance(checked=checked, usual_m=usual, far=far, rig_error=rig_error, scale=scale)
     for note in found.notes():
         warn(note)
     return found
 
 
-@progress.step("judge the model")
-def check_survey(
-    mapped: Mapped,
-    records: Sequence[ImageRecord],
-    rig: Rig | None,
-    datum: Datum | None,
-    scale: ScaleTrend | None,
-) -> Acceptance | None:
-    """Check a mapping with what its survey knows; None without a calibrated rig."""
-    if rig is None or not mapped.scaled:
-        return None
-    positions = sigmas = None
-    if datum is not None:
-        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
-    # What adjustments made of the rig, before its size was put back.
-    rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
-    return check_mapping(mapped.model, records, positions, sigmas, rig_error, scale)
-
-
 def _far_stations(
     model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
 ) -> tuple[int, float, tuple[FarStation, ...]]:
-    first: dict[int, int] = {}
-    for number, image in sorted(model.images.items()):
-        given = np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
-        if image.has_pose and given:
-            first.setdefault(image.frame_id, number)
-    numbers = sorted(first.values())
+    numbers = sorted(first_pictures(model, positions + sigmas).values())
     if len(numbers) < _LEAST_STATIONS:
         return len(numbers), float("nan"), ()
     rows = np.array(numbers) - 1

@@ -57,6 +57,26 @@ def frames_of(model: pycolmap.Reconstruction) -> Indices:
     return np.array(sorted(frames), dtype=np.int64)
 
 
+def first_pictures(model: pycolmap.Reconstruction, given: Array | None = None) -> dict[int, int]:
+    """The first posed picture of every frame; where `given` (N, K), of those without a NaN in it.
+
+    Row i of `given` is of the picture with the id i + 1.
+    """
+    found: dict[int, int] = {}
+    for number, image in sorted(model.images.items()):
+        if image.has_pose and (given is None or np.isfinite(given[number - 1]).all()):
+            found.setdefault(image.frame_id, number)
+    return found
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """(N, 3, 3) matrices M with `M b = a x b` for rows a."""
+    found = np.zeros((len(vectors), 3, 3))
+    found[:, [2, 0, 1], [1, 2, 0]] = vectors
+    found[:, [1, 2, 0], [2, 0, 1]] = -vectors
+    return found
+
+
 def observed(model: pycolmap.Reconstruction) -> Observed:
     """The observations of a model as it is now."""
     poses = {n: i.cam_from_world().matrix() for n, i in model.images.items() if i.has_pose}

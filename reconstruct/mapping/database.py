@@ -1,5 +1,6 @@
 """The COLMAP database that the mapper reads: cameras, rig, stations, keypoints and matches."""
 
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,13 @@ class Observations:
     pixels: Sequence[Array]
     """Keypoints of every picture, (N, 2)."""
     pairs: Sequence[VerifiedPair]
+
+
+def new_folder(path: Path) -> Path:
+    """Make an empty folder for scratch files, in place of what is there."""
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir(parents=True)
+    return path
 
 
 @progress.step("hand pictures to the mapper")

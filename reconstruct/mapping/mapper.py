@@ -3,6 +3,7 @@
 Stations of a known stereo rig are mapped all at once (`global_mapper`), everything else, and what
 that does not explain, incrementally. Adjustments run on one core, so that the same input gives
 the same bytes whatever the number of threads; only work on single pictures and pairs is spread.
+Of several models those that share stations become one, and the others are reported by name.
 """
 
 import shutil
@@ -13,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import SERIAL, Executor
@@ -21,10 +22,10 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.database import Observations, write_database
+from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.database import as_transform as as_transform
-from reconstruct.mapping.global_mapper import adjust, map_globally
-from reconstruct.mapping.merge import merge_models, report_left_out
+from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
+from reconstruct.pictures.files import named
 from reconstruct.views.lens import Lens
 
 Method = Literal["auto", "global", "incremental"]
@@ -46,6 +47,9 @@ growing model straight, and half the time goes: 17.8 to 8.4 s on 24 stations, fo
 _MOST_LOST = 0.02
 """Share of pictures lost by the global mapper from which the incremental one is tried."""
 _LARGEST_REPROJECTION_PX = 2.0
+_LARGEST_SPREAD = 0.1
+"""Radians, and lengths over the models' usual distance to the floor, by which shared stations may
+disagree about where the second model lies in the first."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,9 +97,10 @@ def map_calibrated(
     }
     found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
     model = largest(found, seen.images)
-    known = _baseline(list(pinhole_from_rig.values())[:2])
-    factor = 1.0
+    known, factor = float("nan"), 1.0
     if len(seen.cameras) > 1:
+        first, second, *_ = pinhole_from_rig.values()
+        known = float(np.linalg.norm((second * first.inv()).translation))
         factor = known / model_baseline(model)
         if abs(factor - 1.0) > 1e-12:
             scale_model(model, factor)
@@ -121,7 +126,9 @@ def _map_rig(
     """Models, largest first, and how they came about."""
     total = len(seen.images)
     if method == "incremental" or len(seen.cameras) < 2:
-        why = "as asked for" if method == "incremental" else "one camera has no stereo pairs"
+        why = "one camera has no stereo pairs"
+        if method == "incremental":
+            why = "as set in survey.toml"
         if method == "global":
             warn("one camera has no stereo pairs to map globally from: incremental mapping instead")
         return run_mapper(seen, cam_from_rig, folder, seed, free="nothing"), [
@@ -157,20 +164,13 @@ def _globally(
 ) -> list[pycolmap.Reconstruction]:
     """Map all stations at once, then register what is left over one by one; largest first."""
     options = _options(cam_from_rig, seed, "nothing")
-    scratch = folder / "mapper"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    scratch = new_folder(folder / "mapper")
     database = scratch / "database.db"
     write_database(database, seen, cam_from_rig)
     found = _sorted(map_globally(database, seen, cam_from_rig, options, seed, executor))
     if found and found[0].num_reg_images() < len(seen.images) and not unsound(found[0]):
-        begun, output = scratch / "begun", scratch / "more"
-        begun.mkdir()
-        output.mkdir()
-        found[0].write(begun)
         options.multiple_models = False
-        more = pycolmap.incremental_mapping(database, scratch, output, options, input_path=begun)
-        grown = [pycolmap.Reconstruction(model) for model in more.values()]
+        grown = [pycolmap.Reconstruction(more) for more in _continued(found[0], scratch, options)]
         if grown and _sorted(grown)[0].num_reg_images() > found[0].num_reg_images():
             found[0] = _sorted(grown)[0]
             adjust(found[0], options, tolerance=1e-7)
@@ -247,7 +247,7 @@ def run_mapper(
             moves by itself.
         folder: for scratch files.
         seed: of the mapper.
-        free: what of the cameras is refined besides their poses.
+        free: what of the cameras is refined in addition to their poses.
 
     Returns:
         All models, largest first.
@@ -302,9 +302,7 @@ def _map_once(
     options: pycolmap.IncrementalPipelineOptions,
     free: Literal["nothing", "distortion", "all"],
 ) -> list[pycolmap.Reconstruction]:
-    scratch = folder / "mapper"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    scratch = new_folder(folder / "mapper")
     write_database(scratch / "database.db", seen, cam_from_rig)
     total = len({r.station for r in seen.images}) if cam_from_rig else len(seen.images)
     with progress.step("add pictures to the model", total) as counter:
@@ -331,22 +329,28 @@ def _repaired(
     nothing, with its points in the cameras' common centre, where every ray meets them. The stereo
     points of one of both then carry the model on, and the other stays where it is.
     """
-    for attempt in range(_REPAIRS):
+    for _ in range(_REPAIRS):
         collapsed = collapsed_frames(model)
         if not collapsed or len(collapsed) >= model.num_reg_frames() - 1:
             return model
         for frame in collapsed:
             model.deregister_frame(frame)
-        begun, output = scratch / f"begun{attempt}", scratch / f"repaired{attempt}"
-        begun.mkdir()
-        output.mkdir()
-        model.write(begun)
-        found = pycolmap.incremental_mapping(
-            scratch / "database.db", scratch, output, options, input_path=begun
-        )
+        found = _continued(model, scratch, options)
         if found:
-            model = max(found.values(), key=lambda m: m.num_reg_images())
+            model = max(found, key=lambda m: m.num_reg_images())
     return model
+
+
+def _continued(
+    model: pycolmap.Reconstruction, scratch: Path, options: pycolmap.IncrementalPipelineOptions
+) -> list[pycolmap.Reconstruction]:
+    """What mapping makes of a model, with the database in the folder `scratch`."""
+    begun, output = new_folder(scratch / "begun"), new_folder(scratch / "more")
+    model.write(begun)
+    found = pycolmap.incremental_mapping(
+        scratch / "database.db", scratch, output, options, input_path=begun
+    )
+    return list(found.values())
 
 
 def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
@@ -388,8 +392,91 @@ def sizes(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, ...]:
     return tuple(int(model.num_reg_images()) for model in models)
 
 
-def _baseline(cam_from_rig: Sequence[RigidTransform]) -> float:
-    if len(cam_from_rig) < 2:
-        return float("nan")
-    first, second = cam_from_rig
-    return float(np.linalg.norm((second * first.inv()).translation))
+@progress.step("merge models")
+def merge_models(
+    models: Sequence[pycolmap.Reconstruction],
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> list[pycolmap.Reconstruction]:
+    """Join models on one known rig that share stations.
+
+    A rig gives every model its scale, so that one shared station suffices to place it. Joined
+    models are triangulated and adjusted again, so that points of both sides link them.
+
+    Args:
+        models: largest first, on the rig of the database, which is held constant.
+        database: what they were made from.
+        options: of triangulation and adjustment.
+
+    Returns:
+        What is left, largest first; a joined model that lost pictures is not used.
+    """
+    left = list(models)
+    merged = True
+    while merged and len(left) > 1:
+        merged = False
+        for k in range(1, len(left)):
+            step = second_from_first(left[0], left[k])
+            if step is None:
+                continue
+            poses = _poses(left[0])
+            for frame, pose in _poses(left[k]).items():
+                poses.setdefault(frame, pose * step)
+            joined = triangulate_and_adjust(database, poses, options)
+            if joined.num_reg_frames() == len(poses):
+                left = [joined, *left[1:k], *left[k + 1 :]]
+                merged = True
+                break
+    return left
+
+
+def second_from_first(
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction
+) -> RigidTransform | None:
+    """Where the world of one model lies in that of another, by the stations that both have.
+
+    Returns:
+        None where they share none or these disagree.
+    """
+    ours, theirs = _poses(first), _poses(second)
+    shared = sorted(ours.keys() & theirs.keys())
+    if not shared:
+        return None
+    steps = [theirs[frame].inv() * ours[frame] for frame in shared]
+    middle = np.median([ours[frame].inv().translation for frame in shared], axis=0)
+    turn = Rotation.concatenate([step.rotation for step in steps]).mean()
+    places = np.array([step.apply(middle) for step in steps])
+    place = np.median(places, axis=0)
+    away = np.median([(step.rotation * turn.inv()).magnitude() for step in steps])
+    spread = np.median(np.linalg.norm(places - place, axis=1))
+    if away > _LARGEST_SPREAD or spread > _LARGEST_SPREAD * _reach(first):
+        return None
+    return RigidTransform.from_components(place - turn.apply(middle), turn)
+
+
+def report_left_out(models: Sequence[pycolmap.Reconstruction]) -> list[str]:
+    """A line for every model but the first, with its pictures; each is warned of, too."""
+    notes = []
+    have = {i.name for i in models[0].images.values() if i.has_pose} if models else set()
+    for model in models[1:]:
+        names = sorted({i.name for i in model.images.values() if i.has_pose} - have)
+        have |= set(names)
+        if names:
+            notes.append(
+                f"{len(names)} pictures make a separate model that could not be joined to the "
+                f"largest: {named(names)}"
+            )
+            warn(notes[-1])
+    return notes
+
+
+def _poses(model: pycolmap.Reconstruction) -> dict[int, RigidTransform]:
+    """`rig_from_world` by frame."""
+    return {f: as_transform(model.frames[f].rig_from_world) for f in sorted(model.reg_frame_ids())}
+
+
+def _reach(model: pycolmap.Reconstruction) -> float:
+    """Median distance from the stations to the points."""
+    points = np.array([p.xyz for _, p in sorted(model.points3D.items())])
+    centres = np.array([pose.inv().translation for pose in _poses(model).values()])
+    return float(np.linalg.norm(np.median(points, axis=0) - np.median(centres, axis=0)))

@@ -24,11 +24,13 @@ POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""
 LEAST_POINTS = 4
 """A station that sees fewer is not determined."""
+TURN_INFORMATION = 1.0
+"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sights:
+class LinearObservations:
     """Linearised observations, sorted by point."""
 
     starts: Indices
@@ -50,7 +52,7 @@ class Sights:
         counts: Indices = np.diff(self.starts)
         return np.repeat(counts, counts)
 
-    def weighted(self, weights: Array) -> "Sights":
+    def weighted(self, weights: Array) -> "LinearObservations":
         """The same observations with the squares of each weighted, (O,)."""
         root = np.sqrt(weights)[:, None]
         return replace(
@@ -89,20 +91,20 @@ class ReducedSystem:
         return csc_matrix(bsr_matrix(blocks, shape=(size, size), blocksize=(POSE, POSE)))
 
 
-def reduce_points(sights: Sights, stations: int) -> ReducedSystem:
+def reduce_points(linear: LinearObservations, stations: int) -> ReducedSystem:
     """Eliminate the points.
 
     Args:
-        sights: observations; every point needs two that see it from apart.
+        linear: observations; every point needs two that see it from apart.
         stations: F, how many there are.
     """
     meets = np.eye(stations, dtype=np.bool_)
-    _mark(sights.starts, sights.station, meets)
+    _mark(linear.starts, linear.station, meets)
     rows, columns = np.nonzero(meets)
     pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
     columns = columns.astype(np.int64)
     blocks, border, shared, slope, shared_slope, inverse = _reduce(
-        sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
+        linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
         pointers, columns,
     )  # fmt: skip
     return ReducedSystem(
@@ -313,7 +315,7 @@ def point_covariances(
     With G = -V^-1 W^T what a point does when its stations move: V^-1 + G C G^T.
 
     Args:
-        starts: as `Sights`; so `station`, `by_point` and `arm`.
+        starts: as `LinearObservations`; so `station`, `by_point` and `arm`.
         station: (O,).
         by_point: (O, 2, 3).
         arm: (O, 3).
@@ -362,13 +364,8 @@ class Gauge:
         arms = centres - self.middle
         count = len(arms)
         self.motions = np.zeros((count, POSE, 7 if scale_free else 6))
-        for axis in range(3):
-            unit = np.eye(3)[axis]
-            self.motions[:, :3, axis] = unit
-            self.motions[:, 3:, axis] = np.cross(unit, arms)
-            self.motions[:, 3:, 3 + axis] = unit
-        if scale_free:
-            self.motions[:, 3:, 6] = arms
+        self.motions[:, :3, :3] = np.eye(3)
+        self.motions[:, 3:] = self.of_points(centres)
         self.weights = np.tile([depth**2] * 3 + [1.0] * 3, count)
         flat = self.flat
         self.spread = np.linalg.inv(flat.T @ (self.weights[:, None] * flat))

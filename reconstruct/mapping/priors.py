@@ -6,7 +6,7 @@ a similarity, and would so take the scale from navigation: here the priors are m
 the model's scale first, and the rig's known baseline is restored afterwards.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +16,16 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.mapping.bundle import FULLY, adjust_freely, all_pictures, held_options
+from reconstruct.mapping.arrays import first_pictures
+from reconstruct.mapping.bundle import FULLY, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.views.lens import Lens
+
+Adjust = Callable[[Mapped, float], Mapped]
+"""Adjusts a model, rig and cameras held, to a relative change of the cost; the one given is not
+changed."""
 
 _LEAST_STATIONS = 5
 _WORST_GROWTH = 1.05
@@ -53,6 +58,24 @@ def pinhole_positions(
         positions[i] = bodies[i] + rotation_from_attitude(*attitude).apply(lever)
         sigmas[i] = np.hypot(sigma, turn * np.linalg.norm(lever))
     return positions, sigmas
+
+
+def adjust_freely(mapped: Mapped, tolerance: float = FULLY) -> Mapped:
+    """Adjust all poses and points, without priors.
+
+    A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
+    """
+    model = pycolmap.Reconstruction(mapped.model)
+    config = all_pictures(model)
+    if np.isfinite(mapped.baseline):
+        config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+    else:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(
+        held_options(pixel_sigma(model), tolerance), config, model
+    ).solve()
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)
 
 
 class NavigationAdjuster:
@@ -119,7 +142,8 @@ def refine_with_positions(
     model = pycolmap.Reconstruction(mapped.model)
     model.update_point_3d_errors()
     before = model.compute_mean_reprojection_error()
-    known = _one_a_station(model, positions, sigmas)
+    # One picture of each frame, since navigation measured it once.
+    known = sorted(first_pictures(model, positions + sigmas).values())
     if len(known) < _LEAST_STATIONS:
         return mapped
     given = positions[[number - 1 for number in known]]
@@ -144,16 +168,6 @@ def refine_with_positions(
     factor = mapped.baseline / model_baseline(model)
     scale_model(model, factor)
     return replace(mapped, model=model, rig_factor=mapped.rig_factor * factor)
-
-
-def _one_a_station(model: pycolmap.Reconstruction, positions: Array, sigmas: Array) -> list[int]:
-    """Pictures whose positions are given: one of each frame, since navigation measured it once."""
-    known: dict[int, int] = {}
-    for number, image in sorted(model.images.items()):
-        given = positions[number - 1] + sigmas[number - 1]
-        if image.has_pose and np.isfinite(given).all():
-            known.setdefault(image.frame_id, number)
-    return sorted(known.values())
 
 
 def _priors(

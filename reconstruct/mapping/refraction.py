@@ -24,9 +24,10 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.bundle import FULLY, ROUGHLY, Adjust, adjust_freely
-from reconstruct.mapping.database import Observations, write_database
+from reconstruct.mapping.bundle import FULLY, ROUGHLY
+from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.priors import Adjust, adjust_freely
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.views.lens import FlatPortLens, Lens
 from reconstruct.views.range_shift import field_of
@@ -268,9 +269,7 @@ def _judge_again(
     before = model.compute_num_observations()
     limit = _wrong_px(model)
     if seen.pairs:
-        scratch = folder / "refraction"
-        shutil.rmtree(scratch, ignore_errors=True)
-        scratch.mkdir(parents=True)
+        scratch = new_folder(folder / "refraction")
         write_database(scratch / "database.db", seen, cam_from_rig)
         with pycolmap.Database.open(scratch / "database.db") as database:
             cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())

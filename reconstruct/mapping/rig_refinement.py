@@ -4,42 +4,58 @@ An adjustment of stations, points and the rig's parameters, each parameter withi
 knew of it: the covariance of `rig.json`, or wide bounds where it has none. What is requested is
 free; other uncertain parameters of the calibration (focal lengths, say) moves with it within its
 covariance, since holding that would push its errors into what is requested.
+
+The model is then rebuilt on the refined rig: settings `refine_port`, `refine_rig`. It writes
+`port.json` (values, sigmas, correlation) and `rig.json` (the refined rig) next to the model.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_matrix, diags_array
+import pycolmap
+from scipy.sparse import block_diag, csc_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.frames import Array
+from alice_survey.base.frames import Array, Datum
+from alice_survey.base.records import PortRecord
 from alice_survey.base.run import progress
 from camera_calib.flat_port import PARAMETERS
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, pose_names, value
-from camera_calib.rig import Covariance, Rig
-from reconstruct.mapping.arrays import Indices, frames_of
-from reconstruct.mapping.database import Observations
-from reconstruct.mapping.exact_sights import (
+from camera_calib.rig import Covariance, Rig, write_rig
+from reconstruct.mapping.arrays import Indices, first_pictures, frames_of
+from reconstruct.mapping.bundle import move_points
+from reconstruct.mapping.database import Observations, rigid3d
+from reconstruct.mapping.exact_observations import (
     Pixels,
     RigState,
+    calibrated_parameters,
     choose_pixels,
-    exact_sights,
+    exact_observations,
     start_state,
 )
-from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.normal_equations import (
     POSE,
+    TURN_INFORMATION,
+    LinearObservations,
     ReducedSystem,
-    Sights,
     moved_points,
     reduce_points,
     solver_of,
 )
+from reconstruct.mapping.priors import NavigationAdjuster
+from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
+from reconstruct.mapping.working_range import WorkingDistances
+from reconstruct.matching.matches import as_seen
+from reconstruct.matching.pairs import positions_ned
+from reconstruct.views.lens import Lens, flat_port_lens
 
 _PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
@@ -51,8 +67,6 @@ _MOST_CORRELATED = 0.98
 """Correlation of navigation's errors from one station to the next."""
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
-_TURN_INFORMATION = 1.0
-"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 _ROUNDS = 20
 _SETTLED = 3e-2
 """Steps of all parameters, in their sigmas, at which the adjustment ends."""
@@ -146,15 +160,15 @@ def fit_rig(
     drift = np.zeros(len(first))
     variance = np.nan
     for _ in range(_ROUNDS):
-        sights = exact_sights(state, pixels, fields, names, lever=fixes is not None)
+        linear = exact_observations(state, pixels, fields, names, lever=fixes is not None)
         left = _spare(pixels, len(frames), len(first)) / (2 * len(pixels.station))
-        sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
-        weights = cauchy_weights(sights.miss, sigma)
-        now = variance_of(sights.miss, weights, left)
-        sights = sights.weighted(weights)
+        sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
+        weights = cauchy_weights(linear.miss, sigma)
+        now = variance_of(linear.miss, weights, left)
+        linear = linear.weighted(weights)
         variance = now if np.isnan(variance) else min(variance, now)
-        step = _step(sights, state, variance, information, drift, fixes)
-        state = _moved(state, pixels, step, sights, fields, names)
+        step = _step(linear, state, variance, information, drift, fixes)
+        state = _moved(state, pixels, step, linear, fields, names)
         drift = drift + step.shared
         if np.all(np.abs(step.shared) < _SETTLED * np.sqrt(np.diag(step.covariance))):
             break
@@ -208,9 +222,7 @@ def _spare(pixels: Pixels, stations: int, shared: int) -> int:
 
 def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
     """What is known before the pictures of what may move."""
-    known: tuple[str, ...] = ()
-    if rig.covariance is not None:
-        known = tuple(n for n in rig.covariance.parameters if n.split(".")[0] in names)
+    known = calibrated_parameters(rig, names)
     wide: dict[str, float] = {}
     if port:
         for name in names:
@@ -266,7 +278,7 @@ class _RigStep:
 
 
 def _step(
-    sights: Sights,
+    linear: LinearObservations,
     state: RigState,
     variance: float,
     information: Array,
@@ -275,7 +287,7 @@ def _step(
 ) -> _RigStep:
     """One Gauss-Newton step of stations and shared parameters, and the shared ones' covariance."""
     count = len(state.centres)
-    reduced = reduce_points(sights, count)
+    reduced = reduce_points(linear, count)
     shared = reduced.shared / variance + information
     pull = reduced.shared_slope / variance + information @ drift
     border, slope = reduced.border / variance, reduced.slope / variance
@@ -292,13 +304,13 @@ def _step(
             rows = rows / fixes.sigmas[s][:, None]
             off = (state.centres[s] + arm - fixes.positions[s]) / fixes.sigmas[s]
             extra[s] = rows[:, :POSE].T @ rows[:, :POSE]
-            extra[s][[0, 1, 2], [0, 1, 2]] += _TURN_INFORMATION
+            extra[s][[0, 1, 2], [0, 1, 2]] += TURN_INFORMATION
             at = slice(POSE * s, POSE * s + POSE)
             border[at, -3:] += rows[:, :POSE].T @ rows[:, POSE:]
             slope[at] += rows[:, :POSE].T @ off
             shared[-3:, -3:] += rows[:, POSE:].T @ rows[:, POSE:]
             pull[-3:] += rows[:, POSE:].T @ off
-        matrix = csc_matrix(matrix + _block_diagonal(extra))
+        matrix = csc_matrix(matrix + block_diag(list(extra), format="csc"))
     solve = solver_of(matrix, free)
     back, plain = solve(border), solve(slope)
     covariance = _inverse(shared - border.T @ back)
@@ -318,23 +330,16 @@ def _inverse(matrix: Array) -> Array:
     return (inverse + inverse.T) / 2.0
 
 
-def _block_diagonal(blocks: Array) -> Any:
-    """Sparse matrix from (F, 6, 6) blocks."""
-    from scipy.sparse import block_diag
-
-    return block_diag(list(blocks), format="csc") if len(blocks) else diags_array([])
-
-
 def _moved(
     state: RigState,
     pixels: Pixels,
     step: _RigStep,
-    sights: Sights,
+    linear: LinearObservations,
     fields: Sequence[str],
     names: Sequence[str],
 ) -> RigState:
     points = moved_points(
-        sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
+        linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
         step.reduced.point_inverse, step.stations, step.shared,
     )  # fmt: skip
     cameras, poses = list(state.cameras), list(state.cam_from_rig)
@@ -395,3 +400,153 @@ def _as_rig(
         source=f"{rig.source}; refined from the survey",
         covariance=Covariance(parameters=tuple(fields), matrix=covariance[:count, :count]),
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedSurvey:
+    """A survey mapped on its own refined rig."""
+
+    mapped: Mapped
+    seen: Observations
+    """Keypoints as warped by the refined rig's lenses."""
+    rig: Rig
+    convergence: Convergence
+    """How the keypoints converged."""
+    adjust: NavigationAdjuster
+    """What adjusted the model."""
+
+
+def frees_rig(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
+    """Whether the settings, or the calibration, call for a refinement of the rig.
+
+    A calibration that states its covariance leaves the poses on the rig to the survey as well,
+    unless that is turned off: the two together know more than either.
+    """
+    return settings.refine_port or _frees_poses(settings, rig, names)
+
+
+def _frees_poses(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
+    if settings.refine_rig == "auto":
+        moving = [n for n in pose_names(rig) if n.split(".")[0] in names]
+        return bool(moving) and set(moving) <= set(rig.sigmas)
+    return settings.refine_rig == "on"
+
+
+def refine_rig(
+    mapped: Mapped,
+    seen: Observations,
+    rig: Rig,
+    distances: WorkingDistances | None,
+    adjust: NavigationAdjuster,
+    datum: Datum | None,
+    folder: Path,
+    settings: ReconstructConfig,
+) -> RefinedSurvey | str:
+    """Refine a rig from a model, as far as `frees_rig` calls for it, and map again on it.
+
+    Args:
+        mapped: model on the rig, near its end; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: as calibrated or designed.
+        distances: for which the new lenses are the best.
+        adjust: that adjusted the model.
+        datum: of the positions of navigation.
+        folder: where `port.json` and `rig.json` go.
+        settings: `refine_port` and `refine_rig`.
+
+    Returns:
+        The survey on its refined rig; or what prevented it, where the settings do not insist.
+
+    Raises:
+        ReconstructionError: the settings insist, and the model has no scale, or the survey does not
+            determine what is to be refined.
+    """
+    names = list(seen.cameras)
+    fixes = None
+    if datum is not None and adjust.sigmas is not None:
+        fixes = navigation_fixes(mapped.model, seen, datum)
+    try:
+        if not mapped.scaled or distances is None:
+            raise ReconstructionError(
+                "refine_port and refine_rig need two cameras, whose known baseline gives the "
+                'scale: set refine_port = false and refine_rig = "off" in survey.toml'
+            )
+        pose = _frees_poses(settings, rig, names)
+        fit = fit_rig(mapped, seen, rig, port=settings.refine_port, pose=pose, fixes=fixes)
+    except ReconstructionError as error:
+        if settings.refine_port or settings.refine_rig == "on":
+            raise
+        return f"rig as calibrated: {error}"
+    lenses: dict[str, Lens] = {
+        name: flat_port_lens(fit.rig.cameras[name], distances.near_m, distances.far_m)
+        for name in names
+    }
+    mapped, seen = on_rig(mapped, seen, fit, lenses)
+    adjust = NavigationAdjuster(seen.images, fit.rig, lenses, datum)
+    poses = {name: fit.rig.cam_from_rig[name] for name in names}
+    mapped, convergence = refract(mapped, seen, folder, adjust, poses, near=True)
+    PortRecord.save(folder / "port.json", fit.to_json())
+    write_rig(folder / "rig.json", fit.rig)
+    return RefinedSurvey(
+        mapped=mapped, seen=seen, rig=fit.rig, convergence=convergence, adjust=adjust
+    )
+
+
+def on_rig(
+    mapped: Mapped, seen: Observations, fit: RigFit, lenses: dict[str, Lens]
+) -> tuple[Mapped, Observations]:
+    """A model and its keypoints for refined lenses, as warped."""
+    model = pycolmap.Reconstruction(mapped.model)
+    names = list(seen.cameras)
+    pixels = [
+        as_seen(mapped.lenses[record.camera].from_pinhole(rows), lenses[record.camera])
+        for record, rows in zip(seen.images, seen.pixels, strict=True)
+    ]
+    pinhole_from_rig: dict[str, RigidTransform] = {
+        name: lenses[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
+    }
+    rig_from_reference = pinhole_from_rig[names[0]].inv()
+    for number, name in enumerate(names, 1):
+        camera = model.cameras[number]
+        camera.params = lenses[name].pinhole.colmap.params
+        if number > 1:
+            for rig in model.rigs.values():
+                rig.set_sensor_from_rig(
+                    camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference)
+                )
+    frames = frames_of(model).tolist()
+    for frame, station in zip(frames, fit.stations, strict=True):
+        pose = lenses[names[0]].pinhole_from_cam * station.inv()
+        model.frames[frame].rig_from_world = rigid3d(pose)
+    for point, xyz in zip(fit.point_ids.tolist(), fit.points, strict=True):
+        model.points3D[point].xyz = xyz
+    for number, image in model.images.items():
+        for point, xy in zip(image.points2D, pixels[number - 1], strict=True):
+            point.xy = xy
+    if len(fit.points) < len(model.points3D):  # the others lie where the old rig had them
+        move_points(model, fit.sigma_px)
+    notes = (*mapped.notes, "rig and port refined from the survey's own pictures")
+    return (
+        replace(mapped, model=model, lenses=lenses, baseline=model_baseline(model), notes=notes),
+        replace(
+            seen,
+            pixels=pixels,
+            cameras={name: lenses[name].pinhole.colmap for name in names},
+        ),
+    )
+
+
+def navigation_fixes(
+    model: pycolmap.Reconstruction, seen: Observations, datum: Datum
+) -> NavigationFixes:
+    """Where navigation says that the body's origin was, by ascending frame."""
+    bodies = positions_ned(seen.images, datum)
+    frames = frames_of(model).tolist()
+    positions, sigmas = np.full((len(frames), 3), np.nan), np.full((len(frames), 3), np.nan)
+    for frame, number in first_pictures(model).items():
+        record, row = seen.images[number - 1], frames.index(frame)
+        positions[row] = bodies[number - 1]
+        level = record.sigma_horizontal_m
+        sigmas[row] = [level, level, record.sigma_depth_m]
+    sigmas[~(sigmas > 0).all(axis=1)] = np.nan
+    return NavigationFixes(positions=positions, sigmas=sigmas)

@@ -22,28 +22,25 @@ from alice_survey.base.manifest import ImageRecord, read_manifest
 from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesRecord
 from alice_survey.stages import rig_file
 from camera_calib.rig import Rig, read_rig
-from reconstruct.mapping.acceptance import check_survey
+from reconstruct.mapping.acceptance import judge_model
 from reconstruct.mapping.database import Observations, VerifiedPair
-from reconstruct.mapping.doming import doming_of_survey
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
+from reconstruct.mapping.rig_refinement import RefinedSurvey, frees_rig, refine_rig
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
-from reconstruct.mapping.survey_rig import RefinedSurvey, frees_rig, refine_as_set
 from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import WorkingDistances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
     as_seen,
-    camera_text,
     coarse_matches,
     match_pair,
 )
-from reconstruct.matching.pairs import SMALL_SET, choose_pairs, placed_pictures
+from reconstruct.matching.pairs import SMALL_SET, alike_pairs, choose_pairs, placed_pictures
 from reconstruct.matching.refinement import refine_tracks
-from reconstruct.matching.retrieval import alike_pairs
-from reconstruct.pictures.files import exif_focal_px
+from reconstruct.pictures.files import exif_focal_px, named
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
 from reconstruct.views.lens import Lens, flat_port_lens
@@ -55,8 +52,6 @@ _LEAST_COARSE = 10
 """Coarse matches from which a pair is matched fully."""
 _ALIKE = 12
 """Pictures that look most like one that navigation does not place, which get a coarse look."""
-_NAMED = 8
-"""Pictures named in a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +113,7 @@ def _map(
         cameras=cameras,
         pixels=[
             as_seen(pixels, lenses.get(record.camera))
-            for record, pixels in zip(inputs.records, refined.pixels, strict=True)
+            for record, pixels in zip(inputs.records, refined, strict=True)
         ],
         pairs=pairs,
     )
@@ -137,9 +132,7 @@ def _map(
         rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
         mapped, refracted = refract(mapped, seen, folder, adjust, poses, settle=not free)
         if free:
-            found = refine_as_set(
-                mapped, seen, rig, distances, adjust, inputs.datum, folder, settings
-            )
+            found = refine_rig(mapped, seen, rig, distances, adjust, inputs.datum, folder, settings)
             if isinstance(found, RefinedSurvey):
                 mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
                 seen, rig = found.seen, found.rig
@@ -280,14 +273,14 @@ def _match_all(
     counts = executor.map(coarse_matches, looks, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]
     pairs = sorted([*sure, *likely])
-    texts = {name: camera_text(camera) for name, camera in cameras.items()}
+    fields = {name: camera.todict() for name, camera in cameras.items()}
     names = [record.camera for record in inputs.records]
     tasks = [
         PairTask(
             first=features[i],
             second=features[j],
             ratio=RATIO,
-            cameras=(texts[names[i]], texts[names[j]]),
+            cameras=(fields[names[i]], fields[names[j]]),
             lenses=(lenses.get(names[i]), lenses.get(names[j])),
             seed=seed,
         )
@@ -326,14 +319,9 @@ def _write(
             },
         },
     )
-    doming = doming_of_survey(mapped, inputs.records, inputs.rig, inputs.datum)
-    accepted = check_survey(
-        mapped,
-        inputs.records,
-        inputs.rig,
-        inputs.datum,
-        None if doming is None else doming.scale,
-    )
+    doming = accepted = None
+    if inputs.rig is not None and mapped.scaled:
+        doming, accepted = judge_model(mapped, inputs.records, inputs.rig, inputs.datum)
     content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
     MappingRecord.save(
         partial / "mapping.json",
@@ -374,12 +362,6 @@ def read_inputs(workspace: Path) -> Inputs:
     )
     check_sizes(inputs)
     return inputs
-
-
-def named(images: Sequence[str]) -> str:
-    """The first few names of a list."""
-    rest = len(images) - _NAMED
-    return ", ".join(images[:_NAMED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def check_sizes(inputs: Inputs) -> None:

@@ -17,18 +17,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import warn
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
+from reconstruct.mapping.bundle import all_pictures, direct_solver
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import (
     Mapped,
     as_transform,
     largest,
     model_baseline,
+    report_left_out,
     run_mapper,
     scale_model,
     sizes,
 )
-from reconstruct.mapping.merge import report_left_out
-from reconstruct.mapping.solver import direct_solver
 from reconstruct.views.lens import Lens, self_calibrated_lens
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
@@ -186,10 +186,7 @@ def _best_lens(model: pycolmap.Reconstruction, *, focal: bool) -> pycolmap.Recon
 
 
 def _adjust(model: pycolmap.Reconstruction, *, focal: bool) -> None:
-    config = pycolmap.BundleAdjustmentConfig()
-    for number, image in sorted(model.images.items()):
-        if image.has_pose:
-            config.add_image(number)
+    config = all_pictures(model)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = direct_solver(pycolmap.BundleAdjustmentOptions())
     options.refine_focal_length = focal

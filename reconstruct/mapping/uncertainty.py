@@ -7,10 +7,15 @@ is stated is its shape: the covariance of what is left when all stations togethe
 truth by a rigid motion (and by a scale, where nothing fixes that) with the least squares error (the
 inner constraints of a free network; Baarda's S-transformation, 1973). Where the whole lies in the
 world is for the georeference to say.
+
+An adjustment that holds rig and ports assumes that they are exact. They are not: a lens that is off
+by its sigma bends the whole block a little, and every picture more does the same again. To first
+order stations and points move with the rig's parameters as the adjustment's normal equations say
+(implicit function theorem), and the covariance of the calibration moves with them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +23,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags_array
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.contents import read_arrays, taken_from
@@ -26,16 +32,23 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
-from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
+from reconstruct.mapping.arrays import Indices, Observed, first_pictures, frames_of, observed
 from reconstruct.mapping.database import Observations
+from reconstruct.mapping.exact_observations import (
+    calibrated_parameters,
+    choose_pixels,
+    exact_observations,
+    start_state,
+)
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     LEAST_POINTS,
     POSE,
+    TURN_INFORMATION,
     Gauge,
+    LinearObservations,
     ReducedSystem,
-    Sights,
+    moved_points,
     point_covariances,
     reduce_points,
     solver_of,
@@ -44,8 +57,6 @@ from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 _CHUNK = 32
 """Stations whose columns of the inverse are in memory at a time."""
-_TURN_INFORMATION = 1.0
-"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,6 +82,43 @@ class Uncertainty:
     """Sigma of one coordinate of a keypoint, from the residuals."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationPart:
+    """How a block moves with the parameters of its rig, and how uncertain those are."""
+
+    frames: Indices
+    """(F,) ids of COLMAP's frames, ascending."""
+    stations: Array
+    """(F, 6, G) turns and motions of the stations by the parameters, in the model's axes."""
+    places: Array
+    """(P, 3) points at which the motion is known: enough of them, not all."""
+    points: Array
+    """(P, 3, G) motions of those points by the parameters."""
+    covariance: Array
+    """(G, G) covariance of the parameters."""
+
+    def of_stations(self) -> Array:
+        """Covariances (F, 6, 6) of the stations."""
+        return _spread(self.stations, self.covariance)
+
+    def of_points(self, points: Array) -> Array:
+        """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
+        nearest = np.asarray(KDTree(self.places).query(points)[1])
+        given, which = np.unique(nearest, return_inverse=True)
+        found: Array = _spread(self.points[given], self.covariance)[which]
+        return found
+
+    def without(self, gauge: Gauge) -> "CalibrationPart":
+        """The same minus what a motion of the whole block does, which does not change its shape."""
+        flat = self.stations.reshape(-1, self.stations.shape[2])
+        whole = gauge.spread @ gauge.flat.T @ (gauge.weights[:, None] * flat)
+        return replace(
+            self,
+            stations=self.stations - gauge.motions @ whole,
+            points=self.points - gauge.of_points(self.places) @ whole,
+        )
+
+
 def estimate(
     mapped: Mapped,
     records: Sequence[ImageRecord],
@@ -92,7 +140,7 @@ def estimate(
     model = mapped.model
     seen = observed(model)
     frames = frames_of(model)
-    sights, order = sights_of(model, seen, frames)
+    linear, order = pinhole_observations(model, seen, frames)
     scale_free = not np.isfinite(mapped.baseline)
     spare = 2 * len(order) - 3 * len(seen.point_ids) - POSE * len(frames) + 6 + int(scale_free)
     if spare < 1 or len(frames) < 2:
@@ -101,21 +149,21 @@ def estimate(
             "stations do not determine how well they are known"
         )
     left = spare / (2 * len(order))
-    sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
-    weights = cauchy_weights(sights.miss, sigma)
-    variance = variance_of(sights.miss, weights, left)
-    sights = sights.weighted(weights)
-    reduced = reduce_points(sights, len(frames))
+    sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
+    weights = cauchy_weights(linear.miss, sigma)
+    variance = variance_of(linear.miss, weights, left)
+    linear = linear.weighted(weights)
+    reduced = reduce_points(linear, len(frames))
     centres = _centres(model, frames)
     given = navigation_information(model, position_sigmas)
-    counts = np.bincount(sights.station, minlength=len(frames))
+    counts = np.bincount(linear.station, minlength=len(frames))
     loose = counts < LEAST_POINTS
-    gauge = Gauge(centres, float(np.median(np.linalg.norm(sights.arm, axis=1))), scale_free)
+    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
     blocks = _inverse_blocks(reduced, variance, given, gauge, loose)
     rows = np.repeat(np.arange(len(frames)), np.diff(reduced.pointers))
     own = np.flatnonzero(rows == reduced.columns)
     points = point_covariances(
-        sights.starts, sights.station, sights.by_point, sights.arm,
+        linear.starts, linear.station, linear.by_point, linear.arm,
         reduced.point_inverse, reduced.pointers, reduced.columns, blocks,
     )  # fmt: skip
     noise = variance * reduced.point_inverse
@@ -201,9 +249,9 @@ def read_uncertainty(path: Path) -> Uncertainty:
         )
 
 
-def sights_of(
+def pinhole_observations(
     model: pycolmap.Reconstruction, seen: Observed, frames: Indices
-) -> tuple[Sights, Indices]:
+) -> tuple[LinearObservations, Indices]:
     """The observations of a model of pinholes, linearised.
 
     Returns:
@@ -225,7 +273,7 @@ def sights_of(
         miss[rows] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
         station[rows] = np.searchsorted(frames, image.frame_id)
     counts = np.bincount(seen.point, minlength=len(points))
-    sights = Sights(
+    linear = LinearObservations(
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         station=station[order],
         by_point=by_point[order],
@@ -233,7 +281,7 @@ def sights_of(
         by_shared=np.zeros((len(order), 2, 0)),
         miss=miss[order],
     )
-    return sights, order.astype(np.int64)
+    return linear, order.astype(np.int64)
 
 
 def _inverse_blocks(
@@ -289,12 +337,9 @@ def navigation_information(model: pycolmap.Reconstruction, sigmas: Array | None)
         return None
     frames = frames_of(model)
     given = np.zeros((len(frames), POSE))
-    for number, image in sorted(model.images.items()):
-        if not image.has_pose:
-            continue
-        row = int(np.searchsorted(frames, image.frame_id))
-        if np.isfinite(sigmas[number - 1]).all() and not given[row].any():
-            given[row] = [*[_TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
+    for frame, number in first_pictures(model, sigmas).items():
+        row = int(np.searchsorted(frames, frame))
+        given[row] = [*[TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
     return given if given.any() else None
 
 
@@ -313,3 +358,70 @@ def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indi
         rank = (not image.is_ref_in_frame(), number)
         chosen[image.frame_id] = min(rank, chosen.get(image.frame_id, rank))
     return [chosen[int(f)][1] for f in frames]
+
+
+def _spread(motions: Array, covariance: Array) -> Array:
+    """Covariances (N, k, k) of what moves by (N, k, G)."""
+    spread: Array = motions @ covariance @ motions.swapaxes(1, 2)
+    return spread
+
+
+def calibration_part(
+    mapped: Mapped, seen: Observations, rig: Rig, given: Array | None = None
+) -> CalibrationPart | None:
+    """How a finished model depends on its calibration.
+
+    Args:
+        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: with the covariance of its calibration.
+        given: (F, 6) information of the stations' given poses, as in the adjustment; None without.
+
+    Returns:
+        None where the rig states no covariance: then it is unknown.
+    """
+    names = list(seen.cameras)
+    fields = calibrated_parameters(rig, names)
+    if not fields or rig.covariance is None:
+        return None
+    frames = frames_of(mapped.model)
+    pixels, ids = choose_pixels(mapped, seen, names, frames)
+    state = start_state(mapped, rig, names, frames, ids)
+    linear = exact_observations(state, pixels, fields, names, lever=False)
+    sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
+    linear = linear.weighted(cauchy_weights(linear.miss, sigma))
+    stations, points = _response(linear, len(frames), sigma**2, given)
+    at = [rig.covariance.parameters.index(name) for name in fields]
+    return CalibrationPart(
+        frames=frames,
+        stations=stations,
+        places=state.points,
+        points=points,
+        covariance=rig.covariance.matrix[np.ix_(at, at)],
+    )
+
+
+def _response(
+    linear: LinearObservations, count: int, variance: float, given: Array | None
+) -> tuple[Array, Array]:
+    """Slopes of stations (F, 6, G) and points (P, 3, G) by what is shared, in some gauge."""
+    reduced = reduce_points(linear, count)
+    matrix = csc_matrix(reduced.matrix / variance)
+    seeing = np.bincount(linear.station, minlength=count) >= LEAST_POINTS
+    free = np.repeat(seeing, POSE)
+    if given is None:
+        free[:POSE] = False
+    else:
+        matrix = csc_matrix(matrix + diags_array(given.ravel()))
+    solve = solver_of(matrix, free)
+    shared = reduced.border.shape[1]
+    stations = -solve(reduced.border / variance).reshape(count, POSE, shared)
+    still = np.zeros_like(linear.miss)
+    points = [
+        moved_points(
+            linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, still,
+            reduced.point_inverse, np.ascontiguousarray(stations[:, :, g]), np.eye(shared)[g],
+        )
+        for g in range(shared)
+    ]  # fmt: skip
+    return stations, np.stack(points, axis=-1)

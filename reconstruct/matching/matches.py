@@ -4,7 +4,7 @@ Descriptors are bytes, so that every dot product is a whole number below 2^24 an
 float32 matrix products exactly: matches depend neither on the number of threads nor on the blocks.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -94,9 +94,7 @@ def match_descriptors(
     nearest_b = np.full(len(b), np.inf, np.float32)
     for start in range(0, len(a), block):
         products = left[start : start + block] @ right.T
-        _best_two(
-            products, norms_a, norms_b, best, first, second, best_b, nearest_b, start
-        )  # fmt: skip
+        _best_two(products, norms_a, norms_b, best, first, second, best_b, nearest_b, start)
     rows = np.arange(len(a))
     clear = first < ratio * ratio * second
     good = rows[clear & (best_b[best] == rows)]
@@ -166,8 +164,8 @@ class PairTask:
     first: Path
     second: Path
     ratio: float
-    cameras: tuple[str, str] = ("", "")
-    """COLMAP cameras as `camera_text` writes them; empty for a coarse look."""
+    cameras: tuple[dict[str, Any], dict[str, Any]] = field(default_factory=lambda: ({}, {}))
+    """COLMAP cameras as `todict` gives them; empty for a coarse look."""
     lenses: tuple[Lens | None, Lens | None] = (None, None)
     """What takes pixels to those of the cameras, where these are ideal pinholes."""
     seed: int = 0
@@ -198,25 +196,6 @@ def coarse_matches(task: PairTask) -> int:
     """How many of the first (largest) features of two pictures match: cheap, to choose pairs by."""
     first, second = (_features(p).descriptors[:_COARSE_FEATURES] for p in (task.first, task.second))
     return len(match_descriptors(first, second, task.ratio))
-
-
-def camera_text(camera: pycolmap.Camera) -> str:
-    """A COLMAP camera as text, for another process."""
-    known = int(camera.has_prior_focal_length)
-    values = " ".join(repr(float(p)) for p in camera.params)
-    return f"{camera.model_name} {camera.width} {camera.height} {known} {values}"
-
-
-def camera_from_text(text: str) -> pycolmap.Camera:
-    """The inverse of `camera_text`."""
-    model, width, height, known, *params = text.split()
-    return pycolmap.Camera(
-        model=model,
-        width=int(width),
-        height=int(height),
-        params=[float(p) for p in params],
-        has_prior_focal_length=known == "1",
-    )
 
 
 def match_pair(task: PairTask) -> PairMatches:
@@ -312,9 +291,9 @@ def _verified(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> Pa
     if len(matches) < options.min_num_inliers:
         return PairMatches(matches=matches[:0], geometry=None)
     geometry = pycolmap.estimate_two_view_geometry(
-        camera_from_text(task.cameras[0]),
+        pycolmap.Camera(task.cameras[0]),
         seen[0],
-        camera_from_text(task.cameras[1]),
+        pycolmap.Camera(task.cameras[1]),
         seen[1],
         matches,
         options,

@@ -1,17 +1,29 @@
-"""Which pictures to match: by their footprints, by their order, or by a first coarse look."""
+"""Which pictures to match: by their footprints, by their order, or by a first coarse look.
+
+Pictures that look alike are found by one vector of each: its features' distances from the words of
+a codebook, summed by word (VLAD, Jegou et al. 2010) with each word's sum normalised (Arandjelovic &
+Zisserman 2013). The codebook is made from the survey's own features, so that nothing needs to be
+downloaded and words are those of this sea floor. Words that all pictures share count less, since
+the mean of the vectors is taken off.
+"""
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 from shapely import STRtree
 from shapely.geometry import Polygon
 
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
+from reconstruct.matching.features import load_features
 
 Pair = tuple[int, int]
 """Indices of two pictures, the smaller first."""
@@ -31,6 +43,13 @@ _LOOKS = 12
 """Partners of every picture that get a coarse look."""
 _SIGMAS = 2.0
 """Standard deviations of the distance of two pictures up to which they get a coarse look."""
+_WORDS = 64
+_SAMPLE = 30_000
+"""Features from which the codebook is made."""
+_ROUNDS = 12
+_LARGEST = 1500
+"""Features of each picture that are described."""
+_BLOCK = 512
 
 
 def choose_pairs(
@@ -247,3 +266,91 @@ def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:
         for b in row
         if a != b
     }
+
+
+def alike_pairs(
+    features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, executor: Executor
+) -> list[Pair]:
+    """Pairs of pictures that look most alike.
+
+    Args:
+        features: files of the features of every picture.
+        wanted: pictures for which partners are sought, among all.
+        partners: how many for each.
+        seed: of the codebook.
+        executor: where tasks run.
+
+    Returns:
+        Pairs in rising order.
+    """
+    if len(features) < 2 or not len(wanted):
+        return []
+    words = make_codebook(features, seed)
+    rows = executor.map(partial(describe, words=words), features, label="looks of pictures")
+    looks = np.stack(list(rows))
+    looks = looks - looks.mean(axis=0)
+    looks = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+    pairs: set[Pair] = set()
+    chosen = np.asarray(wanted)
+    for start in range(0, len(chosen), _BLOCK):
+        some = chosen[start : start + _BLOCK]
+        likeness = looks[some] @ looks.T
+        likeness[np.arange(len(some)), some] = -np.inf
+        count = min(partners, len(features) - 1)
+        best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
+        pairs |= {
+            (min(int(i), int(j)), max(int(i), int(j)))
+            for i, row in zip(some, best, strict=True)
+            for j in row
+        }
+    return sorted(pairs)
+
+
+def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
+    """Centres, (W, 128), of the features of evenly chosen pictures (k-means, Lloyd 1982)."""
+    rng = np.random.default_rng(seed)
+    step = max(1, len(features) // 100)
+    some = features[::step]
+    each = max(1, _SAMPLE // len(some))
+    sample = np.concatenate([load_features(path).descriptors[:each] for path in some])
+    sample = sample.astype(np.float32)
+    words = sample[rng.choice(len(sample), min(_WORDS, len(sample)), replace=False)]
+    for _ in range(_ROUNDS):
+        word = _nearest_words(sample, words)
+        count = np.bincount(word, minlength=len(words))
+        sums = _sums(sample, word, len(words))
+        filled = count > 0
+        words = words.copy()
+        words[filled] = (sums[filled] / count[filled, None]).astype(np.float32)
+    return words
+
+
+def describe(features: Path, words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The vector of a picture, (W * 128,); zeros without features."""
+    descriptors = load_features(features).descriptors[:_LARGEST].astype(np.float32)
+    if not len(descriptors):
+        return np.zeros(words.size, np.float32)
+    word = _nearest_words(descriptors, words)
+    sums = _sums(descriptors - words[word], word, len(words))
+    norms = np.linalg.norm(sums, axis=1, keepdims=True)
+    vector = (sums / np.maximum(norms, 1e-9)).ravel()
+    found: NDArray[np.float32] = vector.astype(np.float32)
+    return found
+
+
+def _nearest_words(
+    descriptors: NDArray[np.float32], words: NDArray[np.float32]
+) -> NDArray[np.intp]:
+    distances = (words**2).sum(axis=1) - 2 * descriptors @ words.T
+    nearest: NDArray[np.intp] = np.argmin(distances, axis=1)
+    return nearest
+
+
+def _sums(rows: NDArray[np.float32], word: NDArray[np.intp], words: int) -> Array:
+    """Sums, (W, D), of rows (N, D) by word."""
+    order = np.argsort(word, kind="stable")
+    starts = np.searchsorted(word[order], np.arange(words))
+    present = np.bincount(word, minlength=words) > 0
+    found = np.zeros((words, rows.shape[1]))
+    found[present] = np.add.reduceat(rows[order].astype(np.float64), starts[present], axis=0)
+    return found

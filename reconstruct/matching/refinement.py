@@ -67,25 +67,13 @@ class _TrackTask:
     partners: tuple[_Partner, ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RefinedFeatures:
-    """Features after refinement."""
-
-    pixels: list[Array]
-    """Pixels by picture, (N, 2): all features, moved or not."""
-    tracked: int
-    """Observations that have a reference in another picture."""
-    moved: int
-    """Number of features that were aligned with it."""
-
-
 def refine_tracks(
     features: Sequence[Path],
     greys: Sequence[Path],
     pairs: Sequence[tuple[int, int, Matches]],
     *,
     executor: Executor,
-) -> RefinedFeatures:
+) -> list[Array]:
     """Align every observation of a track with the track's reference.
 
     The reference is the observation that was matched with most others. An observation stays where
@@ -96,23 +84,19 @@ def refine_tracks(
         greys: files of the evened pictures, (H, W) bytes as `numpy.save` writes them.
         pairs: indices of two pictures and (K, 2) verified matches.
         executor: where tasks run.
+
+    Returns:
+        Pixels of all features by picture, (N, 2), moved or not.
     """
     pixels = [load_features(path).pixels for path in features]
     starts = np.concatenate([[0], np.cumsum([len(p) for p in pixels])]).astype(np.int64)
     reference = track_references(pairs, starts)
     tasks = _tasks(pixels, starts, reference, pairs, greys)
     together = np.concatenate([np.zeros((0, 2)), *pixels])
-    tracked = moved = 0
     for nodes, found in executor.map(align, tasks, label="sub-pixel positions"):
         good = np.isfinite(found[:, 0])
         together[nodes[good]] = found[good]
-        tracked += len(nodes)
-        moved += int(good.sum())
-    return RefinedFeatures(
-        pixels=[together[a:b] for a, b in itertools.pairwise(starts)],
-        tracked=tracked,
-        moved=moved,
-    )
+    return [together[a:b] for a, b in itertools.pairwise(starts)]
 
 
 def track_references(

@@ -3,8 +3,9 @@
 import re
 import shutil
 import warnings
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from fractions import Fraction
 from pathlib import Path
@@ -34,7 +35,7 @@ _ADVICE = {
     "HEIC": "save them as JPEG first",
     "video": "take its frames with --video, into a workspace of their own",
     IN_FOLDERS: "give these folders too",
-    "other files": "they are no pictures by their names",
+    "other files": "their names are not those of pictures",
 }
 _NAMED = 3
 _YEARS = range(1970, 2200)
@@ -119,24 +120,16 @@ def look_into(folder: Path, apart: Collection[Path] = ()) -> PictureFolder:
         left_out={reason: tuple(left_out[reason]) for reason in _ADVICE if reason in left_out},
     )
     if not pictures:
-        held = ", ".join(_named(reason, paths) for reason, paths in found.left_out.items())
-        raise ImageError(
-            f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW)"
-            + (
-                f", but {held}: {next(_ADVICE[reason] for reason in found.left_out)}"
-                if held
-                else ""
-            )
-        )
+        held = [_named(reason, paths) for reason, paths in found.left_out.items()]
+        but = f", but {', '.join(held)}: {_ADVICE[next(iter(found.left_out))]}" if held else ""
+        raise ImageError(f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW){but}")
     return found
 
 
 def kind_of(path: Path) -> str:
     """`JPEG`, `PNG`, `TIFF` or `RAW` by the name of a file; empty for all others."""
-    suffix = path.suffix.lower()
-    if suffix in TIFF or suffix in RAW:
-        return "TIFF" if suffix in TIFF else "RAW"
-    return {".png": "PNG"}.get(suffix, "JPEG") if suffix in PLAIN else ""
+    kinds = {"PNG": (".png",), "JPEG": PLAIN, "TIFF": TIFF, "RAW": RAW}
+    return next((kind for kind, names in kinds.items() if path.suffix.lower() in names), "")
 
 
 def _named(reason: str, paths: Sequence[Path]) -> str:
@@ -146,6 +139,12 @@ def _named(reason: str, paths: Sequence[Path]) -> str:
         names = list(dict.fromkeys(p.parent.name for p in paths))
     more = ", ..." if len(names) > _NAMED else ""
     return f"{len(paths)} {reason} ({', '.join(names[:_NAMED])}{more})"
+
+
+def named(names: Sequence[str], most: int = 8) -> str:
+    """The first few of some names, and how many more there are."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _is_mask(path: Path, stems: set[str]) -> bool:
@@ -167,7 +166,7 @@ def inspect(path: Path) -> PictureFacts:
     """Decode a picture whole and read when and where it was taken; never raises for a bad file."""
     try:
         if not path.is_file():
-            return PictureFacts(path=path, fault="no regular file")
+            return PictureFacts(path=path, fault="not a regular file")
         pixels = decode(path)
     except (ImageError, OSError) as error:
         return PictureFacts(path=path, fault=str(error))
@@ -190,7 +189,8 @@ def decode(path: Path) -> NDArray[Any]:
     if suffix in RAW:
         return _develop(path)
     if suffix in PLAIN:
-        _check_whole(path)
+        with _pillow(path) as image:  # it refuses truncated files; OpenCV fills them with grey
+            image.load()
     pixels = read_pixels(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise ImageError("cannot be decoded")
@@ -201,14 +201,19 @@ def decode(path: Path) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[..., :3] if pixels.ndim == 3 else pixels)
 
 
-def _check_whole(path: Path) -> None:
-    """Decode with a library that refuses truncated files (OpenCV fills them with grey)."""
+@contextmanager
+def _pillow(path: Path) -> Iterator[Any]:
+    """A picture opened by Pillow, without its warnings.
+
+    Raises:
+        ImageError: it is damaged, or of a kind that Pillow does not know.
+    """
     from PIL import Image
 
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")
-            image.load()
+            yield image
     except (*PILLOW_FAULTS, Image.DecompressionBombError) as error:
         raise ImageError(f"corrupt: {one_line(error)}".replace(str(path), path.name)) from None
 
@@ -231,16 +236,11 @@ def _develop(path: Path) -> NDArray[Any]:
 
 
 def _with_exif(facts: PictureFacts) -> PictureFacts:
-    from dataclasses import replace
-
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings(), Image.open(facts.path) as image:
-            warnings.simplefilter("ignore")
+        with _pillow(facts.path) as image:
             exif = image.getexif()
             details, gps = exif.get_ifd(_EXIF), exif.get_ifd(_GPS)
-    except (*PILLOW_FAULTS, Image.DecompressionBombError):
+    except ImageError:
         return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
     return replace(
         facts,
@@ -302,13 +302,10 @@ def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
     Film is 36 mm wide; makers relate the longer sides (or the diagonals, which differs by a few
     per cent).
     """
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")
+        with _pillow(path) as image:
             stated = _number(image.getexif().get_ifd(_EXIF).get(_FOCAL_35))
-    except (*PILLOW_FAULTS, Image.DecompressionBombError):
+    except ImageError:
         return float("nan")
     if stated is None or not 5 <= stated <= 1000:
         return float("nan")

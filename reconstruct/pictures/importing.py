@@ -33,6 +33,7 @@ from reconstruct.pictures.files import (
     inspect,
     kind_of,
     look_into,
+    named,
     safe_name,
     target_suffix,
     to_utc,
@@ -152,7 +153,8 @@ def import_images(
                 "choose another workspace with -w"
             )
     sides = _look_into(folders, left, right, [*given, workspace])
-    files = [file for side in sides.values() for each in side for file in _files_of(each)]
+    folders_read = [each for side in sides.values() for each in side]
+    files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
         name="images",
         version=1,
@@ -177,10 +179,9 @@ def import_images(
         if video is not None:
             entries = _take_frames(video, every_s, partial, _mono_name(known_rig))
         else:
-            for line in [
-                line for side in sides.values() for one in side for line in one.warnings()
-            ]:
-                warn(line)
+            for each in folders_read:
+                for line in each.warnings():
+                    warn(line)
             entries = _find_entries(sides, known_rig, executor)
         _check_entries(entries, known_rig)
         entries = _named(entries)
@@ -243,10 +244,6 @@ def _look_into(
     if left is not None and right is not None:
         return {"left": [look_into(left, apart)], "right": [look_into(right, apart)]}
     return {_MONO: [look_into(folder, apart) for folder in folders]} if folders else {}
-
-
-def _files_of(folder: PictureFolder) -> tuple[Path, ...]:
-    return (*folder.pictures, *folder.masks)
 
 
 def _check_sources(
@@ -407,7 +404,7 @@ def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> lis
     """Write a frame at a fixed interval in seconds as PNG."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
-        raise ImageError(f"{video}: no video that can be read")
+        raise ImageError(f"{video}: not a video that can be read")
     entries: list[_Incoming] = []
     try:
         total = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
@@ -556,6 +553,5 @@ def _with_gps(records: Sequence[ImageRecord], entries: Sequence[_Incoming]) -> l
             )
         )
     if lost and len(lost) < len(records):
-        more = f" and {len(lost) - 8} more" if len(lost) > 8 else ""
-        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {', '.join(lost[:8])}{more}")
+        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {named(lost)}")
     return placed

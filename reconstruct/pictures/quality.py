@@ -120,7 +120,7 @@ def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict
     eight = (pixels.astype(np.float32) * (255.0 / full)).round().astype(np.uint8)
     grey = cv2.cvtColor(eight, cv2.COLOR_BGR2GRAY) if eight.ndim == 3 else eight
     use = np.full(grey.shape, True) if mask is None else mask
-    blocks = _whole_blocks(use)
+    blocks = np.asarray(_blocks_of(use).all(axis=(1, 3)))
     if not blocks.any():
         raise ImageError(
             f"no block of {_BLOCK_PX} px is free of the mask: nothing of it can be measured"
@@ -157,10 +157,6 @@ def _blocks_of(values: NDArray[Any]) -> NDArray[Any]:
 def _per_block(values: NDArray[np.float32]) -> NDArray[np.float64]:
     means: NDArray[np.float64] = _blocks_of(values).mean(axis=(1, 3), dtype=np.float64)
     return means
-
-
-def _whole_blocks(use: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return np.asarray(_blocks_of(use).all(axis=(1, 3)))
 
 
 def _noise(values: NDArray[np.float32], blocks: NDArray[np.bool_]) -> float:

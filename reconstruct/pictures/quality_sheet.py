@@ -28,12 +28,7 @@ _HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
 _MOST_SHOWN = 8
 _ACROSS = 4
 _THUMBNAIL_PX = 420
-_STRIPS = (
-    ("sharpness", "sharpness"),
-    ("contrast", "contrast"),
-    ("veil", "veil"),
-    ("brightness", "brightness"),
-)
+_STRIPS = ("sharpness", "contrast", "veil", "brightness")
 
 
 @figure_style()
@@ -75,13 +70,13 @@ def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
     cameras = sorted({quality.camera for quality in found})
     order = np.arange(len(found))
     flagged = np.array([quality.flagged for quality in found])
-    for axis, (name, label) in zip(axes, _STRIPS, strict=True):
+    for axis, name in zip(axes, _STRIPS, strict=True):
         values = np.array([getattr(quality, name) for quality in found])
         for camera in cameras:
             own = np.array([quality.camera == camera for quality in found])
             axis.plot(order[own], values[own], ".", markersize=4, label=camera)
         axis.plot(order[flagged], values[flagged], "o", mfc="none", mec=INKS[1], markersize=8)
-        axis.set_ylabel(label)
+        axis.set_ylabel(name)
         gone = np.isnan(values)
         if gone.any():  # an empty line without clipping has no extent, and no layout
             axis.plot(order[gone], np.zeros(gone.sum()), "x", color=INKS[1], clip_on=False)

@@ -154,10 +154,6 @@ class Pictures:
         except KeyError:
             raise WorkspaceError(f"no picture {image!r} in sparse/cameras.json") from None
 
-    def camera_of(self, image: str) -> str:
-        """The camera that took a picture."""
-        return self._cameras[image]
-
     def taken(self, image: str) -> Colour:
         """A picture as taken, (H, W, 3) BGR.
 

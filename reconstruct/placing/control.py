@@ -8,13 +8,14 @@ import numpy as np
 
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
+from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
 from reconstruct.placing.control_file import Control, KnownLength
 from reconstruct.placing.generalised_fit import Extra
-from reconstruct.placing.navigation_equations import PARAMETERS, SCALE, cross_matrices
+from reconstruct.placing.navigation_equations import PARAMETERS, SCALE
 from reconstruct.placing.picked_points import Spot
 
-_DOUBTFUL_SIGMAS = 4.0
+_CONTRADICTED_SIGMAS = 4.0
 _LEAST_SPREAD = 1e-3
 """Points this close to one line, over their length, do not say how the model is turned about it."""
 
@@ -144,7 +145,7 @@ class ControlFit:
         points = [_score_point(tie, place) for tie in self.ties] if located else []
         bars = [_score_bar(bar, place.scale) for bar in self.bars]
         for row in (*points, *bars):
-            if row["use"] == "control" and row["misfit_sigmas"] > _DOUBTFUL_SIGMAS:
+            if row["use"] == "control" and row["misfit_sigmas"] > _CONTRADICTED_SIGMAS:
                 warn(
                     f"control {row['name']} is {row['misfit_sigmas']:.1f} sigmas off the model: "
                     "check its coordinates and picks, or set use to check"

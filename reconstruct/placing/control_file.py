@@ -198,7 +198,7 @@ def _point(
     if known[2]:
         longitude, latitude = _unproject(path, line, at["epsg"], at["easting_m"], at["northing_m"])
     if known[0] and not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise WorkspaceError(f"{path} line {line}: {latitude}, {longitude} is no place on Earth")
+        raise WorkspaceError(f"{path} line {line}: {latitude}, {longitude} is not a place on Earth")
     vertical = at["sigma_vertical_m"]
     if vertical <= 0:
         raise WorkspaceError(f"{path} line {line}: sigma_vertical_m must be more than 0")

@@ -2,11 +2,11 @@
 
 The error of a channel of navigation, over its stated sigma, is taken as
 `u = sqrt(1 - w) m + sqrt(w) n`: m a first-order Gauss-Markov process of unit variance that keeps
-`exp(-dt / tau)` of itself (Uhlenbeck & Ornstein 1930), n white. Where the sigma changes, m keeps
-the lesser over the greater of the two sigmas besides: an error in metres neither grows with a sigma
-that grows (drift is added to it) nor shrinks in proportion (the errors before and after the update
-of an optimal filter covary by the variance after it). The covariance matrix K of all values is
-dense, but a scalar Kalman filter turns values into innovations, which are white: the same as a
+`exp(-dt / tau)` of itself (Uhlenbeck & Ornstein 1930), n white. Where the sigma changes, m is
+also reduced by the lesser over the greater of the two: an error in metres neither grows with a
+sigma that grows (drift is added to it) nor shrinks in proportion (the errors before and after the
+update of an optimal filter covary by the variance after it). The covariance matrix K of all values
+is dense, but a scalar Kalman filter turns values into innovations, which are white: the same as a
 multiplication by the inverse of K's Cholesky factor, in one pass (Kailath 1968).
 """
 

@@ -163,7 +163,13 @@ class _Normal(NamedTuple):
     rows: int
 
     def plus(self, other: "_Normal") -> "_Normal":
-        return _Normal(*(own + more for own, more in zip(self, other, strict=True)))
+        return _Normal(
+            self.matrix + other.matrix,
+            self.vector + other.vector,
+            self.square + other.square,
+            self.log_det + other.log_det,
+            self.rows + other.rows,
+        )
 
     def solve(self) -> tuple[Array, Array]:
         """Parameters and their covariance."""

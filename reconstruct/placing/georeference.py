@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import warn
@@ -29,7 +28,6 @@ from reconstruct.placing.navigation_equations import (
     STRETCH,
     TURN,
     Epochs,
-    NavigationEquations,
     equations,
     read_epochs,
     without_navigation,
@@ -180,7 +178,7 @@ def level(points: Array, centres: Array) -> Similarity:
 
 
 ExtraOf = Callable[[Similarity, Array], Extra]
-"""Equations besides navigation's at a placement, whose rotation acts about a point (3,)."""
+"""Equations in addition to navigation's, at a placement, whose rotation acts about a point (3,)."""
 
 
 def fit_navigation(
@@ -282,11 +280,21 @@ class _NavigationTask:
         place = self._robust(start, free)
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(found.misfit, epochs.known)
-        solved_for = [*free, *self._nuisances()]
+        bounds = self._frame_bounds()
+        solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND)]
+        if self.mount_sigma_rad > 0 and epochs.has_attitude:
+            solved_for += range(MOUNT.start, MOUNT.stop)
         for _ in range(_STEPS):
             middle = self._middle(place)
             found = equations(epochs, place, middle)
-            got = self._estimate(found, place, middle, used, solved_for)
+            got = estimate(
+                epochs.time,
+                found,
+                used,
+                solved_for,
+                self._extra(place, middle),
+                frame_bounds=bounds,
+            )
             place = _moved(place, got.change, middle)
             sigma = np.sqrt(np.diag(got.covariance))[free]
             if np.all(np.abs(got.change[free]) <= _SETTLED_SIGMAS * sigma):
@@ -295,8 +303,14 @@ class _NavigationTask:
         scaled = got
         if SCALE not in free:
             found = equations(epochs, place, middle)
-            scaled = self._estimate(
-                found, place, middle, got.used, [*solved_for, SCALE], correlation=got.correlation
+            scaled = estimate(
+                epochs.time,
+                found,
+                got.used,
+                [*solved_for, SCALE],
+                self._extra(place, middle),
+                frame_bounds=bounds,
+                correlation=got.correlation,
             )
         return self._report(place, middle, got, scaled, held=SCALE not in free)
 
@@ -326,12 +340,6 @@ class _NavigationTask:
         middle: Array = place.apply(self.epochs.centres).mean(axis=0)
         return middle
 
-    def _nuisances(self) -> list[int]:
-        found = [p for p, bound in self._frame_bounds().items() if bound > _LEAST_BOUND]
-        if self.mount_sigma_rad > 0 and self.epochs.has_attitude:
-            found += range(MOUNT.start, MOUNT.stop)
-        return found
-
     def _frame_bounds(self) -> dict[int, float]:
         """How navigation's own frame may be turned and stretched within its positions' sigmas.
 
@@ -346,25 +354,6 @@ class _NavigationTask:
         sigma = float(np.median(self.epochs.sigma[:, 0]))
         bound = sigma / radius if radius > sigma else 1.0
         return {TURN: bound, STRETCH: min(bound, _STRETCH)}
-
-    def _estimate(
-        self,
-        found: NavigationEquations,
-        place: Similarity,
-        middle: Array,
-        used: NDArray[np.bool_],
-        free: list[int],
-        correlation: Mapping[str, Correlation] | None = None,
-    ) -> Estimate:
-        return estimate(
-            self.epochs.time,
-            found,
-            used,
-            free,
-            self._extra(place, middle),
-            frame_bounds=self._frame_bounds(),
-            correlation=correlation,
-        )
 
     def _extra(self, place: Similarity, middle: Array) -> Extra:
         misfits, rows = [NO_EXTRA.misfit], [NO_EXTRA.jacobian]

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
+from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.placing.alignment import Similarity
 
@@ -200,20 +201,6 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
         misfit=np.where(epochs.known, mean_misfit / scale, np.nan),
         jacobian=np.where(epochs.known[..., None], mean_jacobian / scale[..., None], np.nan),
         sigma=epochs.sigma,
-    )
-
-
-def cross_matrices(vectors: Array) -> Array:
-    """(N, 3, 3) matrices M with `M b = a x b` for rows a."""
-    zero = np.zeros(len(vectors))
-    x, y, z = vectors.T
-    return np.stack(
-        [
-            np.stack([zero, -z, y], axis=1),
-            np.stack([z, zero, -x], axis=1),
-            np.stack([-y, x, zero], axis=1),
-        ],
-        axis=1,
     )
 
 

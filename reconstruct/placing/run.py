@@ -125,7 +125,7 @@ def run_sparse(
     lenses = read_lenses(workspace / "mapping" / "cameras.json")
     model = read_reconstruction(workspace / "mapping" / "model")
     of_name = {r.image: r for r in inputs.records}
-    refined = workspace / "mapping" / "rig.json"  # where the settings ask for it
+    refined = workspace / "mapping" / "rig.json"  # where the settings refine it
     rig = read_rig(refined) if refined.is_file() else inputs.rig
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()

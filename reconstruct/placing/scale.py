@@ -94,7 +94,7 @@ def find_point(token: str, model: SparseModel, pictures: Pictures) -> Array:
         except ValueError:
             point = np.zeros(0)
         if point.shape != (3,) or not np.isfinite(point).all():
-            raise ReconstructionError(f"{token!r} is no point x,y,z")
+            raise ReconstructionError(f"{token!r} is not a point x,y,z")
         return point
     picks = [_read_pick(pick, model, pictures) for pick in token.split("+")]
     if len(picks) == 1:
@@ -112,7 +112,7 @@ def _read_pick(text: str, model: SparseModel, pictures: Pictures) -> tuple[View,
     except ValueError:
         pixel = None
     if pixel is None:
-        raise ReconstructionError(f"{text!r} is no spot IMAGE:x,y")
+        raise ReconstructionError(f"{text!r} is not a spot IMAGE:x,y")
     view = next((v for v in model.views if v.image == name), None)
     if view is None:
         raise ReconstructionError(f"{text!r}: no picture {name} is in the model")

@@ -21,11 +21,11 @@ from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
-from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.arrays import cross_matrices, observed
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.navigation_equations import attitude_axes, cross_matrices
+from reconstruct.placing.navigation_equations import attitude_axes
 from reconstruct.views.lens import Lens
 from reconstruct.views.model import WorldFrame
 

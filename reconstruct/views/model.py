@@ -1,6 +1,6 @@
 """The sparse model as the later stages see it: views through ideal pinholes, and points."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -117,7 +117,7 @@ def write_frame(path: Path, frame: WorldFrame) -> None:
     datum = frame.datum
     FrameRecord(
         name=frame.name,
-        datum=None if datum is None else _place(datum),
+        datum=None if datum is None else PlaceRecord(**asdict(datum)),
         scaled=frame.scaled,
         vertical_datum=frame.vertical_datum,
         notes=frame.notes,
@@ -137,12 +137,6 @@ def read_frame(path: Path) -> WorldFrame:
         scaled=stored.scaled,
         vertical_datum=stored.vertical_datum,
         notes=stored.notes,
-    )
-
-
-def _place(datum: Datum) -> PlaceRecord:
-    return PlaceRecord(
-        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
     )
 
 

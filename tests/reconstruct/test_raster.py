@@ -118,7 +118,7 @@ def test_preview_is_white_where_nothing_is_known(tmp_path):
 
 def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:
     path = tmp_path / "dem.tif"
-    with pytest.raises(WorkspaceError, match="no such file"), opened_raster(path):
+    with pytest.raises(WorkspaceError, match=r"\.tif"), opened_raster(path):
         pass
     with tiled_raster(path, GRID, FRAME, "float32", float("nan"), "height") as raster:
         raster.write(heights(), 1)

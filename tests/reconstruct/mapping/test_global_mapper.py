@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL, local_executor
 from reconstruct.mapping.database import Observations
+from reconstruct.mapping.global_mapper import average_poses, station_groups
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
-from reconstruct.mapping.pose_graph import average_poses, station_groups
 from reconstruct.mapping.stations import StationLink, link_stations, stereo_points
 from tests.reconstruct.mapping.test_mapper import camera_rms, seen_by_pinholes
 from tests.reconstruct.scenes import Scene, make_scene
@@ -64,7 +64,7 @@ def ring(
 
 def linked(a: int, b: int, pose: RigidTransform) -> StationLink:
     return StationLink(
-        first=a, second=b, second_from_first=pose, inliers=100, share=0.9,
+        first=a, second=b, second_from_first=pose, inliers=100,
         turn_variance=1e-6, shift_variance=4e-6,
     )  # fmt: skip
 
@@ -104,7 +104,7 @@ def test_groups_without_a_link_stay_apart() -> None:
     links, _ = ring(np.random.default_rng(3))
     far = linked(40, 41, RigidTransform.identity())
     assert station_groups([*links, far]) == [list(range(12)), [40, 41]]
-    with pytest.raises(ValueError, match="more than one group"):
+    with pytest.raises(ValueError):
         average_poses([*links, far])
 
 

@@ -3,10 +3,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from reconstruct.mapping.link_refinement import RigSight, refine_link
+from reconstruct.mapping.stations import RigPinholes, refine_link
 
 FOCAL = 1130.0
-SIGHT = RigSight(
+PINHOLES = RigPinholes(
     focal_px=np.full((2, 2), FOCAL),
     centre_px=np.array([[423.0, 338.0], [421.0, 340.0]]),
     turn=np.stack([np.eye(3), Rotation.from_euler("y", 1.0, degrees=True).as_matrix()]),
@@ -24,7 +24,7 @@ def stereo(points: np.ndarray, pixels: list[np.ndarray]) -> np.ndarray:
     def miss(flat: np.ndarray) -> np.ndarray:
         at = flat.reshape(-1, 3)
         return np.concatenate(
-            [(SIGHT.see(at, k)[0] - p).ravel() for k, p in zip(both, pixels, strict=True)]
+            [(PINHOLES.see(at, k)[0] - p).ravel() for k, p in zip(both, pixels, strict=True)]
         )
 
     pattern = np.kron(np.ones((2, 1)), np.kron(np.eye(len(points)), np.ones((2, 3))))
@@ -37,10 +37,10 @@ def station_pair(
     """Points by stereo, pixels of the second station, its cameras, and the true points."""
     rng = np.random.default_rng(seed)
     true = rng.uniform([-0.6, -0.2, 1.85], [0.6, 0.6, 2.15], (count, 3))
-    seen = [SIGHT.see(true, np.full(count, k))[0] for k in (0, 1)]
+    seen = [PINHOLES.see(true, np.full(count, k))[0] for k in (0, 1)]
     points = stereo(true, [s + rng.normal(0, noise_px, s.shape) for s in seen])
     camera = rng.integers(0, 2, count)
-    pixels = SIGHT.see(TRUE.apply(true), camera)[0] + rng.normal(0, noise_px, (count, 2))
+    pixels = PINHOLES.see(TRUE.apply(true), camera)[0] + rng.normal(0, noise_px, (count, 2))
     return points, pixels, camera, true
 
 
@@ -53,16 +53,18 @@ def start() -> RigidTransform:
 def test_slopes_are_those_of_the_pixels() -> None:
     points = np.array([[0.2, -0.3, 2.0], [-0.1, 0.4, 1.7]])
     camera = np.array([0, 1])
-    _, slopes = SIGHT.see(points, camera)
+    _, slopes = PINHOLES.see(points, camera)
     for axis in range(3):
         step = 1e-6 * np.eye(3)[axis]
-        change = (SIGHT.see(points + step, camera)[0] - SIGHT.see(points - step, camera)[0]) / 2e-6
+        change = (
+            PINHOLES.see(points + step, camera)[0] - PINHOLES.see(points - step, camera)[0]
+        ) / 2e-6
         np.testing.assert_allclose(slopes[:, :, axis], change, rtol=1e-6, atol=1e-4)
 
 
 def test_exact_pixels_give_the_exact_pose() -> None:
     points, pixels, camera, _ = station_pair(1, noise_px=0.0)
-    found = refine_link(points, pixels, camera, SIGHT, start())
+    found = refine_link(points, pixels, camera, PINHOLES, start())
     assert found is not None
     np.testing.assert_allclose(found[0].translation, TRUE.translation, atol=1e-8)
     assert (found[0].rotation * TRUE.rotation.inv()).magnitude() < 1e-8
@@ -71,20 +73,20 @@ def test_exact_pixels_give_the_exact_pose() -> None:
 def test_it_is_the_adjustment_of_pose_and_points_together() -> None:
     """Against a plain least squares over all unknowns; weights hardly matter without outliers."""
     points, pixels, camera, _ = station_pair(2, count=60)
-    roots = np.linalg.cholesky(SIGHT.information(points)).swapaxes(1, 2)
+    roots = np.linalg.cholesky(PINHOLES.information(points)).swapaxes(1, 2)
 
     def miss(flat: np.ndarray) -> np.ndarray:
         pose = RigidTransform.from_components(flat[3:6], Rotation.from_rotvec(flat[:3]))
         at = flat[6:].reshape(-1, 3)
         held = np.einsum("nij,nj->ni", roots, at - points)
         return np.concatenate(
-            [(SIGHT.see(pose.apply(at), camera)[0] - pixels).ravel(), held.ravel()]
+            [(PINHOLES.see(pose.apply(at), camera)[0] - pixels).ravel(), held.ravel()]
         )
 
     guess = start()
     first = np.concatenate([guess.rotation.as_rotvec(), guess.translation, points.ravel()])
     oracle = least_squares(miss, first).x
-    found = refine_link(points, pixels, camera, SIGHT, guess)
+    found = refine_link(points, pixels, camera, PINHOLES, guess)
     assert found is not None
     pose, covariance = found
     sigma = np.sqrt(np.diag(covariance))
@@ -98,7 +100,7 @@ def test_noise_of_stereo_does_not_shorten_the_way_between_stations() -> None:
     lengths, pulls = [], []
     for seed in range(12):
         points, pixels, camera, _ = station_pair(seed)
-        found = refine_link(points, pixels, camera, SIGHT, start())
+        found = refine_link(points, pixels, camera, PINHOLES, start())
         assert found is not None
         pose, covariance = found
         lengths.append(np.linalg.norm(pose.translation) / np.linalg.norm(TRUE.translation))
@@ -111,9 +113,9 @@ def test_noise_of_stereo_does_not_shorten_the_way_between_stations() -> None:
 
 def test_wrong_matches_are_left_aside() -> None:
     points, pixels, camera, _ = station_pair(3)
-    clean = refine_link(points, pixels, camera, SIGHT, start())
+    clean = refine_link(points, pixels, camera, PINHOLES, start())
     pixels[::5] += np.random.default_rng(1).uniform(20, 200, pixels[::5].shape)
-    spoiled = refine_link(points, pixels, camera, SIGHT, start())
+    spoiled = refine_link(points, pixels, camera, PINHOLES, start())
     assert clean is not None
     assert spoiled is not None
     sigma = np.sqrt(np.diag(clean[1])[3:])
@@ -122,5 +124,5 @@ def test_wrong_matches_are_left_aside() -> None:
 
 def test_a_few_points_in_one_spot_determine_nothing() -> None:
     points = np.tile([[0.1, 0.1, 2.0]], (20, 1))
-    pixels = SIGHT.see(TRUE.apply(points), np.zeros(20, int))[0]
-    assert refine_link(points, pixels, np.zeros(20, int), SIGHT, TRUE) is None
+    pixels = PINHOLES.see(TRUE.apply(points), np.zeros(20, int))[0]
+    assert refine_link(points, pixels, np.zeros(20, int), PINHOLES, TRUE) is None

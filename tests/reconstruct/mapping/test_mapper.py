@@ -5,20 +5,25 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
-from reconstruct.mapping.database import Observations
+from reconstruct.mapping.database import Observations, rigid3d, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
     Method,
+    _options,
     as_transform,
     collapsed_frames,
     map_calibrated,
+    merge_models,
     model_baseline,
+    report_left_out,
     scale_model,
+    second_from_first,
 )
-from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
+from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
+from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
 from reconstruct.matching.matches import as_seen
 from reconstruct.placing.alignment import align_rigid, align_similarity
@@ -119,15 +124,6 @@ def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
         assert (focal, cx, cy) == (expected.focal_px, expected.cx_px, expected.cy_px)
 
 
-def test_mapping_twice_gives_the_same_bytes(tmp_path: Path) -> None:
-    scene = make_scene(lines=1, stations=5, points=3000, noise_px=0.3)
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        mapped_scene(scene).model.write_binary(tmp_path / name)
-    for file in sorted((tmp_path / "a").iterdir()):
-        assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
-
-
 def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
     """In plain air, with tilted views: what comes out must be what went in."""
     rng = np.random.default_rng(2)
@@ -220,7 +216,7 @@ def collapse(model: pycolmap.Reconstruction, frame: int, onto: int) -> None:
             point.xyz = centre
 
 
-def test_a_station_that_collapsed_onto_another_is_registered_anew(
+def test_a_station_that_collapsed_onto_another_is_registered_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As COLMAP's adjustment of a first pair of arbitrary scale leaves it now and then."""
@@ -271,7 +267,7 @@ def strip() -> tuple[Scene, Mapped]:
     return scene, mapped_scene(scene)
 
 
-def test_navigation_tells_where_pinholes_were() -> None:
+def test_pinholes_follow_from_navigation() -> None:
     scene, mapped = strip()
     positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
     true = np.stack(
@@ -310,3 +306,64 @@ def test_positions_that_contradict_the_pictures_are_not_used() -> None:
     assert model_baseline(refined.model) == pytest.approx(0.1, rel=1e-9)
     few = np.where(np.arange(60)[:, None] < 6, positions, np.nan)
     assert refine_with_positions(mapped, scene.records, few, sigmas) is mapped
+
+
+def part(model: pycolmap.Reconstruction, keep: set[int]) -> pycolmap.Reconstruction:
+    """A model of some frames only."""
+    found = pycolmap.Reconstruction(model)
+    for frame in sorted(set(found.reg_frame_ids()) - keep):
+        found.deregister_frame(frame)
+    return found
+
+
+def test_models_that_share_stations_become_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = make_scene(lines=1, stations=9, points=5500, noise_px=0.2)
+    mapped = mapped_scene(scene)
+    move = RigidTransform.from_components([3.0, -2.0, 1.0], Rotation.from_rotvec([0.3, -1.0, 0.4]))
+    first = part(mapped.model, {1, 2, 3, 4, 5, 6})
+    second = part(mapped.model, {6, 7, 8, 9})
+    second.transform(pycolmap.Sim3d(1.0, rigid3d(move).rotation, move.translation))
+    found = second_from_first(first, second)
+    assert found is not None
+    np.testing.assert_allclose(found.as_matrix(), move.as_matrix(), atol=1e-9)
+
+    seen, lenses = seen_by_pinholes(scene)
+    rig = {n: lenses[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+    write_database(tmp_path / "d.db", seen, rig)
+    joined = merge_models([first, second], tmp_path / "d.db", _options(rig, 1, "nothing"))
+    assert [m.num_reg_images() for m in joined] == [18]
+    whole = [
+        as_transform(m.frames[9].rig_from_world) * as_transform(m.frames[1].rig_from_world).inv()
+        for m in (mapped.model, joined[0])
+    ]
+    error = whole[0] * whole[1].inv()
+    assert error.rotation.magnitude() < 2e-3
+    assert np.linalg.norm(error.translation) < 5e-3
+
+    alone = part(mapped.model, {7, 8, 9})
+    first = part(mapped.model, {1, 2, 3})
+    assert second_from_first(first, alone) is None
+    assert len(merge_models([first, alone], tmp_path / "d.db", _options(rig, 1, "nothing"))) == 2
+    notes = report_left_out([first, alone])
+    assert len(notes) == 1
+    assert notes[0].startswith("6 pictures")
+    assert "left/000006.png" in notes[0]
+    assert notes[0] in capsys.readouterr().err
+    assert report_left_out([first]) == report_left_out([]) == []
+
+
+def test_vague_positions_do_not_spoil_a_model_of_precise_pixels() -> None:
+    """COLMAP takes pixels to have unit sigma: of 0.05 px they would count 400 times too little."""
+    scene = make_scene(lines=2, stations=5, points=6000, noise_px=0.05, seed=8)
+    mapped = adjust_freely(mapped_scene(scene))
+    assert 0.8 * 0.05 < pixel_sigma(mapped.model) < 1.4 * 0.05
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    station = np.array([r.station for r in scene.records])
+    noise = np.random.default_rng(1).normal(0, 0.1, (station.max() + 1, 3))[station]
+    vague = np.full_like(sigmas, 0.1)
+    refined = refine_with_positions(mapped, scene.records, positions + noise, vague)
+    assert refined is not mapped
+    free = camera_rms(mapped, scene)
+    assert 0.5 * free < camera_rms(refined, scene) < 1.3 * free

@@ -9,9 +9,8 @@ import pycolmap
 import pytest
 
 from alice_survey.base.frames import Array
-from reconstruct.mapping.bundle import adjust_freely
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.priors import NavigationAdjuster
+from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift

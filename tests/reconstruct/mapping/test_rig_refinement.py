@@ -13,19 +13,20 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
-from camera_calib.freedom import value
+from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig, read_rig
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.rig_refinement import NavigationFixes, RigFit, fit_rig
-from reconstruct.mapping.survey_rig import (
+from reconstruct.mapping.rig_refinement import (
+    NavigationFixes,
     RefinedSurvey,
+    RigFit,
+    fit_rig,
     frees_rig,
     on_rig,
-    refine_as_set,
     refine_rig,
 )
 from reconstruct.mapping.working_range import WorkingDistances
@@ -36,6 +37,8 @@ from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_
 
 NOISE_PX = 0.3
 TURN_SIGMA = 3e-4
+PORT = ReconstructConfig(refine_port=True, refine_rig="off")
+RIG = ReconstructConfig(refine_rig="on")
 
 
 @cache
@@ -63,6 +66,19 @@ def nearer(rig: Rig, by_m: float) -> Rig:
         for name, c in rig.cameras.items()
     }
     return replace(rig, cameras=cameras)
+
+
+def right_turned(rig: Rig, turn_rad: float, sigmas: list[float]) -> Rig:
+    """A rig whose right camera is turned about y, and whose pose a calibration knows this well."""
+    pose = rig.cam_from_rig["right"]
+    turned = Rotation.from_rotvec([0.0, turn_rad, 0.0]) * pose.rotation
+    right = RigidTransform.from_components(pose.translation, turned)
+    names = tuple(f"right.{name}" for name in POSE)
+    return replace(
+        rig,
+        covariance=Covariance(parameters=names, matrix=np.diag(sigmas) ** 2),
+        cam_from_rig={**rig.cam_from_rig, "right": right},
+    )
 
 
 def errors_in_sigmas(fit: RigFit, true: Rig) -> np.ndarray:
@@ -174,16 +190,15 @@ def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
     np.testing.assert_allclose(fit.rig.body_from_rig.inv().translation, fit.after[-3:], atol=1e-12)
 
 
-def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
+def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     scene = noisy(6)
     wrong = nearer(scene.rig, 0.01)
     mapped, seen = modelled(scene, wrong, tmp_path)
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, DATUM)
     mapped = adjust(mapped)
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
-    found = refine_rig(
-        mapped, seen, wrong, distances, adjust, DATUM, tmp_path, port=True, pose=False
-    )
+    found = refine_rig(mapped, seen, wrong, distances, adjust, DATUM, tmp_path, PORT)
+    assert isinstance(found, RefinedSurvey)
     refined = found.mapped
     assert found.convergence.settled
     assert found.adjust.sigmas is not None
@@ -212,22 +227,15 @@ def test_points_that_took_no_part_move_along(
     rng = np.random.default_rng(8)
     pixels = [p + rng.normal(0, 0.05, p.shape) for p in clean().pixels]
     scene = replace(clean(), pixels=pixels)
-    turned = Rotation.from_rotvec([0.0, 6e-4, 0.0])
-    pose = scene.rig.cam_from_rig["right"]
-    right = RigidTransform.from_components(pose.translation, turned * pose.rotation)
-    names = ("right.rx_rad", "right.ry_rad", "right.rz_rad", "right.x_m", "right.y_m", "right.z_m")
-    known = Covariance(parameters=names, matrix=np.diag([4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4]) ** 2)
-    cam_from_rig = {**scene.rig.cam_from_rig, "right": right}
-    wrong = replace(scene.rig, covariance=known, cam_from_rig=cam_from_rig)
+    wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
     mapped, seen = modelled(scene, wrong, tmp_path)
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     models = []
     for most in (200_000, mapped.model.compute_num_observations() // 4):
-        monkeypatch.setattr("reconstruct.mapping.exact_sights._MOST_OBSERVATIONS", most)
-        found = refine_rig(
-            mapped, seen, wrong, distances, adjust, None, tmp_path, port=False, pose=True
-        )
+        monkeypatch.setattr("reconstruct.mapping.exact_observations._MOST_OBSERVATIONS", most)
+        found = refine_rig(mapped, seen, wrong, distances, adjust, None, tmp_path, RIG)
+        assert isinstance(found, RefinedSurvey)
         before = mapped.model.compute_num_observations()
         assert found.convergence.removed < 0.01 * before
         models.append(found.mapped.model)
@@ -237,25 +245,14 @@ def test_points_that_took_no_part_move_along(
 
 def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path) -> None:
     scene = noisy(6)
-    names = ("right.rx_rad", "right.ry_rad", "right.rz_rad", "right.x_m", "right.y_m", "right.z_m")
-    sigmas = np.array([*[TURN_SIGMA] * 3, 1e-5, 1e-4, 1e-4])
-    known = Covariance(parameters=names, matrix=np.diag(sigmas**2))
-    turned = Rotation.from_rotvec([0.0, 1.5 * TURN_SIGMA, 0.0])
-    pose = scene.rig.cam_from_rig["right"]
-    wrong = replace(
-        scene.rig,
-        covariance=known,
-        cam_from_rig={
-            **scene.rig.cam_from_rig,
-            "right": RigidTransform.from_components(pose.translation, turned * pose.rotation),
-        },
-    )
+    sigmas = [*[TURN_SIGMA] * 3, 1e-5, 1e-4, 1e-4]
+    wrong = right_turned(scene.rig, 1.5 * TURN_SIGMA, sigmas)
     mapped, seen = modelled(scene, wrong, tmp_path)
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
 
     def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> RefinedSurvey | str:
-        return refine_as_set(
+        return refine_rig(
             model, seen, rig, distances, adjust, None, tmp_path, ReconstructConfig(**settings)
         )
 
@@ -319,16 +316,10 @@ def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
         )
 
 
-def test_too_little_is_refused(tmp_path: Path) -> None:
+def test_one_camera_is_refused(tmp_path: Path) -> None:
     scene = noisy(0)
     mapped, seen = modelled(scene, scene.rig, tmp_path)
-    for point in sorted(mapped.model.points3D)[12:]:
-        mapped.model.delete_point3D(point)
-    with pytest.raises(ReconstructionError, match="12 points"):
-        fit_rig(mapped, seen, scene.rig, port=True, pose=True)
     adjust = NavigationAdjuster(scene.records, scene.rig, mapped.lenses, None)
+    alone = replace(mapped, scaled=False)
     with pytest.raises(ReconstructionError, match="two cameras"):
-        refine_rig(
-            replace(mapped, scaled=False), seen, scene.rig, None, adjust, None, tmp_path,
-            port=True, pose=False,
-        )  # fmt: skip
+        refine_rig(alone, seen, scene.rig, None, adjust, None, tmp_path, PORT)

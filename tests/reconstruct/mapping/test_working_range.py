@@ -26,7 +26,7 @@ def features_of(scene: Scene, folder: Path) -> list[Path]:
     return paths
 
 
-def test_stereo_matches_tell_the_distance(tmp_path: Path) -> None:
+def test_stereo_matches_give_the_distance(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
     paths = features_of(scene, tmp_path)
     found = find_distances(

@@ -49,15 +49,6 @@ def test_mirrored_picture_has_mirrored_keypoints() -> None:
     assert np.abs(offset.mean(axis=0)).max() < 0.05
 
 
-def test_masked_parts_get_no_features() -> None:
-    centres = np.array([[40.0, 60.0], [120.0, 60.0]])
-    mask = np.ones((120, 160), bool)
-    mask[:, 80:] = False
-    found = find_features(blobs(centres), mask, scale=1.0, most=100)
-    assert len(found.pixels) > 0
-    assert found.pixels[:, 0].max() < 80
-
-
 def test_features_keep_away_from_the_border_of_a_mask() -> None:
     """The mask's own edge, such as that of a gripper, must not become part of a feature."""
     sigma = 4.0

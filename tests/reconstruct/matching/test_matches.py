@@ -6,13 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alice_survey.base.frames import Array
 from reconstruct.matching import matches as matching
 from reconstruct.matching.features import Features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
     apply_homography,
-    camera_from_text,
-    camera_text,
     coarse_matches,
     fit_homography,
     match_descriptors,
@@ -60,29 +59,40 @@ def test_too_few_descriptors_give_no_match(n: int, m: int) -> None:
     ).shape == (0, 2)
 
 
+def pair_task(folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, Array]) -> PairTask:
+    """Two pictures of one camera with features (pixels and descriptors) saved in a folder."""
+    paths = [folder / "a.npz", folder / "b.npz"]
+    for path, (pixels, descriptors) in zip(paths, sides, strict=True):
+        features = Features(
+            pixels=pixels,
+            scale_px=np.ones(len(pixels), np.float32),
+            descriptors=np.clip(descriptors, 0, 255).astype(np.uint8),
+        )
+        save_features(path, features)
+    fields = camera.todict()
+    return PairTask(first=paths[0], second=paths[1], ratio=0.8, cameras=(fields, fields), seed=3)
+
+
+def pinhole(width: int, height: int, focal_px: float) -> pycolmap.Camera:
+    return pycolmap.Camera(
+        model="PINHOLE",
+        width=width,
+        height=height,
+        params=[focal_px, focal_px, width / 2, height / 2],
+        has_prior_focal_length=True,
+    )
+
+
 def two_views(tmp_path: Path, outliers: int) -> tuple[PairTask, int]:
     """Features of 120 points seen by two cameras, and wrong ones with equal descriptors."""
     rng = np.random.default_rng(2)
-    camera = pycolmap.Camera(
-        model="PINHOLE", width=800, height=600, params=[900, 900, 400, 300],
-        has_prior_focal_length=True,
-    )  # fmt: skip
+    camera = pinhole(800, 600, 900)
     points = np.column_stack([rng.uniform(-0.7, 0.7, (120, 2)), rng.uniform(2.2, 2.8, 120)])
     first, second = camera.img_from_cam(points), camera.img_from_cam(points - [0.3, 0.05, 0.1])
     wrong = rng.uniform(0, 600, (2, outliers, 2))
-    descriptors = rng.integers(0, 90, (120 + outliers, 128)).astype(np.uint8)
-    for name, pixels in (("a", [first, wrong[0]]), ("b", [second, wrong[1]])):
-        features = Features(
-            pixels=np.concatenate(pixels),
-            scale_px=np.ones(120 + outliers, np.float32),
-            descriptors=descriptors,
-        )
-        save_features(tmp_path / f"{name}.npz", features)
-    text = camera_text(camera)
-    task = PairTask(
-        first=tmp_path / "a.npz", second=tmp_path / "b.npz", ratio=0.8, cameras=(text, text), seed=3
-    )
-    return task, 120
+    descriptors = rng.integers(0, 90, (120 + outliers, 128))
+    sides = [np.concatenate([p, w]) for p, w in zip((first, second), wrong, strict=True)]
+    return pair_task(tmp_path, camera, *((side, descriptors) for side in sides)), 120
 
 
 def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> None:
@@ -98,35 +108,13 @@ def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> Non
 
 def test_pictures_without_a_common_spot_share_nothing(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
-    for name in ("c", "d"):
-        features = Features(
-            pixels=rng.uniform(0, 600, (200, 2)),
-            scale_px=np.ones(200, np.float32),
-            descriptors=rng.integers(0, 90, (200, 128)).astype(np.uint8),
-        )
-        save_features(tmp_path / f"{name}.npz", features)
-    text = "PINHOLE 800 600 1 900.0 900.0 400.0 300.0"
-    task = PairTask(
-        first=tmp_path / "c.npz", second=tmp_path / "d.npz", ratio=0.8, cameras=(text, text)
-    )
+    sides = [(rng.uniform(0, 600, (200, 2)), rng.integers(0, 90, (200, 128))) for _ in "ab"]
+    task = pair_task(tmp_path, pinhole(800, 600, 900), *sides)
     assert coarse_matches(task) < 10
     assert match_pair(task).geometry is None
 
 
-def test_a_camera_survives_text() -> None:
-    camera = pycolmap.Camera(
-        model="OPENCV",
-        width=800,
-        height=600,
-        params=[900.123456789, 901, 400, 300, 0.1, -0.2, 0, 1e-9],
-    )
-    again = camera_from_text(camera_text(camera))
-    assert again.model == camera.model
-    np.testing.assert_array_equal(again.params, camera.params)
-    assert again.has_prior_focal_length == camera.has_prior_focal_length
-
-
-def test_features_written_anew_are_read_anew(tmp_path: Path) -> None:
+def test_features_written_again_are_read_again(tmp_path: Path) -> None:
     """One process may map a workspace twice with other settings."""
     task, _ = two_views(tmp_path, outliers=0)
     many = match_pair(task)
@@ -193,27 +181,15 @@ def test_homographies_come_back_from_exact_matches() -> None:
 def repeated_texture(tmp_path: Path, alike: int) -> tuple[PairTask, int]:
     """3000 true points, of which `alike` have a double elsewhere that looks the same to a few."""
     rng = np.random.default_rng(11)
-    camera = pycolmap.Camera(
-        model="PINHOLE", width=3000, height=2400, params=[3000, 3000, 1500, 1200],
-        has_prior_focal_length=True,
-    )  # fmt: skip
+    camera = pinhole(3000, 2400, 3000)
     points = np.column_stack([rng.uniform(-0.8, 0.8, (3000, 2)), rng.uniform(1.9, 2.1, 3000)])
     first, second = camera.img_from_cam(points), camera.img_from_cam(points - [0.3, 0.05, 0.0])
     descriptors = rng.integers(0, 90, (3000, 128)).astype(np.int64)
     doubles = rng.permutation(np.arange(1500, 3000))[:alike]
     descriptors[doubles[: alike // 2]] = descriptors[doubles[alike // 2 :]]
-    for name, pixels in (("a", first), ("b", second)):
-        noise = rng.integers(-4, 5, descriptors.shape)
-        features = Features(
-            pixels=pixels,
-            scale_px=np.ones(3000, np.float32),
-            descriptors=np.clip(descriptors + noise, 0, 255).astype(np.uint8),
-        )
-        save_features(tmp_path / f"{name}.npz", features)
-    text = camera_text(camera)
-    return PairTask(
-        first=tmp_path / "a.npz", second=tmp_path / "b.npz", ratio=0.8, cameras=(text, text)
-    ), 3000
+    noise = rng.integers(-4, 5, (2, *descriptors.shape))
+    sides = [(p, descriptors + n) for p, n in zip((first, second), noise, strict=True)]
+    return pair_task(tmp_path, camera, *sides), 3000
 
 
 def test_prediction_finds_what_looks_alike_and_loses_nothing(

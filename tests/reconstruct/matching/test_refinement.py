@@ -164,17 +164,16 @@ def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> N
     found = refine_tracks(
         features, greys, [(0, 1, same), (1, 2, same)], executor=local_executor(threads)
     )
-    assert found.tracked == 100
-    assert found.moved >= 95
+    assert sum((a != b).any(axis=1).sum() for a, b in zip(found, first_guess, strict=True)) >= 95
     spot = [
         (pixels[:50] - shift) @ np.linalg.inv(affine).T
-        for pixels, (affine, shift) in zip(found.pixels, views, strict=True)
+        for pixels, (affine, shift) in zip(found, views, strict=True)
     ]
-    np.testing.assert_array_equal(found.pixels[1], first_guess[1])  # the reference of all
+    np.testing.assert_array_equal(found[1], first_guess[1])  # the reference of all
     for k in (0, 2):
         gap = np.linalg.norm(spot[k] - spot[1], axis=1)
         assert np.median(gap) < 0.05
-        np.testing.assert_array_equal(found.pixels[k][50], [70.0, 60.0])
+        np.testing.assert_array_equal(found[k][50], [70.0, 60.0])
 
 
 def test_what_noise_hides_is_aligned_on_smaller_pictures() -> None:

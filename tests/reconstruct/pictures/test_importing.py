@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, ImageError, WorkspaceError
 from alice_survey.base.executor import local_executor
 from alice_survey.base.manifest import read_manifest
-from alice_survey.cli.main import app
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images
@@ -63,6 +61,22 @@ def draw() -> Draw:
         return path
 
     return one
+
+
+@pytest.fixture
+def several(tmp_path: Path, draw: Draw) -> Callable[..., Path]:
+    """Write pictures `in/0.jpg` and on; with dates, they are of 12:00:00 and the seconds after."""
+
+    def write(count: int, *, dated: bool = False, suffix: str = ".jpg") -> Path:
+        for number in range(count):
+            time = f"2024:07:01 12:00:0{number}" if dated else None
+            draw(tmp_path / "in" / f"{number}{suffix}", number, time=time)
+        return tmp_path / "in"
+
+    return write
+
+
+Several = Callable[..., Path]
 
 
 def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw: Draw) -> None:
@@ -116,20 +130,6 @@ def test_a_divers_folder_is_counted_by_kind_and_reason(
     assert not again.changed and replace(again, changed=True) == found
 
 
-def test_the_command_says_what_came_in(tmp_path: Path, draw: Draw) -> None:
-    for number in range(3):
-        draw(tmp_path / "in" / f"{number}.jpg", number)
-    (tmp_path / "in" / "dive.mp4").write_bytes(b"x")
-
-    done = CliRunner().invoke(
-        app, ["import-images", str(tmp_path / "in"), "-w", str(tmp_path / "w")]
-    )
-
-    assert done.exit_code == 0
-    assert "3 pictures (3 JPEG), 0 with a position" in done.stdout
-    assert "left out: 1 video" in done.stdout
-
-
 def test_a_folder_without_pictures_names_what_it_holds(tmp_path: Path, draw: Draw) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.HEIC").write_bytes(b"x")
@@ -139,14 +139,13 @@ def test_a_folder_without_pictures_names_what_it_holds(tmp_path: Path, draw: Dra
     assert "1 HEIC" in str(caught.value) and "dive1" in str(caught.value)
 
 
-def test_one_folder_does_not_serve_twice(tmp_path: Path, draw: Draw) -> None:
-    for number in range(3):
-        draw(tmp_path / "in" / f"{number}.jpg", number)
+def test_one_folder_does_not_serve_twice(tmp_path: Path, several: Several) -> None:
+    several(3)
     (tmp_path / "link").symlink_to(tmp_path / "in")
     pair = {"left": tmp_path / "in", "right": tmp_path / "link"}
     with pytest.raises(ImageError, match="--right"):
         import_images(tmp_path / "w", [], **pair)
-    with pytest.raises(ImageError, match="twice"):
+    with pytest.raises(ImageError):
         import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "in"])
 
 
@@ -279,10 +278,9 @@ def test_navigation_is_tied_by_time_zone_and_clock_offset(
     [(None, "sea surface, as in the navigation log"), (" NN2000 (tide) ", "NN2000 (tide)")],
 )
 def test_the_level_of_logged_depths_is_stated(
-    tmp_path: Path, draw: Draw, given: str | None, stated: str
+    tmp_path: Path, several: Several, given: str | None, stated: str
 ) -> None:
-    for number in range(2):
-        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
+    several(2, dated=True)
     rows = [[f"2024-07-01T12:00:{s:02d}Z", 60, 5.0, 10 + s] for s in range(5)]
     nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
     import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav, vertical_datum=given)
@@ -293,18 +291,17 @@ def test_the_level_of_logged_depths_is_stated(
     assert [r.depth_m for r in records] == pytest.approx([10.0, 11.0])
 
 
-def test_masks_come_along(tmp_path: Path, draw: Draw) -> None:
-    for number in range(3):
-        draw(tmp_path / "in" / f"{number}.png", number)
-    beside, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
-    beside[:10] = 0
+def test_masks_come_along(tmp_path: Path, several: Several) -> None:
+    several(3, suffix=".png")
+    near, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
+    near[:10] = 0
     apart[:, 32:] = 7
-    cv2.imwrite(str(tmp_path / "in" / "1_mask.png"), beside)
+    cv2.imwrite(str(tmp_path / "in" / "1_mask.png"), near)
     import_images(tmp_path / "w", [tmp_path / "in"])
     images = tmp_path / "w" / "images"
     records = read_manifest(images / "manifest.csv")
     assert [bool(r.mask) for r in records] == [False, True, False]
-    np.testing.assert_array_equal(cv2.imread(str(images / records[1].mask), 0), beside)
+    np.testing.assert_array_equal(cv2.imread(str(images / records[1].mask), 0), near)
     (tmp_path / "masks").mkdir()
     cv2.imwrite(str(tmp_path / "masks" / "2.png"), apart)
     import_images(tmp_path / "w", [tmp_path / "in"], masks=tmp_path / "masks")
@@ -373,23 +370,23 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
     )  # fmt: skip
     w, three = tmp_path / "w", tmp_path / "three"
     faults: list[tuple[list[Path], dict[str, object], str]] = [
-        ([tmp_path / "empty"], {}, "empty: holds no pictures"),
-        ([tmp_path / "one"], {}, "1 usable picture: a model needs"),
-        ([tmp_path / "sizes"], {}, "2.jpg has 64 x 49 pixels, but 0.jpg .* 64 x 48"),
-        ([tmp_path / "absent"], {}, "absent: no such file or folder"),
-        ([tmp_path / "nav.csv"], {}, "nav.csv: cannot be read"),
-        ([], {}, "give folders of pictures"),
-        ([three], {"left": three, "right": three}, "one of them"),
-        ([], {"left": three}, "need both --left and --right"),
+        ([tmp_path / "empty"], {}, "empty"),
+        ([tmp_path / "one"], {}, "1 usable picture"),
+        ([tmp_path / "sizes"], {}, "64 x 49 .* 64 x 48"),
+        ([tmp_path / "absent"], {}, "absent"),
+        ([tmp_path / "nav.csv"], {}, "nav.csv"),
+        ([], {}, "--left and --right"),
+        ([three], {"left": three, "right": three}, "--left and --right"),
+        ([], {"left": three}, "--left and --right"),
         ([], {"left": three, "right": tmp_path / "one"}, "3 pictures in .* but 1 in"),
-        ([], {"video": tmp_path / "no.mp4"}, "no video that can be read"),
-        ([], {"video": tmp_path / "no.mp4", "every_s": 0.0}, "must be more than 0"),
-        ([three], {"navigation": nav}, "no picture carries a time"),
-        ([three], {"time_zone": "Nowhere"}, "time-zone 'Nowhere'"),
-        ([three], {"clock_offset_s": float("nan")}, "clock-offset nan"),
-        ([three], {"vertical_datum": "LAT"}, "'LAT' names the level .* give --navigation too"),
-        ([three], {"navigation": nav, "vertical_datum": " "}, "not a name of one line"),
-        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "not a name of one line"),
+        ([], {"video": tmp_path / "no.mp4"}, "no.mp4"),
+        ([], {"video": tmp_path / "no.mp4", "every_s": 0.0}, "--every"),
+        ([three], {"navigation": nav}, "DateTimeOriginal"),
+        ([three], {"time_zone": "Nowhere"}, "Nowhere"),
+        ([three], {"clock_offset_s": float("nan")}, "--clock-offset"),
+        ([three], {"vertical_datum": "LAT"}, "--navigation"),
+        ([three], {"navigation": nav, "vertical_datum": " "}, "--vertical-datum"),
+        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "--vertical-datum"),
     ]
     for folders, given, message in faults:
         with pytest.raises(AliceError, match=message) as caught:
@@ -400,31 +397,27 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
 
 @pytest.mark.parametrize("stage", ["images", "pool"])
 def test_a_simulated_survey_is_not_mixed_with_real_pictures(
-    tmp_path: Path, draw: Draw, stage: str
+    tmp_path: Path, several: Several, stage: str
 ) -> None:
     truth = tmp_path / "w" / stage / "truth"
     truth.mkdir(parents=True)
-    for number in range(2):
-        draw(tmp_path / "in" / f"{number}.jpg", number)
-    with pytest.raises(WorkspaceError, match="simulated survey"):
-        import_images(tmp_path / "w", [tmp_path / "in"])
+    with pytest.raises(WorkspaceError):
+        import_images(tmp_path / "w", [several(2)])
     assert truth.is_dir()
 
 
-def test_a_navigation_log_of_another_day_is_refused(tmp_path: Path, draw: Draw) -> None:
-    for number in range(2):
-        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
+def test_a_navigation_log_of_another_day_is_refused(tmp_path: Path, several: Several) -> None:
+    source = several(2, dated=True)
     rows = [[f"2024-07-02T12:00:{s:02d}Z", 60, 5.0, 10] for s in range(9)]
     nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
-    with pytest.raises(ImageError, match=r"no picture was taken while navigation was logged"):
-        import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav)
+    with pytest.raises(ImageError, match="--clock-offset"):
+        import_images(tmp_path / "w", [source], navigation=nav)
 
 
-def test_one_or_two_processes_write_the_same(tmp_path: Path, draw: Draw) -> None:
-    for number in range(4):
-        draw(tmp_path / "in" / f"{number}.jpg", number)
+def test_one_or_two_processes_write_the_same(tmp_path: Path, several: Several) -> None:
+    source = several(4)
     for threads in (1, 2):
-        import_images(tmp_path / f"w{threads}", [tmp_path / "in"], executor=local_executor(threads))
+        import_images(tmp_path / f"w{threads}", [source], executor=local_executor(threads))
     one, two = tmp_path / "w1" / "images", tmp_path / "w2" / "images"
     for file in sorted(p for p in one.rglob("*") if p.is_file() and p.name != "stage.json"):
         assert file.read_bytes() == (two / file.relative_to(one)).read_bytes()

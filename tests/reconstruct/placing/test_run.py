@@ -167,24 +167,17 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     assert length == pytest.approx(25.0, rel=1e-3)
     assert view.image in {v.image for v in doubled.views}
 
-    for points, message in (
-        ("1,2,3", "two points"),
-        ("1,2,3 1,2,3", "one and the same"),
-        ("1,2 1,2,3", "no point x,y,z"),
-        ("1,2,nan 1,2,3", "no point x,y,z"),
-        ("camera/x.jpg:5,5 1,2,3", "no picture camera/x.jpg"),
-        (f"{view.image}:9999,5 1,2,3", "outside of the picture"),
-        (f"{view.image}:5;5 1,2,3", "no spot"),
-    ):
-        with pytest.raises(ReconstructionError, match=message):
-            scale_model(nowhere, points, 1.0)
-    with pytest.raises(ReconstructionError, match="more than 0"):
+    spots = ("camera/x.jpg:5,5", f"{view.image}:9999,5", f"{view.image}:5;5", "1,2", "1,2,nan")
+    for first_point in (*spots, "", "1,2,3"):  # the last two: one point, and twice the same
+        with pytest.raises(ReconstructionError):
+            scale_model(nowhere, f"{first_point} 1,2,3", 1.0)
+    with pytest.raises(ReconstructionError, match="--length"):
         scale_model(nowhere, "0,0,0 1,1,1", 0.0)
 
     # a scale measured on another model is refused
     scale = json.loads((nowhere / "scale.json").read_text())
     (nowhere / "scale.json").write_text(json.dumps(scale | {"gauge": "other"}))
-    with pytest.raises(ReconstructionError, match="an earlier model"):
+    with pytest.raises(ReconstructionError, match=r"scale\.json"):
         reconstruct(nowhere, QUICK, SERIAL)
 
 
@@ -238,7 +231,7 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
     folder = tmp_path / "w"
     import_images(folder, [drone / "in"])
     write_rig(folder / "calibration" / "rig.json", design_rig(CameraConfig(), WaterConfig()))
-    with pytest.raises(AliceError, match="'camera' of the pictures is not in the rig"):
+    with pytest.raises(AliceError, match="'camera'"):
         reconstruct(folder, QUICK, SERIAL)
     manifest = folder / "images" / "manifest.csv"
     records = [replace(r, camera="left") for r in read_manifest(manifest)]

@@ -18,7 +18,7 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import Sights
+from reconstruct.mapping.normal_equations import LinearObservations
 from reconstruct.views.lens import Lens
 
 _SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
@@ -61,6 +61,12 @@ class RigState:
     centres: Array
     points: Array
     lever: Array
+
+
+def calibrated_parameters(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
+    """The parameters of these cameras whose covariance a rig states."""
+    known = () if rig.covariance is None else rig.covariance.parameters
+    return tuple(name for name in known if name.split(".")[0] in names)
 
 
 def choose_pixels(
@@ -127,9 +133,9 @@ def start_state(
     )
 
 
-def exact_sights(
+def exact_observations(
     state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
-) -> Sights:
+) -> LinearObservations:
     """The observations linearised; those that no ray explains do not count."""
     count = len(fields) + 3 * lever
     arm = state.points[pixels.point] - state.centres[pixels.station]
@@ -150,7 +156,7 @@ def exact_sights(
                 np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2),
                 source, target, by_point, by_shared, miss,
             )  # fmt: skip
-    return Sights(
+    return LinearObservations(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm,
         by_shared=by_shared, miss=miss,
     )  # fmt: skip
