@@ -3,9 +3,10 @@
 Every number stands as a row (`Setting`) with its equation, its source and the limit that bound it.
 """
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import (
     CameraConfig,
     ImagingConfig,
@@ -14,7 +15,6 @@ from alice_survey.base.config import (
     WaterConfig,
 )
 from alice_survey.base.errors import PlanError, warn
-from camera_calib.fov.table import json_row
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from missions.exposure.focus import Focus, focus_rows, plan_focus, too_open
@@ -128,8 +128,7 @@ class ImagingSettings:
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON values."""
         data = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rows"}
-        plain = {k: v if isinstance(v, float) else json_row(asdict(v)) for k, v in data.items()}
-        return {**plain, "rows": [row.to_json() for row in self.rows]}
+        return {**json_values(data), "rows": [row.to_json() for row in self.rows]}
 
 
 def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> ImagingSettings:
