@@ -43,6 +43,8 @@ _ROBUST_SIGMAS = 2.0
 _STEPS = 6
 _SETTLED_SIGMAS = 0.01
 _LEAST_BOUND = 1e-9
+_SHRUNK = 1e-6
+"""Share of its first scale below which a model has shrunk to a point."""
 _STRETCH = 0.005
 """Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
 `vehicle.navigation.sensors`)."""
@@ -209,7 +211,8 @@ def fit_navigation(
         control: equations of control points and bars.
 
     Returns:
-        The fit; None, after a warning, where positions are too few or too close together.
+        The fit; None, after a warning, where positions are too few or too close together, or have
+        no scale in common with the model.
     """
     epochs = read_epochs(records, model_from_cam, body_from_cam, datum)
     if epochs is None:
@@ -228,7 +231,14 @@ def fit_navigation(
         mount_sigma_rad=np.deg2rad(mount_sigma_deg),
         control=control,
     )
-    return task.fit(start, free)
+    near = task.robust(start, free)
+    if near.scale < _SHRUNK * start.scale:
+        warn(
+            "positions of navigation and model have no scale in common: it stays without CRS; are "
+            "they of these pictures?"
+        )
+        return None
+    return task.fit(near, free)
 
 
 def fit_control(
@@ -261,7 +271,7 @@ def fit_control(
         mount_sigma_rad=0.0,
         control=control,
     )
-    return task.fit(start, free)
+    return task.fit(task.robust(start, free), free)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -274,10 +284,9 @@ class _NavigationTask:
     mount_sigma_rad: float
     control: ExtraOf | None
 
-    def fit(self, start: Similarity, free: list[int]) -> PlacementFit:
-        """Iterate from a rough placement to the final one."""
+    def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
+        """Iterate from a robust placement to the final one."""
         epochs = self.epochs
-        place = self._robust(start, free)
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(found.misfit, epochs.known)
         bounds = self._frame_bounds()
@@ -381,8 +390,12 @@ class _NavigationTask:
             rows.append(more.jacobian)
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
 
-    def _robust(self, place: Similarity, free: list[int]) -> Similarity:
-        """A placement robust to a few wrong readings: readings as independent, soft L1."""
+    def robust(self, start: Similarity, free: list[int]) -> Similarity:
+        """A placement robust to a few wrong readings: readings as independent, soft L1.
+
+        It ends early where the model shrinks to a point.
+        """
+        place = start
         for _ in range(_ROBUST_STEPS):
             middle = self._middle(place)
             found, extra = equations(self.epochs, place, middle), self._extra(place, middle)
@@ -395,8 +408,10 @@ class _NavigationTask:
             step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
             change = np.zeros(PARAMETERS)
             change[free] = step
+            if change[SCALE] > 0:  # a scale alone is solved by 1 + step; exp overshoots
+                change[SCALE] = np.log1p(change[SCALE])
             place = _moved(place, change, middle)
-            if np.all(np.abs(step) * size < 1e-6):
+            if np.all(np.abs(step) * size < 1e-6) or place.scale < _SHRUNK * start.scale:
                 break
         return place
 
