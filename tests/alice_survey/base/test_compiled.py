@@ -54,6 +54,7 @@ def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[3])]),
         "NUMBA_CACHE_DIR": str(folder / "kept"),
+        "PYTHONDONTWRITEBYTECODE": "1",  # which an edit in the same second would leave
     }
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
