@@ -169,8 +169,9 @@ def read_shrunk(
         )
         opacity: Array = raster.dataset_mask(out_shape=shape)
         full = raster.transform
-        wide, high = full.a * raster.width / shape[1], full.e * raster.height / shape[0]
-        return values, opacity, Affine(wide, 0.0, full.c, 0.0, high, full.f)
+        # Exactly its own transform where nothing is shrunk.
+        wide, high = raster.width / shape[1], raster.height / shape[0]
+        return values, opacity, full * Affine.scale(wide, high)
 
 
 def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:

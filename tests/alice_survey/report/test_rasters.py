@@ -3,8 +3,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rasterio
+from affine import Affine
 
 from alice_survey.kit.document import PictureLayer
+from alice_survey.report.colours import read_shrunk
 from alice_survey.report.held import Held
 from alice_survey.report.rasters import mosaic_layer, picture_layers
 from tests.alice_survey.report.tiny import tiny_workspace
@@ -60,6 +63,17 @@ def test_a_mosaic_too_large_is_shrunk_and_says_so(workspace: Path) -> None:
     assert layer.width_px * layer.height_px <= 61_000
     assert layer.pixel_m * layer.width_px == pytest.approx(0.8)
     assert "2.0 times" in layer.about
+
+
+@pytest.mark.parametrize("width", [3, 1000, 2719])
+def test_a_raster_that_fits_keeps_its_own_grid(width: int, tmp_path: Path) -> None:
+    grid = Affine(0.0018, 0.0, -2.3, 0.0, -0.0018, 4.1)
+    with rasterio.open(
+        tmp_path / "a.tif", "w", driver="GTiff", width=width, height=2, count=1, dtype="uint8",
+        transform=grid,
+    ) as raster:  # fmt: skip
+        raster.write(np.ones((1, 2, width), np.uint8))
+    assert read_shrunk(tmp_path / "a.tif", [1], 1e6)[2] == grid
 
 
 def test_numbers_are_coloured_between_limits_that_the_legend_tells(workspace: Path) -> None:
