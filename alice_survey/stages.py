@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from alice_survey.base import artefacts, records
-from alice_survey.base.artefacts import Stage, read_stage, run_stage, why_stale
+from alice_survey.base.artefacts import Stage, read_json, read_stage, run_stage, why_stale
 from alice_survey.base.config import Config, SurveyConfig
 from alice_survey.base.errors import AliceError, WorkspaceError
 from alice_survey.base.executor import Executor
@@ -254,19 +254,17 @@ def _given(*paths: Path | None) -> list[Path]:
 
 
 def _plan_summary(folder: Path) -> Summary:
-    from missions.values.plan_file import read_plan
-
-    plan = read_plan(folder / "plan.json")
-    dives = len(plan.dives)
+    plan = read_json(folder / "plan.json")
+    dives = len(plan["dives"])
     text = (
-        f"{len(plan.lines)} lines, {plan.stations} stations, {plan.length_m:.0f} m, "
-        f"{plan.duration_s / 60:.0f} min, {plan.energy_wh:.0f} Wh in {dives} "
-        f"dive{'s' if dives > 1 else ''}; overlap {plan.reached_forward_overlap:.0%} forward, "
-        f"{plan.reached_side_overlap:.0%} side, {plan.coverage:.1%} covered as requested; "
-        f"a picture every {plan.interval_s:.2f} s, exposed {1e3 * plan.exposure_s:.2g} ms; map in "
+        f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
+        f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
+        f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
+        f"{plan['side_overlap']:.0%} side, {plan['coverage']:.1%} covered as requested; a picture "
+        f"every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map in "
         f"{folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
     )
-    return text, plan.to_json()
+    return text, plan
 
 
 def _fly_summary(folder: Path) -> Summary:
