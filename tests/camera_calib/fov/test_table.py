@@ -97,7 +97,7 @@ def test_in_air_it_is_a_pinhole() -> None:
     assert row.diagonal_air_deg == pytest.approx(65.2, abs=0.05)
     assert row.focus_air_m == pytest.approx(2.0)
     assert row.corner_blur_px == pytest.approx(0.0, abs=1e-9)
-    # A rectangle less the strip of one baseline.
+    # A rectangle minus the strip of one baseline.
     assert row.stereo_overlap == pytest.approx(1 - 0.1 / row.horizontal_m)
 
 
