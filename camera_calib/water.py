@@ -97,14 +97,13 @@ def water_optics(jerlov: Jerlov, wavelength_nm: Array = WAVELENGTH_NM) -> WaterO
     )
 
 
-def phase_per_sr(cosine: Array, asymmetry: float = ASYMMETRY) -> Array:
+def phase_per_sr(cosine: Array) -> Array:
     """Henyey-Greenstein phase function: share of the scattered light per steradian.
 
     Args:
         cosine: cosine of the angle by which light is turned (1 is forward).
-        asymmetry: mean cosine.
     """
-    g = asymmetry
+    g = ASYMMETRY
     phase: Array = (1.0 - g * g) / (4.0 * np.pi * (1.0 + g * g - 2.0 * g * cosine) ** 1.5)
     return phase
 

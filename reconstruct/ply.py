@@ -36,7 +36,7 @@ VERTEX = np.dtype(
 )  # fmt: skip
 """One point of a mesh: place, normal and colour."""
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-_COLOURED = ("nx", "ny", "nz", "red", "green", "blue")
+_COLOURED = {"nx", "ny", "nz", "red", "green", "blue"}
 _CHUNK = 65_536
 """Points of which the bounds are kept, so that a tile reads only what may fall into it."""
 
@@ -255,17 +255,14 @@ def open_cloud(path: Path) -> CloudFile:
         header = read_header(path)
     except OSError as error:
         raise WorkspaceError(f"{path}: {error.strerror}") from None
-    lacking = [name for name in _COLOURED if name not in dict(header.fields)]
-    if not header.order or lacking or not header.count:
-        what = f"lacks {', '.join(lacking)}" if lacking else "is text or empty"
-        raise WorkspaceError(f"{path}: no binary cloud with normals and colours ({what})")
+    if not (header.order and header.count and dict(header.fields).keys() >= _COLOURED):
+        raise WorkspaceError(
+            f"{path}: no binary cloud with normals and colours: delete dense/ and run again"
+        )
     points = header.rows()
     lows, highs = [], []
     for first in range(0, header.count, _CHUNK):
         xyz = _coordinates(points[first : first + _CHUNK])
-        if not np.isfinite(xyz).all():
-            last = first + len(xyz)
-            raise WorkspaceError(f"{path}: a point of {first} to {last} is not finite")
         lows.append(xyz.min(axis=0))
         highs.append(xyz.max(axis=0))
     return CloudFile(header=header, chunk_low=np.array(lows), chunk_high=np.array(highs))

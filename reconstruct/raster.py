@@ -159,12 +159,12 @@ def tiled_raster(
 
 
 @contextmanager
-def small_cache() -> Iterator[None]:
+def small_cache(mib: int = _CACHE_MIB) -> Iterator[None]:
     """Within this block, or a task that it decorates, GDAL keeps little of the files it opens.
 
     Its own choice is 5 % of the machine's memory in each process.
     """
-    with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
+    with rasterio.Env(GDAL_CACHEMAX=mib << 20):
         yield
 
 

@@ -236,8 +236,9 @@ class Coverage:
         return float((self.counts == 0).mean())
 
 
-def coverage(camera: FlatPortCamera, pixels: Array, columns: int = 10, rows: int = 8) -> Coverage:
+def coverage(camera: FlatPortCamera, pixels: Array) -> Coverage:
     """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
+    columns, rows = 10, 8
     size = np.array([camera.width_px, camera.height_px])
     cell = np.floor(pixels / size * [columns, rows]).astype(int)
     inside = ((cell >= 0) & (cell < [columns, rows])).all(axis=1)

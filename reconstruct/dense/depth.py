@@ -169,14 +169,14 @@ def merge_depths(
     for row in range(height):
         for column in range(width):
             known = 0
-            best_company, best_weight, best = 0, 0.0, -1
+            best_company, best_weight, best_total = 0, 0.0, 0.0
             for k in range(count):
                 z = depths[k, row, column]
                 if math.isnan(z):
                     continue
                 known += 1
                 s = sigmas[k, row, column]
-                company, weight = 0, 0.0
+                company, weight, total = 0, 0.0, 0.0
                 for j in range(count):
                     other = depths[j, row, column]
                     if math.isnan(other):
@@ -185,23 +185,13 @@ def merge_depths(
                     if (z - other) ** 2 <= gate * gate * (s * s + t * t):
                         company += 1
                         weight += 1.0 / (t * t)
+                        total += other / (t * t)
                 if company > best_company or (company == best_company and weight > best_weight):
-                    best_company, best_weight, best = company, weight, k
-            if best < 0 or (known > 1 and best_company == 1):
+                    best_company, best_weight, best_total = company, weight, total
+            if best_company == 0 or (known > 1 and best_company == 1):
                 continue
-            z = depths[best, row, column]
-            s = sigmas[best, row, column]
-            total, weights = 0.0, 0.0
-            for j in range(count):
-                other = depths[j, row, column]
-                if math.isnan(other):
-                    continue
-                t = sigmas[j, row, column]
-                if (z - other) ** 2 <= gate * gate * (s * s + t * t):
-                    total += other / (t * t)
-                    weights += 1.0 / (t * t)
-            merged[row, column] = total / weights
-            sigma[row, column] = math.sqrt(1.0 / weights)
+            merged[row, column] = best_total / best_weight
+            sigma[row, column] = math.sqrt(1.0 / best_weight)
             agreeing[row, column] = best_company
     return merged, sigma, agreeing
 

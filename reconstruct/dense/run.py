@@ -37,7 +37,7 @@ from reconstruct.dense.views import (
 )
 from reconstruct.light.solve import joined_samples, solve_light, write_light
 from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster
-from reconstruct.views.model import SparseModel, WorldFrame, read_model, scaled_view
+from reconstruct.views.model import WorldFrame, read_model, scaled_view
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
@@ -56,23 +56,13 @@ def run_dense(
         ReconstructionError: the views do not overlap, or no depth was found.
         WorkspaceError: the model is damaged.
     """
-    build_surface(workspace, read_model(workspace / "sparse"), folder, reconstruct, executor)
-
-
-def build_surface(
-    workspace: Path,
-    model: SparseModel,
-    folder: Path,
-    settings: ReconstructConfig,
-    executor: Executor,
-) -> None:
-    """Do the work of the stage in a folder; see `run_dense`."""
+    model = read_model(workspace / "sparse")
     store = ViewStore(folder / "scratch")
     store.folder.mkdir(parents=True, exist_ok=True)
-    partners = choose_partners(model, settings.dense_partners)
+    partners = choose_partners(model, reconstruct.dense_partners)
     points = points_in_sight(model)
     conditions = find_conditions(
-        workspace, model.views, partners, points, settings.dense_scale, executor
+        workspace, model.views, partners, points, reconstruct.dense_scale, executor
     )
     views = [scaled_view(view, conditions.scale) for view in model.views]
 
@@ -93,7 +83,7 @@ def build_surface(
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
     summaries = list(executor.map(check, checks, label="cross-check"))
-    grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
+    grid = surface_grid(summaries, reconstruct.dem_cell_m, model.frame)
     offset = _offset(grid, summaries)
     edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
     light = solve_light(
@@ -111,10 +101,7 @@ def build_surface(
     with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:
         count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, model.frame)
     if count == 0:
-        raise ReconstructionError(
-            f"no depth was confirmed by a second view in {len(views)} pictures; they need more "
-            "overlap, sharper texture or better positions"
-        )
+        raise _no_depth(len(views))
     write_cloud_json(folder / "cloud.json", count, offset, edge, model.frame)
     SurfaceRecord.save(
         folder / "surface.json",
@@ -151,10 +138,7 @@ def surface_grid(
     """
     bounds = [s.bounds for s in summaries if s.bounds is not None]
     if not bounds:
-        raise ReconstructionError(
-            f"no depth was confirmed by a second view in {len(summaries)} pictures; they need "
-            "more overlap, sharper texture or better positions"
-        )
+        raise _no_depth(len(summaries))
     if cell is not None and not frame.scaled:
         warn("reconstruct.dem_cell_m is taken in model units: the model has no scale")
     footprint = float(np.nanmedian([s.footprint for s in summaries]))
@@ -167,6 +151,13 @@ def surface_grid(
             "raise reconstruct.dem_cell_m"
         )
     return grid
+
+
+def _no_depth(pictures: int) -> ReconstructionError:
+    return ReconstructionError(
+        f"no depth was confirmed by a second view in {pictures} pictures; they need more overlap, "
+        "sharper texture or better positions"
+    )
 
 
 def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, float, float]:

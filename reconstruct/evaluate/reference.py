@@ -47,7 +47,6 @@ def evaluate_reference(
     *,
     free_scale: bool | None = None,
     out: Path | None = None,
-    seed: int = 1,
 ) -> tuple[str, dict[str, Any]]:
     """Compare the cloud of a workspace with a LAZ, LAS, PLY or GeoTIFF of the same place.
 
@@ -61,7 +60,6 @@ def evaluate_reference(
         reference: the file.
         free_scale: overrules where the scale is held.
         out: folder to write to.
-        seed: of the points drawn.
 
     Returns:
         A few lines of text, and figures as JSON values.
@@ -80,7 +78,7 @@ def evaluate_reference(
     source = RegistrationRecord.read(sparse / "registration.json").scale_source or "no scale"
     if free_scale is None:
         free_scale = not model.frame.scaled or _NAVIGATION in source
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     own = read_own_cloud(workspace)
     theirs, placed = read_reference(reference, model.frame.datum)
     surface = ReferenceSurface.of(theirs)

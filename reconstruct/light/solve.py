@@ -54,8 +54,9 @@ _FEWEST_PICTURES = 6
 _LEAST_SHOWN = 0.5
 """Share of a picture's nodes that must be seen for its brightness to be known."""
 _LARGEST_GAIN = 8.0
-_WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
-_GREY_LEVEL = 128.0
+BRIGHT_PERCENT = 98.0
+"""Share of a survey's spots that are no brighter than what counts as bright."""
+_WHITE_LEVEL, _GREY_LEVEL = 215.0, 128.0
 _NORM = 6.0
 _DENSE_PICTURES = 400
 """More are solved for with sparse matrices."""
@@ -410,11 +411,7 @@ def at_nodes(low: NDArray[np.float32]) -> Array:
 def _white(
     samples: LightSamples, light: LightModel, images: Sequence[str], cameras: Sequence[str]
 ) -> Array:
-    """Factors that make what is bright neutral, and the survey light without burning out.
-
-    The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
-    purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
-    """
+    """Factors that make what is bright neutral, and the survey light without burning out."""
     if not len(samples.views):
         return np.ones(3)
     first = samples.views[:, 0]
@@ -425,12 +422,25 @@ def _white(
         factors = light.factors(cameras[number], images[number]).reshape(-1, 3)
         lift = (factors[nodes[mine]] * weights[mine][..., None]).sum(axis=1)
         level[mine] = np.exp(samples.levels[mine, 0]) * lift
+    neutral = neutral_factors(level)
+    return neutral * brightening(level * neutral, _WHITE_LEVEL, _GREY_LEVEL)
+
+
+def neutral_factors(level: Array) -> Array:
+    """Factors (3,) that make what is bright in colours (N, 3) neutral.
+
+    The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
+    purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
+    """
     cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
-    neutral = cast.mean() / cast
-    grey = (level * neutral).mean(axis=1)
-    bright, middle = np.percentile(grey, _WHITE_PERCENT), np.median(grey)
-    white: Array = neutral * min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle)
-    return white
+    neutral: Array = cast.mean() / cast
+    return neutral
+
+
+def brightening(level: Array, bright: float, middle: float) -> float:
+    """The factor that takes colours (N, 3) up to a bright and a middle level, but above neither."""
+    grey = level.mean(axis=1)
+    return float(min(bright / np.percentile(grey, BRIGHT_PERCENT), middle / np.median(grey)))
 
 
 def write_light(path: Path, light: LightModel) -> None:
@@ -456,18 +466,11 @@ def read_light(path: Path) -> LightModel:
     """
     data = read_json(path)
     with taken_from(path):
-        light = LightModel(
+        return LightModel(
             patterns={n: np.array(p, dtype=np.float64) for n, p in data["patterns"].items()},
             gains={n: np.array(g, dtype=np.float64) for n, g in data["gains"].items()},
             white=np.array(data["white"], dtype=np.float64),
         )
-        triples = [light.white, *light.gains.values()]
-        grids = list(light.patterns.values())
-        if any(t.shape != (3,) for t in triples) or any(g.shape[2:] != (3,) for g in grids):
-            raise ValueError("not of three channels")
-        if not all(np.isfinite(values).all() for values in (*triples, *grids)):
-            raise ValueError("values that are not finite")
-        return light
 
 
 def solve_robustly(

@@ -233,10 +233,6 @@ def read_uncertainty(path: Path) -> Uncertainty:
         "sigma_px",
     )  # fmt: skip
     with taken_from(path):
-        frames, points = len(data["frames"]), len(data["point_ids"])
-        shapes = [data[name].shape for name in ("stations", "cov", "point_cov", "point_noise")]
-        if shapes != [(frames,), (frames, 6, 6), (points, 3, 3), (points, 3, 3)]:
-            raise ValueError(f"{frames} frames and {points} points with the shapes {shapes}")
         return Uncertainty(
             frames=data["frames"].astype(np.int64),
             stations=data["stations"].astype(np.int64),

@@ -33,14 +33,24 @@ _ROWS = 128
 _BACK = 255.0
 
 
-def write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
-    """Write binary glTF: one mesh and one material a page; pages as JPEG inside.
+def write_mesh(
+    folder: Path, mesh: Textured, extras: dict[str, Any], comments: Sequence[str]
+) -> None:
+    """Write `mesh.glb`, `mesh.obj` with `mesh.mtl`, and `mesh.ply` next to the pages.
 
     Args:
-        path: of the file.
-        mesh: with pages that exist.
-        extras: JSON values to keep with it.
+        folder: of the pages, which exist.
+        mesh: what is written.
+        extras: JSON values for the GLB.
+        comments: lines for the headers of the others.
     """
+    _write_glb(folder / "mesh.glb", mesh, extras)
+    _write_obj(folder / "mesh.obj", mesh, comments)
+    _write_ply(folder / "mesh.ply", mesh, comments)
+
+
+def _write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
+    """Write binary glTF: one mesh and one material a page; pages as JPEG inside."""
     import trimesh
     from PIL import Image
     from trimesh.exchange.gltf import export_glb
@@ -96,7 +106,7 @@ def write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
         temporary.write_bytes(content)
 
 
-def write_obj(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
+def _write_obj(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
     """Write OBJ and, next to it, MTL that names the pages; x east, y north, z up."""
     material = path.with_suffix(".mtl")
     with atomic_path(material) as temporary:
@@ -118,27 +128,14 @@ def write_obj(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
             np.savetxt(file, both, fmt="f %d/%d %d/%d %d/%d")
 
 
-def write_mesh_ply(
-    path: Path,
-    vertices: Array,
-    triangles: NDArray[np.int32],
-    colours: NDArray[np.uint8],
-    comments: Sequence[str],
-) -> None:
-    """Write a binary PLY with normals and colours at vertices; x east, y north, z up.
-
-    Args:
-        path: of the file.
-        vertices: (V, 3).
-        triangles: (T, 3).
-        colours: (V, 3) RGB.
-        comments: lines for its header.
-    """
-    record = np.empty(len(vertices), VERTEX)
-    normals = vertex_normals(vertices, triangles)
+def _write_ply(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
+    """Write a binary PLY with normals and colours at vertices; x east, y north, z up."""
+    triangles = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
+    record = np.empty(len(mesh.vertices), VERTEX)
+    normals = vertex_normals(mesh.vertices, triangles)
     for axis, name in enumerate("xyz"):
-        record[name], record[f"n{name}"] = vertices[:, axis], normals[:, axis]
-    record["red"], record["green"], record["blue"] = colours.T
+        record[name], record[f"n{name}"] = mesh.vertices[:, axis], normals[:, axis]
+    record["red"], record["green"], record["blue"] = mesh.colours.T
     write_ply(path, [record], comments, triangles)
 
 

@@ -13,7 +13,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.records import CloudRecord, MeshRecord
 from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
-from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_glb, write_mesh_ply, write_obj
+from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts
 from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
@@ -22,7 +22,7 @@ from reconstruct.mesh.visibility import find_candidates
 from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
-from reconstruct.views.model import SparseModel, WorldFrame, read_model
+from reconstruct.views.model import WorldFrame, read_model
 
 MOST_TRIANGLES = 4_000_000
 """Most triangles where the settings name no number."""
@@ -39,17 +39,7 @@ def run_mesh(
         ReconstructionError: the cloud carries no surface.
         WorkspaceError: the model or the cloud is damaged.
     """
-    build_mesh(workspace, read_model(workspace / "sparse"), folder, reconstruct, executor)
-
-
-def build_mesh(
-    workspace: Path,
-    model: SparseModel,
-    folder: Path,
-    settings: ReconstructConfig,
-    executor: Executor,
-) -> None:
-    """Do the work of the stage in a folder; see `run_mesh`."""
+    model = read_model(workspace / "sparse")
     dense = workspace / "dense"
     about = CloudRecord.read(dense / "cloud.json")
     light = read_light(dense / "light.json")
@@ -60,8 +50,8 @@ def build_mesh(
     mesh = mesh_cloud(
         cloud,
         step,
-        settings.mesh_error_px * pixel,
-        settings.mesh_triangles or MOST_TRIANGLES,
+        reconstruct.mesh_error_px * pixel,
+        reconstruct.mesh_triangles or MOST_TRIANGLES,
         executor,
     )
     scratch = folder / "scratch"
@@ -83,7 +73,7 @@ def build_mesh(
         light,
         colours_of_cloud(cloud, mesh.vertices, step),
         plain_pixel=pixel,
-        page_px=settings.mesh_page_px,
+        page_px=reconstruct.mesh_page_px,
         executor=executor,
     )
     shutil.rmtree(scratch)
@@ -93,11 +83,11 @@ def build_mesh(
             f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "
             "has the colours of the cloud"
         )
-    write_mesh(folder, textured, facts)
+    _write_results(folder, textured, facts)
 
 
 @progress.step("write the mesh")
-def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
+def _write_results(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
     """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` next to the pages."""
     offset = " ".join(repr(value) for value in facts["offset_east_north_up"])
     comments = [
@@ -105,10 +95,7 @@ def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
         f"frame {facts['frame']}, unit {facts['unit']}, x east, y north, z up",
         f"vertical datum: {facts['vertical_datum']}",
     ]
-    write_glb(folder / "mesh.glb", mesh, {**facts, "axes": GLB_AXES})
-    write_obj(folder / "mesh.obj", mesh, comments)
-    triangles = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
-    write_mesh_ply(folder / "mesh.ply", mesh.vertices, triangles, mesh.colours, comments)
+    write_mesh(folder, mesh, {**facts, "axes": GLB_AXES}, comments)
     MeshRecord.save(folder / "mesh.json", facts)
     write_png(folder / "mesh.png", render_oblique(mesh))
 

@@ -21,14 +21,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.light.solve import (
+    BRIGHT_PERCENT,
     GRID,
     SAMPLES_PER_FACT,
     LightModel,
     LightSamples,
     bilinear,
+    brightening,
+    neutral_factors,
     node_weights,
     solve_patterns,
 )
@@ -53,9 +57,8 @@ _LARGEST_WATER_SIGMA = 0.15
 """Largest sigma of the logarithm of the colour ratios lost to the water, for a correction by them.
 """
 _LARGEST_LIFT = 30.0
-_BRIGHT_LIGHT, _BRIGHT_PERCENT = 0.68, 98.0
+_BRIGHT_LIGHT = 0.68
 _MIDDLE_LIGHT = 0.22
-_NORM = 6.0
 _BLACK_QUANTILE = 0.01
 """Quantile of the darkest half percent of pixels around all places of all pictures."""
 _BLACK_SHARE = 0.6
@@ -121,19 +124,17 @@ class ColourModel:
 
     def to_json(self) -> dict[str, Any]:
         """What was found, for `mosaic.json`."""
-        return {
-            "white_blue_green_red": [float(w) for w in self.light.white],
-            "fall_off_per_unit_blue_green_red": [float(b) for b in self.light.fall_off],
-            "fall_off_sigma_blue_green_red": [
-                float(s) if np.isfinite(s) else None for s in self.light.fall_off_sigma
-            ],
-            "black_blue_green_red": [float(b) for b in self.black],
+        values = {
+            "white_blue_green_red": self.light.white,
+            "fall_off_per_unit_blue_green_red": self.light.fall_off,
+            "fall_off_sigma_blue_green_red": self.light.fall_off_sigma,
+            "black_blue_green_red": self.black,
             "middle_range": float(self.light.middle_range),
-            "added_light_share_blue_green_red": [float(s) for s in self.shares],
-            "added_light_share_sigma_blue_green_red": [
-                float(s) if np.isfinite(s) else None for s in self.share_sigmas
-            ],
+            "added_light_share_blue_green_red": self.shares,
+            "added_light_share_sigma_blue_green_red": self.share_sigmas,
         }
+        found: dict[str, Any] = json_values(values)
+        return found
 
 
 @progress.step("even the light")
@@ -238,7 +239,7 @@ def _brighter(
         return 1.0
     level = _levels(samples, model, facts) * model.light.white
     grey, dark = level.mean(axis=1), float(black.mean())
-    bright, middle = np.percentile(grey, _BRIGHT_PERCENT), np.median(grey)
+    bright, middle = np.percentile(grey, BRIGHT_PERCENT), np.median(grey)
     # factor f with (f level - f dark) / (1 - f dark) = wanted
     return float(
         min(
@@ -404,17 +405,11 @@ def _white(
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out.
 
-    With `neutral` given, colours are multiplied by that instead of being made neutral. The cast is
-    the 6-norm of each colour, between the mean (grey world, which paints a lawn purple) and the
-    largest value ("shades of gray", Finlayson & Trezzi 2004).
+    With `neutral` given, colours are multiplied by that instead of being made neutral.
     """
     if not len(samples.views):
         return np.ones(3)
     level = _levels(samples, model, facts)
     if neutral is None:
-        cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
-        neutral = cast.mean() / cast
-    grey = (level * neutral).mean(axis=1)
-    bright, middle = np.percentile(grey, _BRIGHT_PERCENT), np.median(grey)
-    white: Array = neutral * min(_BRIGHT_LIGHT / bright, _MIDDLE_LIGHT / middle)
-    return white
+        neutral = neutral_factors(level)
+    return neutral * brightening(level * neutral, _BRIGHT_LIGHT, _MIDDLE_LIGHT)

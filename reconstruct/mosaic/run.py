@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import rasterio
 
 from alice_survey.base.config import ReconstructConfig, WaterConfig
 from alice_survey.base.executor import Executor
@@ -48,7 +47,7 @@ from reconstruct.mosaic.tools import MosaicSetup
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
-from reconstruct.raster import DemGrid, opened_raster, round_cell
+from reconstruct.raster import DemGrid, opened_raster, round_cell, small_cache
 from reconstruct.views.lens import FlatPortLens
 from reconstruct.views.model import SparseModel, read_lenses, read_model
 
@@ -70,6 +69,7 @@ _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Sea water where none is stated; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
+@small_cache(_CACHE_MIB)
 def run_mosaic(
     workspace: Path,
     folder: Path,
@@ -86,25 +86,11 @@ def run_mosaic(
         WorkspaceError: the model or the surface is damaged.
     """
     model = read_model(workspace / "sparse")
-    sea = _sea(water, seafloor_depth_m)
-    with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
-        build_mosaic(workspace, model, folder, reconstruct, sea, executor)
-
-
-def build_mosaic(
-    workspace: Path,
-    model: SparseModel,
-    folder: Path,
-    settings: ReconstructConfig,
-    sea: tuple[Water, bool],
-    executor: Executor,
-) -> None:
-    """Do the work of the stage in a folder; see `run_mosaic`."""
     scratch = folder / "scratch"
     scratch.mkdir()
     with opened_raster(workspace / "dense" / "dem.tif") as raster:
         heights = height_range(raster)
-        pixel = settings.mosaic_pixel_m or round_cell(mean_pixel(model))
+        pixel = reconstruct.mosaic_pixel_m or round_cell(mean_pixel(model))
         grid = mosaic_grid(raster, pixel, model.frame)
     names = [view.image for view in model.views]
     measure = partial(measure_view, workspace, scratch, heights)
@@ -112,16 +98,13 @@ def build_mosaic(
         executor.map(measure, model.views, label="measure pictures", task_mib=_TASK_MIB)
     )
     facts = [fact for fact, _ in measured]
-    water, dispersion = _dispersion(
-        workspace, settings.dispersion, sea, grey=all(f.grey for f in facts)
-    )
-    survey = MosaicSetup(
-        workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water
-    )
+    grey = all(fact.grey for fact in facts)
+    sea, dispersion = _dispersion(workspace, reconstruct.dispersion, water, seafloor_depth_m, grey)
+    survey = MosaicSetup(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=sea)
     views = _seen_views(model, facts)
     ground = footprints(model.views, heights)
     label_blocks = seam_blocks(grid, ground)
-    colour = _solve(model, survey, facts, views, label_blocks, settings.colour, executor)
+    colour = _solve(model, survey, facts, views, label_blocks, reconstruct.colour, executor)
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
         return [
@@ -130,7 +113,7 @@ def build_mosaic(
                 block=block,
                 views=tuple(views[n] for n in block.views),
                 colour=_part_of(colour, [names[n] for n in block.views]),
-                even=settings.colour != "raw",
+                even=reconstruct.colour != "raw",
             )
             for block in blocks
         ]
@@ -165,7 +148,7 @@ def build_mosaic(
             "covered": covered,
             "coverage_cell": grid.cell * CELL_PX,
             "vertical_datum": model.frame.vertical_datum,
-            "colour": settings.colour,
+            "colour": reconstruct.colour,
             **colour.to_json(),
             "dispersion": dispersion,
             "notes": [*model.frame.notes, *colour.notes],
@@ -231,7 +214,7 @@ def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:
 
 
 def _dispersion(
-    workspace: Path, wanted: str, sea: tuple[Water, bool], *, grey: bool
+    workspace: Path, wanted: str, config: WaterConfig, depth_m: float, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
     lenses = read_lenses(workspace / "sparse" / "cameras.json").values()
@@ -248,21 +231,14 @@ def _dispersion(
         reason = "rendered pictures have none"
     if reason:
         return None, {"corrected": False, "reason": reason}
-    water, stated = sea
-    return water, {
-        "corrected": True,
-        "temperature_c": water.temperature_c,
-        "salinity_psu": water.salinity_psu,
-        "water_stated": stated,
-    }
-
-
-def _sea(config: WaterConfig, depth_m: float) -> tuple[Water, bool]:
-    """The water of a survey, and whether its settings state it."""
-    stated = config.temperature_c is not None and config.salinity_psu is not None
     water = Water(
         temperature_c=_TEMPERATURE_C if config.temperature_c is None else config.temperature_c,
         salinity_psu=_SALINITY_PSU if config.salinity_psu is None else config.salinity_psu,
         depth_m=depth_m,
     )
-    return water, stated
+    return water, {
+        "corrected": True,
+        "temperature_c": water.temperature_c,
+        "salinity_psu": water.salinity_psu,
+        "water_stated": config.temperature_c is not None and config.salinity_psu is not None,
+    }

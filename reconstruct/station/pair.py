@@ -32,7 +32,7 @@ from reconstruct.matching.features import find_features
 from reconstruct.matching.matches import match_descriptors
 from reconstruct.mesh.atlas import Wedges
 from reconstruct.mesh.decimate import decimate
-from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
+from reconstruct.mesh.formats import GLB_AXES, write_mesh
 from reconstruct.mesh.surface import TriangleMesh
 from reconstruct.mesh.texture import Textured, remapped, write_jpeg
 from reconstruct.mesh.topology import clean, split_fans, without_folds
@@ -448,17 +448,15 @@ def write_station_mesh(
     uv[:, 1] = 1.0 - uv[:, 1]
     count = len(mesh.vertices)
     shown = remapped(colour, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
-    rgb = np.ascontiguousarray(shown[:, ::-1])
-    vertices = mesh.vertices * [1.0, -1.0, -1.0]
     textured = Textured(
-        vertices=vertices,
+        vertices=mesh.vertices * [1.0, -1.0, -1.0],
         wedges=Wedges(
             vertex=np.arange(count), chart=np.zeros(count, np.int32), triangles=mesh.triangles
         ),
         uv=uv,
         page=np.zeros(len(mesh.triangles), np.int32),
         pages=(page,),
-        colours=rgb,
+        colours=np.ascontiguousarray(shown[:, ::-1]),
         label=np.zeros(len(mesh.triangles), np.int32),
         scale=1.0,
     )
@@ -468,9 +466,7 @@ def write_station_mesh(
     ]
     axes = GLB_AXES.replace("east", "right").replace("north", "up in the picture")
     about = {"unit": "m", "axes": axes, "left": facts["left"]}
-    write_glb(folder / "mesh.glb", textured, about)
-    write_obj(folder / "mesh.obj", textured, comments)
-    write_mesh_ply(folder / "mesh.ply", vertices, mesh.triangles, rgb, comments)
+    write_mesh(folder, textured, about, comments)
 
 
 @figure_style()

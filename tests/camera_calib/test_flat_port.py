@@ -365,22 +365,16 @@ def test_json_keeps_every_parameter() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("name", "value"),
     [
-        ({"fx_px": math.nan}, "fx_px"),
-        ({"cx_px": math.inf}, "cx_px"),
-        ({"width_px": 0}, "width_px"),
-        ({"fy_px": -1.0}, "fy_px"),
-        ({"port_distance_m": -0.01}, "port_distance_m"),
-        ({"n_water": 0.9}, "n_water"),
-        ({"normal": (0.0, 0.1, 1.0)}, "normal"),
-        ({"normal": (0.0, 0.0, -1.0)}, "normal"),
+        ("fx_px", math.nan), ("cx_px", math.inf), ("width_px", 0), ("fy_px", -1.0),
+        ("port_distance_m", -0.01), ("n_water", 0.9), ("normal", (0.0, 0.1, 1.0)),
+        ("normal", (0.0, 0.0, -1.0)),
     ],
-)
-def test_a_camera_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
-    with pytest.raises(CalibrationError, match=words) as fault:
-        replace(MANTA, **change)
-    assert "\n" not in str(fault.value)
+)  # fmt: skip
+def test_a_camera_that_cannot_be_is_refused(name: str, value: object) -> None:
+    with pytest.raises(CalibrationError, match=name):
+        replace(MANTA, **{name: value})
 
 
 def test_json_with_an_unknown_or_a_missing_key_is_refused() -> None:

@@ -44,7 +44,7 @@ def test_index_falls_with_wavelength(material: str) -> None:
 
 
 def test_unknown_glass_and_invisible_light_are_refused() -> None:
-    with pytest.raises(ConfigError, match="no glass 'ice': known are bk7, fused-silica, sapphire"):
+    with pytest.raises(ConfigError, match=r"ice.*bk7"):
         n_glass("ice", 530.0)
     with pytest.raises(ConfigError, match="380 to 1050 nm"):
         n_glass("bk7", 0.53)

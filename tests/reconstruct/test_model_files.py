@@ -63,32 +63,21 @@ def test_a_track_beyond_the_file_is_not_followed(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ('"ned"', '"enu"'), ('"ned"', "[]"), ("46.5", '"x"'), ("46.5", "1e999"),
-        ("46.5", "91"), ('"latitude_deg"', '"latitude"'), ('["a"]', '[["a"]]'), ('["a"]', "5"),
-        ('"sea"', "null"),
-    ],
-)  # fmt: skip
+    ("old", "new"), [('"ned"', '"enu"'), ("46.5", "91"), ('"latitude_deg"', '"latitude"')]
+)
 def test_a_frame_that_was_changed_names_its_file(tmp_path: Path, old: str, new: str) -> None:
     path = tmp_path / "frame.json"
     datum = Datum(46.5, -91.5)
     frame = WorldFrame(name="ned", datum=datum, scaled=True, vertical_datum="sea", notes=("a",))
     write_frame(path, frame)
     assert read_frame(path) == frame
-    text = " ".join(path.read_text().split()).replace('[ "a" ]', '["a"]')
+    text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
     with pytest.raises(WorkspaceError, match=r"frame\.json"):
         read_frame(path)
 
 
-@pytest.mark.parametrize("side", [0, -5, 10**9, "x", None])
-def test_a_lens_of_impossible_size_is_refused(side: object) -> None:
-    scene = make_scene(lines=1, stations=2, points=10)
-    _, lenses = warped_scene(scene)
-    data = lenses["left"].to_json()
-    assert lens_from_json(data).size_px == lenses["left"].size_px
-    for part in ("pinhole", "camera"):
-        with pytest.raises(WorkspaceError, match=r"cameras\.json"):
-            lens_from_json({**data, part: {**data[part], "width_px": side}})
+def test_a_lens_that_lacks_a_value_names_its_file() -> None:
+    with pytest.raises(WorkspaceError, match=r"cameras\.json"):
+        lens_from_json({"kind": "flat_port"})

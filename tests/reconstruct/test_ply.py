@@ -51,24 +51,22 @@ def test_a_file_that_is_cut_short_makes_no_points(tmp_path: Path, kind: str) -> 
     start = whole.index(b"end_header") + 11
     for end in (3, start - 1, start, start + 100):
         (tmp_path / "a.ply").write_bytes(whole[:end])
-        with pytest.raises(WorkspaceError, match=r"cut short|not a PLY"):
+        with pytest.raises(WorkspaceError):
             read_ply_points(tmp_path / "a.ply", 1000)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "reason"),
+    ("old", "new"),
     [
-        (b"vertex 50", b"vertex -5", "not the first"),
-        (b"vertex 50", b"vertex x", "not the first"),
-        (b"element vertex", b"element edge", "not the first"),
-        (b"property double x", b"property list uchar int x", "is not read"),
-        (b"property double x", b"property double y", "twice"),
-        (b"property double x", b"property double q", "lack x"),
-        (b"ascii 1.0", b"morse 1.0", "format 'morse'"),
+        (b"vertex 50", b"vertex -5"), (b"vertex 50", b"vertex x"),
+        (b"element vertex", b"element edge"),
+        (b"property double x", b"property list uchar int x"),
+        (b"property double x", b"property double y"), (b"property double x", b"property double q"),
+        (b"ascii 1.0", b"morse 1.0"),
     ],
-)
-def test_headers_that_do_not_hold(tmp_path: Path, old: bytes, new: bytes, reason: str) -> None:
+)  # fmt: skip
+def test_headers_that_do_not_hold(tmp_path: Path, old: bytes, new: bytes) -> None:
     path = ply(tmp_path / "a.ply", "ascii")
     path.write_bytes(path.read_bytes().replace(old, new, 1))
-    with pytest.raises(WorkspaceError, match=reason):
+    with pytest.raises(WorkspaceError):
         read_ply_points(path, 1000)

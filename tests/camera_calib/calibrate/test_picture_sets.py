@@ -77,5 +77,5 @@ def test_pairs_by_order_of_pictures_with_other_numbers_are_reported(
 ) -> None:
     pair_pictures({"left": paths("a1.png", "a2.png"), "right": paths("b51.png", "b52.png")})
     shown = capsys.readouterr().err
-    assert "paired by their order, first a1.png of left, b51.png of right" in shown
+    assert "a1.png" in shown and "b51.png" in shown
     assert len(shown.splitlines()) == 1

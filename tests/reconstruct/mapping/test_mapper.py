@@ -257,7 +257,7 @@ def test_pictures_that_share_nothing_give_one_clear_line(tmp_path: Path) -> None
     scene = make_scene(lines=1, stations=3, points=300)
     seen, lenses = seen_by_pinholes(scene)
     alone = Observations(images=seen.images, cameras=seen.cameras, pixels=seen.pixels, pairs=[])
-    with pytest.raises(ReconstructionError, match="no two of the 6 pictures"):
+    with pytest.raises(ReconstructionError, match="6 pictures"):
         map_calibrated(alone, scene.rig.cam_from_rig, lenses, tmp_path, 1)
 
 

@@ -54,7 +54,7 @@ def test_a_given_range_and_the_altitude_stand_in(tmp_path: Path) -> None:
     assert measured.source == "altitude"
     assert 2 / (1 / measured.near_m + 1 / measured.far_m) == pytest.approx(ALTITUDE_M + 0.03)
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
-    with pytest.raises(ReconstructionError, match="set working_range_m"):
+    with pytest.raises(ReconstructionError, match="working_range_m"):
         find_distances(blind, paths, scene.rig, given_m=None, ratio=0.8, executor=SERIAL)
 
 

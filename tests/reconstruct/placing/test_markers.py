@@ -115,7 +115,7 @@ def test_a_picture_without_markers_has_none() -> None:
 
 
 def test_an_unknown_dictionary_is_refused(workspace: Path) -> None:
-    with pytest.raises(ReconstructionError, match="no dictionary 'DICT_9X9'"):
+    with pytest.raises(ReconstructionError, match="DICT_9X9"):
         survey_control(workspace, dictionary="DICT_9X9")
 
 

@@ -99,28 +99,16 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
         )
         moved.append(RigidTransform.concatenate([world(turned), world(turned * arm)]))
     true = RigidTransform.concatenate([world(pose) for pose in both])
-    found = shape_covariances(
-        true,
-        np.array([7, 7]),
-        np.array([True, False]),
-        Uncertainty(
-            frames=np.array([1]), stations=np.array([7]), images=("a",),
-            frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
-            point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
-        ),
-        place,
+    known = Uncertainty(
+        frames=np.array([1]), stations=np.array([7]), images=("a",),
+        frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
+        point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
     )  # fmt: skip
-    assert_close(found, scatter(true, moved))
-    strange = shape_covariances(
-        true, np.array([8, 8]), np.array([True, False]),
-        Uncertainty(
-            frames=np.array([1]), stations=np.array([7]), images=("a",),
-            frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
-            point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
-        ),
-        place,
-    )  # fmt: skip
-    assert np.isnan(strange).all()
+    first = np.array([True, False])
+    assert_close(
+        shape_covariances(true, np.array([7, 7]), first, known, place), scatter(true, moved)
+    )
+    assert np.isnan(shape_covariances(true, np.array([8, 8]), first, known, place)).all()
 
 
 @pytest.mark.parametrize("angles_deg", [(0, 0, 0), (5, -8, 120), (20, 30, -170)])
