@@ -21,7 +21,8 @@ from typing import Any, ClassVar, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import AliceError, NavigationError, WorkspaceError, why
 from alice_survey.base.run import progress
 from alice_survey.base.run.resources import Meter, Spent, versions, watched
 
@@ -400,3 +401,42 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
         writer.writerow(header)
         for row in rows:
             writer.writerow(["" if cell is None or cell != cell else cell for cell in row])
+
+
+def read_csv(
+    path: Path,
+    required: Iterable[str] = (),
+    *,
+    exact: bool = False,
+    fault: type[AliceError] = NavigationError,
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Read a CSV file with a header.
+
+    Args:
+        path: the file, in UTF-8.
+        required: columns that must be there.
+        exact: keep spaces at the ends of cells, which names of files may have.
+        fault: type of the error.
+
+    Returns:
+        Names of the columns, and rows by column with the number of their line; a cell that a row
+        lacks is empty.
+
+    Raises:
+        AliceError: of type `fault`: the file cannot be read, or lacks a column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, restval="", skipinitialspace=not exact)
+            reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
+            numbered = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise fault(f"{path}: cannot be read: {why(error)}") from None
+    missing = [name for name in required if name not in names]
+    if missing:
+        raise fault(f"{path}: column {missing[0]} is missing; it has {shown(', '.join(names))}")
+    rows = [
+        (line, {name: row[name] if exact else row[name].strip() for name in names})
+        for line, row in numbered
+    ]
+    return names, rows

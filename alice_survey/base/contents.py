@@ -9,30 +9,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import AliceError, WorkspaceError, why
+from alice_survey.base.errors import WorkspaceError, why
 
 _SHOWN = 200
 
 
 @contextlib.contextmanager
-def taken_from(path: Path, fault: type[AliceError] = WorkspaceError) -> Iterator[None]:
+def taken_from(path: Path) -> Iterator[None]:
     """Within this block values are read from the contents of a file.
 
-    Args:
-        path: the file, for the message.
-        fault: what is raised.
-
     Raises:
-        AliceError: of the type `fault`, where a value is missing or of another type.
+        WorkspaceError: a value is missing or of another type.
     """
     try:
         yield
     except KeyError as error:
-        raise fault(
+        raise WorkspaceError(
             f"{path}: lacks {one_line(error)}; it was changed: delete it and run again"
         ) from None
     except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
-        raise fault(
+        raise WorkspaceError(
             f"{path}: is not as it was written ({one_line(error)}): delete it and run again"
         ) from None
 

@@ -3,7 +3,6 @@
 Pictures enter a reconstruction through `images/manifest.csv` only, never by a file-name trick.
 """
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from alice_survey.base.artefacts import write_csv
+from alice_survey.base.artefacts import read_csv, write_csv
 from alice_survey.base.errors import ImageError
 
 NAN = math.nan
@@ -76,19 +75,15 @@ def read_manifest(path: Path) -> list[ImageRecord]:
         ImageError: it is missing, lacks a column, holds a value that is not a number, names a
             picture twice, or a path that leaves its folder.
     """
+    _, rows = read_csv(path, exact=True, fault=ImageError)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = [{name: cell for name, cell in row.items() if name and cell} for row in reader]
-        records = _RECORDS.validate_python(rows)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ImageError(f"{path}: no CSV text in UTF-8: {error}") from None
+        records = _RECORDS.validate_python(
+            [{name: cell for name, cell in row.items() if name and cell} for _, row in rows]
+        )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         row, name = first["loc"]
-        raise ImageError(f"{path} line {int(row) + 2}: {name}: {first['msg']}") from None
+        raise ImageError(f"{path} line {rows[int(row)][0]}: {name}: {first['msg']}") from None
     for name, count in Counter(record.image for record in records).items():
         if count > 1:
             raise ImageError(f"{path}: picture {name} is named twice")

@@ -1,6 +1,5 @@
 """Poses of the body over time: the true track of a simulation, the navigation log of a dive."""
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.errors import NavigationError, why
+from alice_survey.base.artefacts import read_csv, write_csv
+from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array, attitude_from_rotation, rotation_from_attitude
 
 TRACK_COLUMNS = (
@@ -70,18 +69,10 @@ def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
         NavigationError: the file is missing, lacks a column, or holds a value that is not a finite
             number (the message gives its line).
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in required if name not in (reader.fieldnames or [])]
-            if missing:
-                raise NavigationError(f"{path}: column {missing[0]} is missing")
-            table = [
-                [_number(path, i, row, name) for name in required]
-                for i, row in enumerate(reader, 2)
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
+    table = [
+        [_number(path, line, row, name) for name in required]
+        for line, row in read_csv(path, required)[1]
+    ]
     values = np.asarray(table, dtype=np.float64).reshape(-1, len(required))
     return {name: values[:, i] for i, name in enumerate(required)}
 
@@ -89,7 +80,7 @@ def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
 def _number(path: Path, line: int, row: dict[str, str], name: str) -> float:
     try:
         value = float(row[name])
-    except (TypeError, ValueError):
+    except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise NavigationError(f"{path} line {line}: {name} is {row[name]!r}, not a finite number")

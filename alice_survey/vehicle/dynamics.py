@@ -150,6 +150,19 @@ def add_coriolis(body: Body, nu: Array, force: Array) -> None:
 
 
 @kernel
+def add_weight(body: Body, r20: float, r21: float, r22: float, force: Array) -> None:
+    """Add weight and buoyancy along the body's down, (r20, r21, r22), to a force (6,)."""
+    net, weight = body.weight_n - body.buoyancy_n, body.weight_n
+    gx, gy, gz = body.cg[0], body.cg[1], body.cg[2]
+    force[0] += net * r20
+    force[1] += net * r21
+    force[2] += net * r22
+    force[3] += weight * (gy * r22 - gz * r21)
+    force[4] += weight * (gz * r20 - gx * r22)
+    force[5] += weight * (gx * r21 - gy * r20)
+
+
+@kernel
 def derivative(
     time_s: float,
     state: Array,
@@ -192,15 +205,7 @@ def derivative(
     add_thrust(plant.propulsion, state[13:], nu, force)
     add_damping(body, nu, force)
     add_coriolis(body, nu, force)
-    # Weight and buoyancy along the body's down, (r20, r21, r22).
-    net, weight = body.weight_n - body.buoyancy_n, body.weight_n
-    gx, gy, gz = body.cg[0], body.cg[1], body.cg[2]
-    force[0] += net * r20
-    force[1] += net * r21
-    force[2] += net * r22
-    force[3] += weight * (gy * r22 - gz * r21)
-    force[4] += weight * (gz * r20 - gx * r22)
-    force[5] += weight * (gx * r21 - gy * r20)
+    add_weight(body, r20, r21, r22, force)
     # A current that changes along the way down, and in time.
     along_n, along_e = water[4] * out[2], water[5] * out[2]
     if along_n != 0.0 or along_e != 0.0 or water[2] != 0.0 or water[3] != 0.0:

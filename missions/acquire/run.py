@@ -16,11 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import (
-    atomic_path,
-    write_csv,
-    write_json,
-)
+from alice_survey.base.artefacts import atomic_path, write_csv, write_json
 from alice_survey.base.config import CameraConfig, ImagingConfig, SeafloorConfig, WaterConfig
 from alice_survey.base.errors import ImageError, NavigationError
 from alice_survey.base.executor import Executor
@@ -60,8 +56,9 @@ class _Shoot:
     water: WaterConfig
     imaging: ImagingConfig
     seed: int
-    exposure_s: float
-    altitude_m: float
+    exposure_s: float = 0.0
+    """Of a survey's pictures, as the altitude; a pool's board stands still."""
+    altitude_m: float = 0.0
     stamp: tuple[int, ...] = ()
     """Size and time of the files that workers read, so that none keeps what has changed."""
 
@@ -82,15 +79,7 @@ def run_pool(
     rng = np.random.default_rng([seed, _POOL_STREAM])
     poses = pool_poses(board, rig, imaging.pool_views, rng)
     shown = board_records(rig, poses)
-    shoot = _Shoot(
-        folder=folder,
-        camera=camera,
-        water=water,
-        imaging=imaging,
-        seed=seed,
-        exposure_s=0.0,
-        altitude_m=0.0,
-    )
+    shoot = _Shoot(folder=folder, camera=camera, water=water, imaging=imaging, seed=seed)
     jobs = [
         (shoot, board, view, name, rig.cameras[name], pose.as_matrix())
         for view, by_camera in enumerate(shown)

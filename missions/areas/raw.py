@@ -56,19 +56,15 @@ class RawShapes:
         """Whether there is neither a polygon, a line nor a point."""
         return not (self.polygons or self.lines or len(self.points))
 
-    def mapped(
-        self, change: Callable[[Array, str], Array], *, geographic: bool, origin: str | None = None
-    ) -> "RawShapes":
+    def mapped(self, change: Callable[[Array, str], Array], *, geographic: bool) -> "RawShapes":
         """The shapes with other coordinates.
 
         Args:
             change: takes (N, 2) coordinates and their name, such as `polygon 2, hole 1`.
             geographic: what they are then.
-            origin: its new name; the old one unless given.
         """
         return replace(
             self,
-            origin=origin or self.origin,
             geographic=geographic,
             polygons=tuple(
                 tuple(change(ring, self.ring_name(i, j)) for j, ring in enumerate(rings))

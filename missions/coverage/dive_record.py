@@ -4,24 +4,23 @@ Logs are of the body's origin, and so is what `import-log` writes; the cameras' 
 rig. What cannot be used is left out and reported, never silently filled in.
 """
 
-import csv
 import math
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.contents import shown
-from alice_survey.base.errors import NavigationError, warn, why
+from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.stations import MOST_ALTITUDES, Stations
-from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
+from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation, utc_date
 from missions.values.footprint import glass_point_cam
 from missions.values.plan_file import Plan
 
@@ -140,27 +139,24 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
     Raises:
         NavigationError: it cannot be read, or a time is none or does not follow the one before.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            reader.fieldnames = [name.strip() for name in reader.fieldnames or []]
-            rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
-    names = list(reader.fieldnames or [])
+    names, rows = read_csv(path)
     dated = "time_s" not in names
     if dated and "time_utc" not in names:
         raise NavigationError(
             f"{path}: no column time_s or time_utc; it has {shown(', '.join(names))}"
         )
-    if dated and nav.start_utc is None:
+    start = nav.start_utc if dated else None
+    if dated and start is None:
         raise NavigationError(f"{path} has dates and the log has none: give time_s")
     times, lines = [], []
     for number, row in rows:
         try:
-            times.append(_since_start(row["time_utc"], nav) if dated else float(row["time_s"]))
+            if start is not None:
+                times.append((utc_date(row["time_utc"]) - start).total_seconds())
+            else:
+                times.append(float(row["time_s"]))
             lines.append(_line_number(row["line"]) if "line" in names else -1)
-        except (TypeError, ValueError) as error:
+        except ValueError as error:
             raise NavigationError(f"{path} line {number}: {shown(str(error))}") from None
         if not math.isfinite(times[-1]) or (len(times) > 1 and times[-1] <= times[-2]):
             raise NavigationError(
@@ -180,14 +176,6 @@ def _line_number(cell: str) -> int:
     if abs(number) > _MOST_TRIGGERS:
         raise ValueError(f"line is {cell:.60}")
     return number
-
-
-def _since_start(cell: str | None, nav: NavigationLog) -> float:
-    """Seconds of a date, UTC where it names no zone, since the log's first row."""
-    if nav.start_utc is None:
-        raise ValueError("the log has no dates")
-    date = datetime.fromisoformat((cell or "").strip())
-    return ((date if date.tzinfo else date.replace(tzinfo=UTC)) - nav.start_utc).total_seconds()
 
 
 def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:

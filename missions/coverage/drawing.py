@@ -16,7 +16,6 @@ from alice_survey.kit.figure import (
     Axes,
     BoundaryNorm,
     LinearSegmentedColormap,
-    LineCollection,
     ListedColormap,
     Outline,
     PathPatch,
@@ -33,9 +32,8 @@ from missions.coverage.holes import Hole
 from missions.coverage.raster import Grid
 from missions.coverage.stations import Stations
 from missions.values.area import Area
-from missions.values.line import Line
 
-_AREA, _HOLE, _TRACK, _AGAIN = "#17202a", "#c0392b", "#17202a", "#d35400"
+_AREA, _HOLE, _TRACK = "#17202a", "#c0392b", "#17202a"
 _NONE = "#f5b7b1"
 _SEEN = LinearSegmentedColormap.from_list("seen", ["#d6eaf8", "#5dade2", "#1f618d", "#0b2239"])
 _RISK = LinearSegmentedColormap.from_list("risk", ["#e8f8f5", "#f7dc6f", "#e67e22", "#78281f"])
@@ -58,9 +56,7 @@ def draw_certificate(
     certificate: Certificate,
     holes: Sequence[Hole],
     title: str,
-    *,
-    stations: Stations | None = None,
-    again: Sequence[Line] = (),
+    stations: Stations,
 ) -> None:
     """Draw how many pictures of all cameras see each place, with the holes outlined.
 
@@ -70,13 +66,12 @@ def draw_certificate(
         holes: its holes, worst first; the first ones are numbered.
         title: of the map.
         stations: where pictures were taken, to be drawn as points.
-        again: lines that fly the holes again.
     """
     figure, axes = map_sheet(_bounds(certificate.area))
     draw_counts(axes, certificate)
     draw_polygons(axes, certificate.area.survey, "survey area", edgecolor=_AREA, lw=1.4)
     _draw_no_go(axes, certificate.area)
-    if stations is not None and len(stations):
+    if len(stations):
         size = 5.0 if len(stations) < 1500 else 1.5
         axes.scatter(
             stations.glass_ne[:, 1], stations.glass_ne[:, 0], s=size, color=_TRACK, lw=0,
@@ -87,13 +82,6 @@ def draw_certificate(
         draw_polygons(axes, hole.outline, label, edgecolor=_HOLE, lw=1.6)
         if index < _NUMBERED:
             _number(axes, hole, index + 1)
-    if again:
-        ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in again]
-        axes.add_collection(
-            LineCollection(
-                ends, colors=_AGAIN, linewidths=1.8, zorder=5, label="lines to fly again"
-            )
-        )
     finish_map(figure, axes, certificate.area.datum, title, _figures(certificate, holes))
     save_figure(figure, path)
 

@@ -91,7 +91,6 @@ def gain_report(
     *,
     present_gain_db: float | None = None,
     linear: bool = False,
-    target: float = MIDDLE_GREY,
 ) -> tuple[str, dict[str, Any]]:
     """The gain to set, as text and as JSON values.
 
@@ -99,14 +98,11 @@ def gain_report(
         pictures: a folder, or a pattern such as `control/*.png`.
         present_gain_db: at which they were taken; the change is reported relative to it when None.
         linear: grey values are proportional to light; else they follow the sRGB curve.
-        target: share of full scale, linear, that the median is to have.
 
     Raises:
         ImageError: no picture can be read, or all are black or white; the message says what to do.
     """
-    advice = gain_advice(
-        picture_files(pictures), present_gain_db=present_gain_db, linear=linear, target=target
-    )
+    advice = gain_advice(picture_files(pictures), present_gain_db=present_gain_db, linear=linear)
     return _text(advice, linear=linear), asdict(advice)
 
 
@@ -134,11 +130,8 @@ def gain_advice(
     *,
     present_gain_db: float | None = None,
     linear: bool = False,
-    target: float = MIDDLE_GREY,
 ) -> GainAdvice:
     """The gain to set for pictures like these; as `gain_report`."""
-    if not 0.0 < target < _HIGHLIGHT:
-        raise ImageError(f"target {target:g}: a share of full scale between 0 and {_HIGHLIGHT:g}")
     levels = []
     for file in progress(files, "control pictures"):
         picture = read_linear(file, linear=linear)
@@ -151,7 +144,7 @@ def gain_advice(
     )
     clipped = float(np.median([p.clipped for p in levels]))
     _refuse_useless(levels, median, bright, clipped)
-    by_median, by_highlights = _db(target / max(median, 1e-9)), _db(_HIGHLIGHT / bright)
+    by_median, by_highlights = _db(MIDDLE_GREY / max(median, 1e-9)), _db(_HIGHLIGHT / bright)
     change = min(by_median, by_highlights)
     snr = float(np.median([p.median / max(p.noise, 1e-9) for p in levels]))
     return GainAdvice(
@@ -165,7 +158,7 @@ def gain_advice(
         change_db=change,
         present_gain_db=present_gain_db,
         gain_db=None if present_gain_db is None else present_gain_db + change,
-        target=target,
+        target=MIDDLE_GREY,
         bound_by="median" if by_median <= by_highlights else "highlights",
         advice=tuple(_advice(levels, change, by_median, snr, clipped, present_gain_db)),
         levels=tuple(levels),

@@ -210,7 +210,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
     write_coverage_tif(folder / "coverage.tif", check.flown)
     draw_certificate(
         folder / "coverage.png", check.flown, check.holes, f"{check.plan.name}: as flown",
-        stations=check.record.stations,
+        check.record.stations,
     )  # fmt: skip
     write_json(folder / "certificate.json", data)
 

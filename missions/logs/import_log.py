@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
-from missions.logs.navigation_csv import csv_rows, longest_gap_s, utc_date
+from missions.logs.navigation_csv import longest_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
@@ -328,7 +329,7 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
         return metres
     column = "time_utc" if dated else "time_s"
     try:
-        names, rows = csv_rows(path)
+        names, rows = read_csv(path)
     except NavigationError as error:
         raise NavigationError(f"--tide is neither metres nor a CSV: {error}") from None
     for name in (column, "height_m"):
@@ -340,9 +341,9 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
     times, heights = [], []
     for line, row in rows:
         try:
-            cell = (row[column] or "").strip()
+            cell = row[column]
             times.append(utc_date(cell).timestamp() if dated else float(cell))
-            heights.append(float(row["height_m"] or ""))
+            heights.append(float(row["height_m"]))
         except ValueError:
             raise NavigationError(
                 f"{path} line {line}: {row[column]!r}, {row['height_m']!r}: not a time and a height"

@@ -1,18 +1,17 @@
 """A navigation log of a real dive, and what it gives at the time of each picture."""
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
-from typing import Any
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.contents import shown
-from alice_survey.base.errors import NavigationError, warn, why
+from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array
 from missions.values.navigation import COLUMNS
 
@@ -116,22 +115,6 @@ def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
         raise ValueError(f"{text} is not within the years 1 to 9999 in UTC") from None
 
 
-def csv_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
-    """Names of a CSV's columns, and its rows with the number of their line.
-
-    Raises:
-        NavigationError: the file cannot be read.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = header
-            return header, [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
-
-
 def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
     """Read a navigation CSV: `time_s` or `time_utc`, latitude, longitude, depth, and optional rest.
 
@@ -145,16 +128,11 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
     Raises:
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
-    header, rows = csv_rows(path)
+    header, rows = read_csv(path, POSITION)
     time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
     if time_name is None:
         raise NavigationError(
             f"{path}: no column time_s or time_utc; it has {shown(', '.join(header))}"
-        )
-    missing = [name for name in POSITION if name not in header]
-    if missing:
-        raise NavigationError(
-            f"{path}: column {missing[0]} is missing; it has {shown(', '.join(header))}"
         )
     names = [*POSITION, *(name for name in OPTIONAL if name in header)]
     start: datetime | None = None
@@ -178,7 +156,7 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
         rest = []
         for name in names[len(POSITION) :]:
             try:
-                rest.append(_number(row, name) if (row[name] or "").strip() else math.nan)
+                rest.append(_number(row, name) if row[name] else math.nan)
             except ValueError as error:
                 faults.append((line, f"{error} (that value only)"))
                 rest.append(math.nan)
@@ -212,10 +190,10 @@ def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
     ]
 
 
-def _number(row: dict[str, str | None], name: str) -> float:
-    cell = row.get(name)
+def _number(row: dict[str, str], name: str) -> float:
+    cell = row[name]
     try:
-        value = float(cell or "")
+        value = float(cell)
     except ValueError:
         raise ValueError(f"{name} is {cell!r}, not a number") from None
     if not math.isfinite(value):
@@ -226,9 +204,9 @@ def _number(row: dict[str, str | None], name: str) -> float:
     return value
 
 
-def _date(cell: str | None, zone: tzinfo) -> datetime:
+def _date(cell: str, zone: tzinfo) -> datetime:
     try:
-        return utc_date((cell or "").strip(), zone)
+        return utc_date(cell, zone)
     except ValueError:
         raise ValueError(f"time_utc is {cell!r}, not a date such as 2024-05-01T12:00:00Z") from None
 

@@ -1,6 +1,5 @@
 """The overlaps that a flight reached, from the true poses and the true cameras."""
 
-import csv
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations, pairwise
@@ -13,6 +12,7 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.trajectory import read_columns
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_polygon
 from missions.values.plan_file import Plan
@@ -48,11 +48,11 @@ def overlaps_reached(
     camera = rig.cameras[rig.reference]
     image_of = {r.station: r.image for r in records if r.camera == rig.reference}
     lines: dict[int, list[Polygon]] = {}
-    with triggers.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            pose = poses[image_of[int(row["station"])]]
-            polygon = footprint_polygon(camera, pose, plan.seafloor_depth_m)
-            lines.setdefault(int(row["line"]), []).append(polygon)
+    columns = read_columns(triggers, ("station", "line")).values()
+    for station, line in np.column_stack(list(columns)).astype(int).tolist():
+        pose = poses[image_of[station]]
+        polygon = footprint_polygon(camera, pose, plan.seafloor_depth_m)
+        lines.setdefault(line, []).append(polygon)
     forward = [
         one.intersection(other).area / one.area
         for line in lines.values()

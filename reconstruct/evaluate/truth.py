@@ -1,6 +1,5 @@
 """What only the evaluation may read: the truth next to simulated pictures."""
 
-import csv
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -30,8 +30,8 @@ def read_true_poses(path: Path) -> dict[str, RigidTransform]:
     """`ned_from_cam` (entrance pupil) of every picture, from `poses.csv` of the truth."""
     columns = ("north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
     values = np.column_stack(list(read_columns(path, columns).values()))
-    with taken_from(path), path.open(newline="", encoding="utf-8") as file:
-        names = [row["image"] for row in csv.DictReader(file)]
+    with taken_from(path):
+        names = [row["image"] for _, row in read_csv(path, exact=True)[1]]
         poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
         return {name: poses[i] for i, name in enumerate(names)}
 

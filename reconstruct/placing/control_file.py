@@ -17,15 +17,14 @@ from 0 at the middle of the first pixel as viewers show them, and `sigma_px` (0.
 marker `7` has the corners `7.0` to `7.3`, clockwise from its own upper left, and `7` is its middle.
 """
 
-import csv
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum
 from alice_survey.stages import CONTROL_FILES
@@ -120,7 +119,7 @@ def read_control(path: Path) -> Control:
         WorkspaceError: it cannot be read, or a row is wrong; the message names the line.
     """
     points, lengths = [], []
-    for line, row in _rows(path, {"kind", "name", "use"}):
+    for line, row in read_csv(path, ("kind", "name", "use"), fault=WorkspaceError)[1]:
         kind, name, use = row["kind"], row["name"], row["use"]
         if use not in ("control", "check"):
             raise WorkspaceError(f"{path} line {line}: use is {use!r}, not control or check")
@@ -154,7 +153,7 @@ def read_picks(path: Path) -> list[Pick]:
         WorkspaceError: it cannot be read, or a row is wrong.
     """
     picks = []
-    for line, row in _rows(path, {"image", "point", "x", "y"}):
+    for line, row in read_csv(path, ("image", "point", "x", "y"), fault=WorkspaceError)[1]:
         if not row["x"] and not row["y"]:
             continue
         x, y = _number(path, line, row, "x"), _number(path, line, row, "y")
@@ -226,21 +225,6 @@ def _unproject(path: Path, line: int, epsg: float, x: float, y: float) -> tuple[
     except (ValueError, CRSError, ProjError) as error:
         raise WorkspaceError(f"{path} line {line}: epsg {epsg}: {error}") from None
     return float(place[0]), float(place[1])
-
-
-def _rows(path: Path, needed: set[str]) -> Sequence[tuple[int, dict[str, str]]]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            missing = needed - set(reader.fieldnames or [])
-            if missing:
-                raise WorkspaceError(f"{path}: column {min(missing)} is missing")
-            return [
-                (line, {k: (v or "").strip() for k, v in row.items() if isinstance(k, str)})
-                for line, row in enumerate(reader, 2)
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise WorkspaceError(f"{path}: cannot be read: {error}") from None
 
 
 def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:

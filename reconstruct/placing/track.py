@@ -5,7 +5,6 @@ frame's unit) and of its rotation about the same three axes, radians: the true p
 `exp(rotation) * attitude` at `position + shift`.
 """
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import atomic_path, write_csv, write_json
+from alice_survey.base.artefacts import atomic_path, read_csv, write_csv, write_json
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
@@ -307,20 +306,13 @@ def read_track_poses(path: Path) -> dict[str, RigidTransform]:
     Raises:
         WorkspaceError: the file is missing or no track.
     """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise WorkspaceError(f"{path}: no CSV text in UTF-8: {error}") from None
     poses = {}
-    for line, row in enumerate(rows, 2):
+    for line, row in read_csv(path, exact=True, fault=WorkspaceError)[1]:
         axes = next((a for a in (_NED, _MODEL_SCALED, _MODEL) if a[0] in row), _NED)
         try:
             position = np.array([float(row[name]) for name in axes])
             rotation = Rotation.from_quat([float(row[name]) for name in _QUATERNION])
             poses[row["image"]] = RigidTransform.from_components(position, rotation)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, ValueError) as error:
             raise WorkspaceError(f"{path} line {line}: no pose: {one_line(error)}") from None
     return poses

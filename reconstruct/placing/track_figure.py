@@ -6,6 +6,7 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -143,10 +144,7 @@ def _mean(angles: Array) -> float:
 
 def _stations(track_csv: Path) -> list[str]:
     """The first picture of every station, by time where known, else by number."""
-    import csv
-
-    with track_csv.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = [row for _, row in read_csv(track_csv, exact=True)[1]]
     timed = all(row["time_s"] for row in rows)
     rows.sort(key=lambda r: (float(r["time_s"]) if timed else 0.0, int(r["station"]), r["image"]))
     first: dict[int, str] = {}

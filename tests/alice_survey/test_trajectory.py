@@ -87,7 +87,7 @@ def test_a_file_without_rows_gives_empty_columns(tmp_path: Path) -> None:
         ("a,b\n1,2\n3,nan\n", "line 3: b is 'nan', not a finite number"),
         ("a,b\n1,inf\n", "line 2: b is 'inf'"),
         ("a,b\n1,\n", "line 2: b is ''"),
-        ("a,b\n1\n", "line 2: b is None"),
+        ("a,b\n1\n", "line 2: b is ''"),
         ("a,b\nten,1\n", "line 2: a is 'ten'"),
     ],
 )

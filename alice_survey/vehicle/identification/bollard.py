@@ -7,7 +7,6 @@ joined by `+`, as in `port+starboard`, and share their coefficients.
 The force is net of what the vehicle's model takes off at rest, such as thrust deduction.
 """
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.propulsion import add_thrust
@@ -57,15 +57,8 @@ def read_pulls(path: Path) -> list[Pull]:
         VehicleError: the file cannot be read, lacks a column, has no rows, or holds a value that is
             not a number, or a force against its speed.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            for name in ("thruster", "rpm", "force_n"):
-                if name not in (reader.fieldnames or []):
-                    raise VehicleError(f"{path}: column {name} is missing")
-            pulls = [_pull(path, line, row) for line, row in enumerate(reader, 2)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise VehicleError(f"{path}: cannot be read: {error}") from None
+    _, rows = read_csv(path, ("thruster", "rpm", "force_n"), fault=VehicleError)
+    pulls = [_pull(path, line, row) for line, row in rows]
     if not pulls:
         raise VehicleError(f"{path}: has no rows")
     return pulls
@@ -153,12 +146,12 @@ def _pull(path: Path, line: int, row: dict[str, str]) -> Pull:
     for name in ("rpm", "force_n"):
         try:
             value = float(row[name])
-        except (TypeError, ValueError):
+        except ValueError:
             value = float("nan")
         if not np.isfinite(value):
             raise VehicleError(f"{path} line {line}: {name} is {row[name]!r}, not a finite number")
         values.append(value)
-    names = tuple(part.strip() for part in (row["thruster"] or "").split("+"))
+    names = tuple(part.strip() for part in row["thruster"].split("+"))
     if not all(names):
         raise VehicleError(f"{path} line {line}: thruster is missing")
     rpm, force = values

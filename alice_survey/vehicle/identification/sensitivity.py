@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
+from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
 from alice_survey.vehicle.propulsion import Propulsion, add_thrust
 from alice_survey.vehicle.rotations import matrix_rows
 
@@ -112,14 +112,7 @@ def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Arr
     add_thrust(physics.propulsion, rps, nu, force)
     add_damping(body, nu, force)
     add_coriolis(body, nu, force)
-    net, weight = body.weight_n - body.buoyancy_n, body.weight_n
-    gx, gy, gz = body.cg[0], body.cg[1], body.cg[2]
-    force[0] += net * r20
-    force[1] += net * r21
-    force[2] += net * r22
-    force[3] += weight * (gy * r22 - gz * r21)
-    force[4] += weight * (gz * r20 - gx * r22)
-    force[5] += weight * (gx * r21 - gy * r20)
+    add_weight(body, r20, r21, r22, force)
 
 
 @kernel

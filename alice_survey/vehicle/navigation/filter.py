@@ -219,6 +219,20 @@ def _velocity_sigma(sensors: Sensors) -> float:
 
 
 @kernel
+def correlated_states(sensors: Sensors) -> tuple[tuple[int, float, float], ...]:
+    """Gauss-Markov processes, first the instruments' biases: state, correlation time, sigma."""
+    compass, pressure, gps = sensors.compass, sensors.pressure, sensors.gps
+    return (
+        (HEADING_BIAS, compass.bias_correlation_s, compass.bias_sigma_rad),
+        (DEPTH_BIAS, pressure.bias_correlation_s, pressure.bias_sigma_m),
+        (GPS_BIAS, gps.bias_correlation_s, gps.bias_sigma_m),
+        (GPS_BIAS + 1, gps.bias_correlation_s, gps.bias_sigma_m),
+        (WATER, sensors.current_correlation_s, sensors.current_sigma_mps),
+        (WATER + 1, sensors.current_correlation_s, sensors.current_sigma_mps),
+    )
+
+
+@kernel
 def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
     """Propagate estimate and covariance by the IMU's increments in `readings`.
 
@@ -251,14 +265,7 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
     turn(attitude, angle)
     matrix_of(attitude, turned)
     _turn_by_bias(nav)
-    for i, correlation_s in (
-        (HEADING_BIAS, sensors.compass.bias_correlation_s),
-        (DEPTH_BIAS, sensors.pressure.bias_correlation_s),
-        (GPS_BIAS, sensors.gps.bias_correlation_s),
-        (GPS_BIAS + 1, sensors.gps.bias_correlation_s),
-        (WATER, sensors.current_correlation_s),
-        (WATER + 1, sensors.current_correlation_s),
-    ):
+    for i, correlation_s, _ in correlated_states(sensors):
         nav.scratch[KEPT, i] = math.exp(-dt_s / correlation_s)
         x[i + 1] *= nav.scratch[KEPT, i]
     _propagate(dt_s, sensors, nav)
@@ -372,14 +379,7 @@ def _add_noise(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
         for i, both in ((0, v * r2 - w * r1), (1, w * r0 - u * r2), (2, u * r1 - v * r0)):
             p[VELOCITY + i, ATTITUDE + j] += both
             p[ATTITUDE + j, VELOCITY + i] += both
-    for i, sigma in (
-        (HEADING_BIAS, sensors.compass.bias_sigma_rad),
-        (DEPTH_BIAS, sensors.pressure.bias_sigma_m),
-        (GPS_BIAS, sensors.gps.bias_sigma_m),
-        (GPS_BIAS + 1, sensors.gps.bias_sigma_m),
-        (WATER, sensors.current_sigma_mps),
-        (WATER + 1, sensors.current_sigma_mps),
-    ):
+    for i, _, sigma in correlated_states(sensors):
         kept = nav.scratch[KEPT, i]
         p[i, i] += (1.0 - kept * kept) * sigma * sigma
 

@@ -76,6 +76,7 @@ from alice_survey.vehicle.navigation.filter import (
     WATER_VELOCITY,
     NavigationState,
     correct,
+    correlated_states,
     lever_row,
     predict,
     use_beams,
@@ -400,13 +401,7 @@ def drift(dt_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Ge
         hidden[i] += imu.gyro_bias_walk_radps_per_sqrt_s * root * rng.standard_normal()
     for i in range(ACCELEROMETER_BIAS - GYRO_BIAS, ACCELEROMETER_BIAS - GYRO_BIAS + 3):
         hidden[i] += imu.accelerometer_bias_walk_mps2_per_sqrt_s * root * rng.standard_normal()
-    compass, pressure, gps = sensors.compass, sensors.pressure, sensors.gps
-    for i, correlation_s, sigma in (
-        (HEADING_BIAS, compass.bias_correlation_s, compass.bias_sigma_rad),
-        (DEPTH_BIAS, pressure.bias_correlation_s, pressure.bias_sigma_m),
-        (GPS_BIAS, gps.bias_correlation_s, gps.bias_sigma_m),
-        (GPS_BIAS + 1, gps.bias_correlation_s, gps.bias_sigma_m),
-    ):
+    for i, correlation_s, sigma in correlated_states(sensors)[:-2]:  # the water is no instrument
         kept = math.exp(-dt_s / correlation_s)
         draw = sigma * math.sqrt(1.0 - kept * kept) * rng.standard_normal()
         hidden[i - GYRO_BIAS] = kept * hidden[i - GYRO_BIAS] + draw
