@@ -57,14 +57,14 @@ def highest_within(
     heading_rad: float,
     ahead_m: float,
     astern_m: float,
-    beside_m: float,
+    across_m: float,
     step_m: float,
 ) -> float:
     """The least depth on a fine grid about a place, turned with the vehicle."""
     least = math.inf
     for ahead in np.arange(-astern_m, ahead_m + step_m / 2, step_m):
-        for beside in np.arange(-beside_m, beside_m + step_m / 2, step_m):
-            north = place_ne[0] + ahead * math.cos(heading_rad) - beside * math.sin(heading_rad)
-            east = place_ne[1] + ahead * math.sin(heading_rad) + beside * math.cos(heading_rad)
+        for across in np.arange(-across_m, across_m + step_m / 2, step_m):
+            north = place_ne[0] + ahead * math.cos(heading_rad) - across * math.sin(heading_rad)
+            east = place_ne[1] + ahead * math.sin(heading_rad) + across * math.cos(heading_rad)
             least = min(least, float(depth_at(np.array([[north, east]]))[0]))
     return least

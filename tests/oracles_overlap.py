@@ -63,12 +63,12 @@ def measured_side_overlap(rig: Rig, stations: Stations, camera: str | None = Non
     shares, measured = [], []
     for index in lines:
         for s in np.flatnonzero(stations.line == index).tolist():
-            beside = _beside(stations, s, index, ways)
-            if beside is None:
+            neighbour = _neighbour(stations, s, index, ways)
+            if neighbour is None:
                 continue
             points = _middle_row(rig, name, stations, s)
             seen = np.zeros(len(points), dtype=bool)
-            for other in _nearest(stations, s, beside):
+            for other in _nearest(stations, s, neighbour):
                 seen |= _sees(rig, name, stations, other, points)
             shares.append(float(seen.mean()))
             measured.append(s)
@@ -89,7 +89,7 @@ def _direction(stations: Stations, line: int) -> Array:
     return np.array([math.cos(heading), math.sin(heading)])
 
 
-def _beside(stations: Stations, s: int, line: int, ways: dict[int, Array]) -> int | None:
+def _neighbour(stations: Stations, s: int, line: int, ways: dict[int, Array]) -> int | None:
     """The nearest parallel line to starboard of a picture that it does not lie beyond an end of."""
     ahead = ways[line]
     starboard = np.array([-ahead[1], ahead[0]])

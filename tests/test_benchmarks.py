@@ -177,11 +177,11 @@ def three_runs(folder: Path) -> list[Run]:
 def test_repeats_become_median_and_spread(tmp_path: Path) -> None:
     found = table.outcome("part", "python -m part", three_runs(tmp_path))
 
-    beside, alone, speed = found.figures
-    assert (beside.median, beside.least, beside.most, beside.repeats) == (3.0, 1.0, 8.0, 3)
-    assert (beside.peer, beside.peer_median) == ("slow | old", 4.0)
-    assert beside.ratio == 0.75  # the median of 0.75, 0.25 and 4
-    assert beside.goal is None
+    compared, alone, speed = found.figures
+    assert (compared.median, compared.least, compared.most, compared.repeats) == (3.0, 1.0, 8.0, 3)
+    assert (compared.peer, compared.peer_median) == ("slow | old", 4.0)
+    assert compared.ratio == 0.75  # the median of 0.75, 0.25 and 4
+    assert compared.goal is None
     assert (alone.peer, alone.ratio, alone.goal) == (None, None, "<= 9")
     assert (alone.met, alone.judged) == (3, 3)
     assert (speed.met, speed.judged) == (2, 3)

@@ -54,8 +54,10 @@ def test_the_small_survey_is_reconstructed(undisturbed: Path) -> None:
 
 def test_every_stage_is_reported(undisturbed: Path) -> None:
     lines = undisturbed.with_suffix(".jsonl").read_text().splitlines()
-    told = [json.loads(line) for line in lines]
-    run = told[: 1 + next(i for i, event in enumerate(told) if event["event"] == "run_finished")]
+    events = [json.loads(line) for line in lines]
+    run = events[
+        : 1 + next(i for i, event in enumerate(events) if event["event"] == "run_finished")
+    ]
     assert run[0]["event"] == "run_started"
     assert run[-1]["exit_code"] == 0
     for name in ("stage_started", "stage_finished"):

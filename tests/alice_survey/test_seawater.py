@@ -20,9 +20,9 @@ def test_anchors_of_the_levant_sea(capsys: pytest.CaptureFixture[str]) -> None:
     got = n_water(24.0, 39.0, 0.0, [460.0, 530.0, 610.0])
 
     np.testing.assert_allclose(got, [1.3455, 1.3419, 1.3391], atol=5.1e-5)
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "salinity_psu = 39 is beyond the 0 to 35 psu" in told
+    warning = capsys.readouterr().err
+    assert warning.count("\n") == 1
+    assert "salinity_psu = 39 is beyond the 0 to 35 psu" in warning
     n_water(24.0, 35.0, 0.0, 530.0)
     assert capsys.readouterr().err == ""
 

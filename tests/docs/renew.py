@@ -47,9 +47,9 @@ def renew(made: Path, out: Path) -> None:
     png(out / "plan.png", to_width(read(reef / "plan/map.png"), 800))
     png(out / "flight.png", to_width(read(reef / "flight/track.png"), 1400))
     pair = [read(reef / f"images/{side}/{STATION:06d}.png") for side in ("left", "right")]
-    jpeg(out / "pictures.jpg", beside([*pair, read(reef / "pool/left/03.png")], 338))
+    jpeg(out / "pictures.jpg", side_by_side([*pair, read(reef / "pool/left/03.png")], 338))
     surface = [cut(read(reef / "dense/dem.png")), read(reef / "mosaic/track.png")]
-    jpeg(out / "surface.jpg", beside(surface, 620))
+    jpeg(out / "surface.jpg", side_by_side(surface, 620))
     jpeg(out / "mesh.jpg", to_width(cut(read(reef / "mesh/mesh.png")), 1000))
     png(out / "errors.png", read(reef / "evaluation/errors.png"))
     photograph(reef / "report/report.html", out / "report.jpg")
@@ -87,7 +87,7 @@ def scaled(picture: Picture, by: float) -> Picture:
     return np.asarray(cv2.resize(picture, None, fx=by, fy=by, interpolation=how), np.uint8)
 
 
-def beside(pictures: list[Picture], height: int) -> Picture:
+def side_by_side(pictures: list[Picture], height: int) -> Picture:
     """Pictures of one height with gaps between them."""
     row = []
     for picture in pictures:

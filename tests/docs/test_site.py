@@ -41,9 +41,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text=True,
         timeout=300,
     )
-    told = built.stdout + built.stderr
-    assert built.returncode == 0, told[-3000:]
-    assert "WARNING" not in told, told[-3000:]
+    output = built.stdout + built.stderr
+    assert built.returncode == 0, output[-3000:]
+    assert "WARNING" not in output, output[-3000:]
     return folder
 
 

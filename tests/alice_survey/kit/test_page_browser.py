@@ -218,9 +218,9 @@ def test_ruler_measures_between_clicks(page: Any) -> None:
 def test_popups(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))
     popup = page.locator(".leaflet-popup-content")
-    told = popup.inner_text().split("\n")
-    assert told[0] == "Check points"
-    assert told[-1] == "Point A: 1.2 mm east, 0.4 mm north, 2.2 mm up"
+    lines = popup.inner_text().split("\n")
+    assert lines[0] == "Check points"
+    assert lines[-1] == "Point A: 1.2 mm east, 0.4 mm north, 2.2 mm up"
     page.keyboard.press("Escape")
     popup.wait_for(state="detached")
 
@@ -279,12 +279,12 @@ def test_no_fault_that_axe_finds(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))  # with a popup open
     found = Axe().run(page, options={"runOnly": rules, "resultTypes": ["violations"]})
     page.keyboard.press("Escape")
-    told = [
+    faults = [
         f"{fault['id']}: {node['html'][:160]}"
         for fault in found.response["violations"]
         for node in fault["nodes"]
     ]
-    assert told == []
+    assert faults == []
     assert len(found.response["passes"]) > 20
 
 

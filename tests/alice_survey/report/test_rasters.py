@@ -76,7 +76,7 @@ def test_a_raster_that_fits_keeps_its_own_grid(width: int, tmp_path: Path) -> No
     assert read_shrunk(tmp_path / "a.tif", [1], 1e6)[2] == grid
 
 
-def test_numbers_are_coloured_between_limits_that_the_legend_tells(workspace: Path) -> None:
+def test_numbers_are_coloured_between_limits_of_the_legend(workspace: Path) -> None:
     layers = {layer.name: layer for layer in picture_layers(Held.of(workspace))}
     assert list(layers) == ["mosaic", "height", "sigma", "slope", "stations"]
     assert [name for name, layer in layers.items() if layer.shown] == ["mosaic"]

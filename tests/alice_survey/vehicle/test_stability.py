@@ -12,9 +12,6 @@ from alice_survey.vehicle.sea import constant_current
 from alice_survey.vehicle.stability import pitch_divergence_speed_mps, pitch_matrix
 from alice_survey.vehicle.vehicle import Vehicle
 
-PITCHED = [8, 11]
-"""Heave and pitch rate in the state."""
-
 
 def growth(craft: Vehicle, speed_mps: float) -> float:
     """Fastest growth of heave, pitch rate and pitch, by differences of the equations of motion.

@@ -99,11 +99,11 @@ def test_points_of_a_dull_picture_are_judged_by_its_own_noise() -> None:
     blur = np.ones(found.residuals_px.shape[:2])
     blur[3, 1] = 4.0
     dull = replace(found, residuals_px=found.residuals_px * blur[..., None, None])
-    told = replace(dull, blur=blur)
+    with_blur = replace(dull, blur=blur)
 
     assert max(picture.outliers for picture in picture_fits(dull)) > 5
-    assert max(picture.outliers for picture in picture_fits(told)) == 0
-    camera, seen = found.rig.cameras["right"], camera_residuals(told, "right")
+    assert max(picture.outliers for picture in picture_fits(with_blur)) == 0
+    camera, seen = found.rig.cameras["right"], camera_residuals(with_blur, "right")
     np.testing.assert_allclose(seen.sigma_px[seen.view == 3], 4.0 * found.noise_px)
     np.testing.assert_allclose(seen.sigma_px[seen.view != 3], found.noise_px)
     by = residual_profiles(camera, seen)[0]

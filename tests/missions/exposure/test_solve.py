@@ -106,7 +106,7 @@ def test_turns_are_half_circles_where_lines_are_wide_apart() -> None:
     assert turn_s(config.plan, 1.0 - 1e-9) == pytest.approx(turn_s(config.plan, 1.0), abs=1e-3)
     assert turn_s(config.plan, 0.0) == pytest.approx((7 / 3 * math.pi * 0.5 + 0.5) / 0.2)
     _, spot = survey(plan={"turns": "spot"})
-    # Two right angles at 15 deg/s, and what each stop takes besides.
+    # Two right angles at 15 deg/s, and the time of each stop.
     assert turn_s(spot.plan, 1.0) == pytest.approx(2 * (6.0 + SETTLE_S) + 1.0 / 0.2 + 0.5 / 0.2)
     _, auto = survey()
     assert turn_s(auto.plan, 1.0) == min(turn_s(config.plan, 1.0), turn_s(spot.plan, 1.0))
