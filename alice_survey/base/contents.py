@@ -5,11 +5,13 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from alice_survey.base.errors import WorkspaceError, why
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _SHOWN = 200
 
@@ -33,12 +35,14 @@ def taken_from(path: Path) -> Iterator[None]:
         ) from None
 
 
-def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
+def read_arrays(path: Path, *names: str) -> "dict[str, NDArray[np.generic]]":
     """Arrays of an `.npz` file.
 
     Raises:
         WorkspaceError: it is missing or damaged, or lacks one.
     """
+    import numpy as np
+
     try:
         with np.load(path) as data:
             return {name: data[name] for name in names}

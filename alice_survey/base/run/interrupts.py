@@ -54,7 +54,8 @@ def handled(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
     """Within this block `SIGNALS` raise `Interrupted` in the main thread.
 
     A thread waits for them. They are blocked everywhere else, also in processes started within:
-    COLMAP's log answers them with a trace of its stack, in whatever process has loaded it.
+    COLMAP's log answers them with a trace of its stack, in whatever process has loaded it. Threads
+    that run already, such as numpy's, keep their own mask: enter this block before them.
 
     Python raises only between its own instructions, and an adjustment of a large model may take
     minutes. Some seconds later, or at a second signal, the process therefore ends whatever it is
