@@ -214,9 +214,9 @@ def test_only_the_window_is_read_and_says_the_same(
 
 def test_faults_say_what_to_change(tmp_path: Path) -> None:
     path = _written(tmp_path / "f.tif", _plane())
-    with pytest.raises(PlanError, match="survey area"):
+    with pytest.raises(PlanError, match=r"f\.tif"):
         read_bathymetry(path, DATUM, bounds_ne=(500.0, 500.0, 600.0, 600.0))
-    with pytest.raises(PlanError, match="missing"):
+    with pytest.raises(PlanError, match=r"missing\.tif"):
         read_bathymetry(tmp_path / "missing.tif", DATUM)
     with pytest.raises(PlanError, match="EPSG:999999"):
         read_bathymetry(path, DATUM, crs="EPSG:999999")
@@ -287,8 +287,6 @@ def test_a_description_of_other_files_is_not_followed(tmp_path: Path) -> None:
     )
     with pytest.raises(PlanError, match=r"a\.tif"):
         read_bathymetry(other, DATUM)
-    with pytest.raises(PlanError, match=r"none\.tif"):
-        read_bathymetry(tmp_path / "none.tif", DATUM)
 
 
 def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
@@ -297,5 +295,5 @@ def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
     path.write_text("\n".join(rows) + "\n")
     assert read_bathymetry(path, DATUM, crs=UTM, sense="depths").depth_m.shape == (20, 20)
     path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
-    with pytest.raises(PlanError, match="cells"):
+    with pytest.raises(PlanError, match=r"a\.xyz"):
         read_bathymetry(path, DATUM, crs=UTM, sense="depths")

@@ -182,7 +182,7 @@ def test_marks_are_zones_as_wide_as_the_clearance(text: str, tmp_path: Path) -> 
     mark = shapely.from_wkt(text)
     assert area.no_go.distance(mark) == 0
     assert area.allowed.distance(mark) == pytest.approx(2.0, rel=0.01)
-    with pytest.raises(PlanError, match="set no_go_clearance_m"):
+    with pytest.raises(PlanError, match="no_go_clearance_m"):
         area_of(polygon_ne_m=SQUARE, no_go_file=file)
 
 
@@ -216,18 +216,17 @@ def test_without_a_datum_that_of_a_geographic_shape_is_its_middle(
 
 def test_a_shape_far_from_its_datum_is_refused_with_its_place() -> None:
     ring = ((10.0, 20.0), (10.0, 20.001), (10.001, 20.0))
-    with pytest.raises(PlanError, match=r"corner 1 at \(10, 20\) is \d+ km from the datum"):
-        area_of(polygon_latlon_deg=ring, latitude_deg=32.0, longitude_deg=34.0)
-    with pytest.raises(PlanError, match="latitude and longitude are swapped"):
-        area_of(polygon_latlon_deg=ring, latitude_deg=20.0, longitude_deg=10.0)
-    with pytest.raises(PlanError, match="too large"):
+    for latitude_deg, longitude_deg in ((32.0, 34.0), (20.0, 10.0)):
+        with pytest.raises(PlanError, match=r"corner \d at \(10, 20.* is \d+ km"):
+            area_of(polygon_latlon_deg=ring, latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    with pytest.raises(PlanError, match=r"corner \d at .* km"):
         area_of(polygon_latlon_deg=((10, 20), (10, 21), (11, 20)))
-    with pytest.raises(PlanError, match="corner 3 is 1000 km from the datum"):
+    with pytest.raises(PlanError, match="corner 3 is 1000 km"):
         area_of(polygon_ne_m=((0, 0), (10, 0), (10, 1e6)))
 
 
 @pytest.mark.parametrize(
-    ("area", "words"),
+    ("area", "named"),
     [
         ({"polygon_ne_m": [[0, 0], [1, 1]]}, "3 corners"),
         ({"corridor_ne_m": [[0, 0]]}, "2 points"),
@@ -239,12 +238,12 @@ def test_a_shape_far_from_its_datum_is_refused_with_its_place() -> None:
                 "polygon_ne_m": [[0, 0], [1, 1], [2, 0]],
                 "polygon_latlon_deg": [[0, 0], [1, 1], [2, 0]],
             },
-            "not both",
+            "polygon_latlon_deg",
         ),
     ],
 )
-def test_settings_refuse_areas_that_cannot_be(area: dict[str, object], words: str) -> None:
+def test_settings_refuse_areas_that_cannot_be(area: dict[str, object], named: str) -> None:
     with pytest.raises(AliceError) as fault:
         parse_config({"area": area}, "survey.toml")
-    assert words in str(fault.value)
+    assert named in str(fault.value)
     assert "\n" not in str(fault.value)
