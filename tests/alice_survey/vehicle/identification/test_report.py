@@ -1,6 +1,7 @@
 """The command, from files to files."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,9 @@ def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: P
         assert (tmp_path / "out" / name).stat().st_size > 500
     lines = text.splitlines()
     assert any(line.split()[:2] == ["X_uu", "-15.23"] for line in lines)
+    # The other day's current is that day's, and is reported.
+    of_that_day = [float(number) for number in re.findall(r"(-?[\d.]+) m/s", text)[-2:]]
+    assert of_that_day == pytest.approx([-0.05, 0.1], abs=0.01)
     read = coefficients_from_file(tmp_path / "out" / "coefficients.json")
     assert read.values["X_uu"] == found["X_uu"]["identified"]
     assert read.values["Y_vv"] == -321.597
