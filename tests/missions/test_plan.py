@@ -192,25 +192,25 @@ def test_without_forward_overlap_the_certificate_shows_the_gaps(
 
 
 @pytest.mark.parametrize(
-    ("sections", "words"),
+    ("sections", "named"),
     [
         ({"area": {"length_m": 0.3, "width_m": 0.2}}, "1.44 x 1.17 m"),
-        ({"area": {"length_m": 9000, "width_m": 9000}}, "split the area"),
+        ({"area": {"length_m": 9000, "width_m": 9000}}, "area"),
         ({"plan": {"altitude_m": 9.0}, "area": {"seafloor_depth_m": 5.0}}, "altitude_m 9"),
-        ({"plan": {"altitude_m": 0.3}, "camera": {"baseline_m": 1.0}}, "runs aground"),
+        ({"plan": {"altitude_m": 0.3}, "camera": {"baseline_m": 1.0}}, "altitude_m"),
         (
             {"plan": {"altitude_m": 0.5, "relief_m": 0.0}, "camera": {"baseline_m": 1.0}},
-            "no view in common",
+            "baseline_m",
         ),
         ({"plan": {"home_ne_m": [50.0, 0.0]}}, "home_ne_m"),
-        ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "pictures a second"),
+        ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "forward_overlap"),
         ({"plan": {"speed_mps": 0.4, "turn_radius_m": 0.5}}, "46 deg/s"),
     ],
 )
-def test_errors_of_planning_take_few_lines(sections: dict[str, Any], words: str) -> None:
+def test_errors_of_planning_take_few_lines(sections: dict[str, Any], named: str) -> None:
     with pytest.raises(PlanError) as fault:
         planned(**sections)
-    assert words in str(fault.value)
+    assert named in str(fault.value)
     assert len(str(fault.value).splitlines()) < 5
 
 
@@ -263,14 +263,14 @@ def test_lines_csv_has_a_row_for_each_line(workspace: Path) -> None:
 def test_a_broken_plan_file_is_an_error_in_one_line(workspace: Path, tmp_path: Path) -> None:
     good = json.loads((workspace / "plan" / "plan.json").read_text())
     path = tmp_path / "plan.json"
-    for change, words in (
+    for change, named in (
         ({"version": 7}, "version"),
         ({"lines": [{**good["lines"][0], "kind": "zigzag"}]}, "zigzag"),
         ({"speed_mps": "fast"}, "fast"),
         ({"datum": {"latitude": 1}}, "latitude"),
     ):
         path.write_text(json.dumps({**good, **change}))
-        with pytest.raises(PlanError, match=words) as fault:
+        with pytest.raises(PlanError, match=named) as fault:
             read_plan(path)
         assert "\n" not in str(fault.value)
     path.write_text(json.dumps({k: v for k, v in good.items() if k != "interval_s"}))

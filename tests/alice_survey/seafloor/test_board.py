@@ -112,8 +112,8 @@ def test_pool_views_fit_both_frames_and_vary(rig: Rig) -> None:
     assert len(cells) == 20  # corners in every part of the frame
 
 
-def test_a_board_that_never_fits_says_so(rig: Rig) -> None:
-    with pytest.raises(CalibrationError, match="fits into no picture of both cameras"):
+def test_a_board_that_never_fits_is_refused(rig: Rig) -> None:
+    with pytest.raises(CalibrationError):
         pool_poses(PoolBoard(square_m=0.5), rig, 1, np.random.default_rng(0))
 
 

@@ -224,9 +224,9 @@ def test_noise_can_be_left_out(survey: Path, tmp_path: Path) -> None:
     assert 0.1 < difference.std() < 6.0
 
 
-def test_a_flight_that_ends_before_its_triggers_says_so(tmp_path: Path) -> None:
+def test_a_flight_that_ends_before_its_triggers_is_refused(tmp_path: Path) -> None:
     fly(tmp_path, until_s=5.0)
-    with pytest.raises(NavigationError, match=r"covers 0\.00 to 4\.90 s, but triggers go .* 6\.50"):
+    with pytest.raises(NavigationError, match=r"4\.90 s.* 6\.50"):
         spec("image").make(tmp_path, settings(), SERIAL)
 
 

@@ -34,9 +34,9 @@ def test_each_name_lands_in_its_row_and_column() -> None:
 def test_both_names_of_an_added_mass_share_their_mean() -> None:
     matrix = named(Y_rdot=-8.50, N_vdot=-8.55).added_mass
     assert matrix[1, 5] == matrix[5, 1] == pytest.approx(8.525)
-    with pytest.raises(VehicleError, match=r"Y_rdot = -8.5 and N_vdot = -9"):
+    with pytest.raises(VehicleError, match=r"Y_rdot = -8\.5 .*N_vdot = -9"):
         _ = named(Y_rdot=-8.5, N_vdot=-9.0).added_mass
-    with pytest.raises(VehicleError, match="one added mass"):
+    with pytest.raises(VehicleError, match=r"Z_qdot .*M_wdot"):
         _ = named(Z_qdot=11.0, M_wdot=-11.0).added_mass
 
 
@@ -44,7 +44,7 @@ def test_both_names_of_an_added_mass_share_their_mean() -> None:
     "name", ["X_vw", "X_uv", "Q_uu", "X_zz", "X", "", "X_", "Xuu", "Y_vdott", "Y_uvv", "N_uw"]
 )
 def test_a_name_that_is_none_is_refused(name: str) -> None:
-    with pytest.raises(VehicleError, match="not known"):
+    with pytest.raises(VehicleError, match=f"'{name}'"):
         named(**{name: 1.0})
 
 

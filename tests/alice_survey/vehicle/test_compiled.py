@@ -11,5 +11,5 @@ def test_a_kernel_cannot_allocate() -> None:
     def allocates(x: float) -> float:
         return float(np.zeros(3)[0] + x)
 
-    with pytest.raises(TypingError, match="Only accept returning of array passed into"):
+    with pytest.raises(TypingError):
         compiled.kernel(allocates)(1.0)

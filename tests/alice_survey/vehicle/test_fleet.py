@@ -78,7 +78,7 @@ def test_lateral_thrusters_sit_in_their_tunnels() -> None:
 
 
 def test_unknown_names_are_refused() -> None:
-    with pytest.raises(VehicleError, match="vehicle 'bluerov' is not known; known: alice, sparus2"):
+    with pytest.raises(VehicleError, match=r"'bluerov'.* alice, sparus2"):
         fleet.vehicle("bluerov")
-    with pytest.raises(VehicleError, match="coefficients 'best' are not known; known: estimated"):
+    with pytest.raises(VehicleError, match=r"'best'.* estimated"):
         fleet.vehicle("alice", "best")

@@ -218,7 +218,7 @@ def test_a_failed_thruster_runs_down_whatever_is_asked() -> None:
     kernels.add_speed_rates(failed, np.full(5, 10.0), np.full(5, 40.0), rates)
     assert rates[1] == pytest.approx(-10.0 / PORT.time_constant_s)
     assert np.all(np.delete(rates, 1) > 0)
-    with pytest.raises(VehicleError, match="share"):
+    with pytest.raises(VehicleError):
         weakened(PACKED, np.array([1.0, 2.0, 1.0, 1.0, 1.0]))
 
 

@@ -117,7 +117,7 @@ def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
 
 
 def test_an_unknown_thruster_cannot_fail() -> None:
-    with pytest.raises(VehicleError, match=r"no thruster 'warp'; it has starboard, port"):
+    with pytest.raises(VehicleError, match=r"'warp'.* starboard, port"):
         simulate(setup(failed="warp"), np.random.default_rng(1), longest_s=1.0, label="test")
 
 

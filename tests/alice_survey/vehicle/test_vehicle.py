@@ -74,7 +74,7 @@ def test_the_plant_holds_weight_buoyancy_and_inertia() -> None:
 
 
 def test_an_inertia_that_is_not_positive_is_refused() -> None:
-    with pytest.raises(VehicleError, match=r"block.*'given'.*eigenvalue -20"):
+    with pytest.raises(VehicleError, match=r"'given'.* -20"):
         _ = block({"Y_vdot": 70.0}).mass
 
 

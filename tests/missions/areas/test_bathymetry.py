@@ -18,6 +18,8 @@ from tests.oracles_energy import bilinear
 
 DATUM = Datum(32.8236, 34.9553)
 UTM = "EPSG:32636"
+TO_UTM = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
+DATUM_UTM = TO_UTM.transform(34.9553, 32.8236)
 
 
 def _written(
@@ -32,7 +34,7 @@ def _written(
     tags: dict[str, str] | None = None,
 ) -> Path:
     """A GeoTIFF whose first cell's outer corner is 20 m north-west of the datum."""
-    x, y = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(34.9553, 32.8236)
+    x, y = DATUM_UTM
     with rasterio.open(
         path, "w", driver="GTiff", height=values.shape[0], width=values.shape[1], count=1,
         dtype="float64", crs=crs, nodata=nodata,
@@ -107,9 +109,7 @@ def test_depth_is_bilinear_between_centres_of_cells(tmp_path: Path) -> None:
     values[5, 6] = np.nan
     points = rng.uniform(-30, 30, (400, 2))
     lon_lat = DATUM.geodetic_from_ned(np.column_stack([points, np.full(400, 15.0)]))
-    x, y = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(
-        lon_lat[:, 1], lon_lat[:, 0]
-    )
+    x, y = TO_UTM.transform(lon_lat[:, 1], lon_lat[:, 0])
     a, _, c, _, e, f = found.from_pixel
 
     depth = found.depth_at(points)
@@ -174,7 +174,7 @@ def test_any_coordinate_system_gives_the_same_floor(tmp_path: Path, crs: str) ->
 
 
 def test_a_raster_turned_on_its_side_reads_alike(tmp_path: Path) -> None:
-    x, y = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(34.9553, 32.8236)
+    x, y = DATUM_UTM
     cos, sin = 1.5 * math.cos(math.radians(30)), 1.5 * math.sin(math.radians(30))
     turned = Affine(cos, sin, x - 20 * (cos + sin), sin, -cos, y - 20 * (sin - cos))
     column, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
@@ -183,9 +183,7 @@ def test_a_raster_turned_on_its_side_reads_alike(tmp_path: Path) -> None:
     found = read_bathymetry(_written(tmp_path / "t.tif", values, transform=turned), DATUM)
     points = np.random.default_rng(4).uniform(-12, 12, (60, 2))
     geodetic = DATUM.geodetic_from_ned(np.column_stack([points, np.full(60, 12.0)]))
-    px, py = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(
-        geodetic[:, 1], geodetic[:, 0]
-    )
+    px, py = TO_UTM.transform(geodetic[:, 1], geodetic[:, 0])
 
     np.testing.assert_allclose(
         found.depth_at(points), 12 + 0.1 * (px - x) + 0.04 * (py - y), atol=1e-6
@@ -214,9 +212,9 @@ def test_only_the_window_is_read_and_says_the_same(
 
 def test_faults_say_what_to_change(tmp_path: Path) -> None:
     path = _written(tmp_path / "f.tif", _plane())
-    with pytest.raises(PlanError, match="survey area"):
+    with pytest.raises(PlanError, match=r"f\.tif"):
         read_bathymetry(path, DATUM, bounds_ne=(500.0, 500.0, 600.0, 600.0))
-    with pytest.raises(PlanError, match="missing"):
+    with pytest.raises(PlanError, match=r"missing\.tif"):
         read_bathymetry(tmp_path / "missing.tif", DATUM)
     with pytest.raises(PlanError, match="EPSG:999999"):
         read_bathymetry(path, DATUM, crs="EPSG:999999")
@@ -287,8 +285,6 @@ def test_a_description_of_other_files_is_not_followed(tmp_path: Path) -> None:
     )
     with pytest.raises(PlanError, match=r"a\.tif"):
         read_bathymetry(other, DATUM)
-    with pytest.raises(PlanError, match=r"none\.tif"):
-        read_bathymetry(tmp_path / "none.tif", DATUM)
 
 
 def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
@@ -297,5 +293,5 @@ def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
     path.write_text("\n".join(rows) + "\n")
     assert read_bathymetry(path, DATUM, crs=UTM, sense="depths").depth_m.shape == (20, 20)
     path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
-    with pytest.raises(PlanError, match="cells"):
+    with pytest.raises(PlanError, match=r"a\.xyz"):
         read_bathymetry(path, DATUM, crs=UTM, sense="depths")

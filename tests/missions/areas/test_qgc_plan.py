@@ -85,7 +85,7 @@ def test_fences_keep_out_and_in(write: Any, capsys: pytest.CaptureFixture[str]) 
     )
     whole = area_of(polygon_latlon_deg=POLYGON)
     area = area_of(file=path)
-    assert "set allowed_file to the file" in capsys.readouterr().err
+    assert "allowed_file" in capsys.readouterr().err
     # A polygon of 64 corners around the circle: no place in it is left to the vehicle.
     circle_m2 = 64 * math.tan(math.pi / 64) * 10.0**2
     assert area.no_go.area == pytest.approx(circle_m2, rel=1e-4)
@@ -98,37 +98,28 @@ def test_fences_keep_out_and_in(write: Any, capsys: pytest.CaptureFixture[str]) 
     assert kept_out.survey.area == pytest.approx(area.survey.area, rel=1e-9)
 
 
+def _mission(kind: str, **item: object) -> dict[str, Any]:
+    return {"mission": {"items": [{"complexItemType": kind, **item}]}}
+
+
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "named"),
     [
-        ({"fileType": "Rally"}, "its fileType is not 'Plan'"),
-        ({"mission": {"items": []}}, "no shapes in its layer 'mission'"),
-        ({"mission": {"items": 3}}, "mission.items is not as QGroundControl writes it"),
-        (
-            {"mission": {"items": [{"complexItemType": "survey", "polygon": [[1]]}]}},
-            "item 1 (survey) is not as QGroundControl writes it",
-        ),
-        (
-            {"mission": {"items": [{"complexItemType": "survey", "polygon": [[135, 1]] * 3}]}},
-            "item 1 (survey), corner 1 is at latitude 135",
-        ),
-        (
-            {
-                "mission": {
-                    "items": [
-                        {"complexItemType": "CorridorScan", "polyline": POLYGON, "CorridorWidth": 0}
-                    ]
-                }
-            },
-            "CorridorWidth is 0; it must be above 0",
-        ),
-        ({"geoFence": {"polygons": [{"polygon": POLYGON}]}}, "geoFence.polygons 1 is not"),
+        ({"fileType": "Rally"}, "fileType"),
+        ({"mission": {"items": []}}, "'mission'"),
+        ({"mission": {"items": 3}}, "mission.items"),
+        (_mission("survey", polygon=[[1]]), "item 1 (survey)"),
+        (_mission("survey", polygon=[[135, 1]] * 3), "item 1 (survey), corner 1 "),
+        (_mission("survey", polygon=[[10**400, 35.0], *POLYGON[1:]]), "item 1"),
+        (_mission("CorridorScan", polyline=POLYGON, CorridorWidth=0), "CorridorWidth"),
+        (_mission("CorridorScan", polyline=POLYGON, CorridorWidth=1e300), "CorridorWidth"),
+        ({"geoFence": {"polygons": [{"polygon": POLYGON}]}}, "geoFence.polygons 1"),
     ],
 )
-def test_a_plan_that_cannot_be_is_refused(write: Any, change: dict[str, Any], words: str) -> None:
+def test_a_plan_that_cannot_be_is_refused(write: Any, change: dict[str, Any], named: str) -> None:
     with pytest.raises(PlanError) as fault:
         area_of(file=write({**plan_of(), **change}))
-    assert words in str(fault.value)
+    assert named in str(fault.value)
     assert "\n" not in str(fault.value)
 
 
@@ -136,16 +127,7 @@ def test_another_layer_can_be_chosen(write: Any) -> None:
     fence = {"inclusion": True, "polygon": POLYGON, "version": 1}
     path = write({**plan_of(polygons=[fence]), "mission": {"items": []}})
     assert area_of(file=path, layer="inclusion").survey.area > 1000
-    with pytest.raises(PlanError, match="there are some in inclusion"):
+    with pytest.raises(PlanError, match="inclusion"):
         area_of(file=path)
-    with pytest.raises(PlanError, match="not 'fence'"):
+    with pytest.raises(PlanError, match="'fence'"):
         area_of(file=path, layer="fence")
-
-
-def test_numbers_beyond_all_measure_are_refused(write: Any) -> None:
-    item = {"complexItemType": "survey", "polygon": [[10**400, 35.0], *POLYGON[1:]]}
-    with pytest.raises(PlanError, match="item 1"):
-        area_of(file=write({**plan_of(), "mission": {"items": [item]}}))
-    item = {"complexItemType": "CorridorScan", "polyline": POLYGON, "CorridorWidth": 1e300}
-    with pytest.raises(PlanError, match="CorridorWidth"):
-        area_of(file=write({**plan_of(), "mission": {"items": [item]}}))

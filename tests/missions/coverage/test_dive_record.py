@@ -134,7 +134,7 @@ def test_a_manifest_stands_for_triggers(
     kept = np.delete(np.arange(len(flown)), 4)
     assert_alike(record.stations, flown.some(kept))
     assert "1 station" in capsys.readouterr().err
-    assert "not both" in refusal(log, triggers=log, manifest=log)
+    assert "manifest" in refusal(log, triggers=log, manifest=log)
 
 
 def test_triggers_in_a_gap_and_beyond_the_log_are_counted(
@@ -201,7 +201,7 @@ def test_nan_rows_are_left_out_by_their_line(
     # The log is interpolated over so short a stretch.
     assert len(record.stations) == len(flown)
     assert_alike(record.stations.some(np.arange(12)), flown.some(np.arange(12)))
-    assert "lines 14 to 15: latitude_deg is nan" in capsys.readouterr().err
+    assert "lines 14 to 15: latitude_deg" in capsys.readouterr().err
 
 
 def test_pictures_from_high_above_and_from_below_do_not_count(
@@ -253,7 +253,7 @@ def test_logs_of_elsewhere_or_another_time_are_refused(
 
     assert flown.time_s is not None
     write_triggers(tmp_path / "late.csv", flown.time_s + 1e6)
-    assert "the log is of" in refusal(log, triggers=tmp_path / "late.csv")
+    assert f"{len(flown)} triggers" in refusal(log, triggers=tmp_path / "late.csv")
     write_triggers(tmp_path / "back.csv", flown.time_s[::-1])
     assert "line 3" in refusal(log, triggers=tmp_path / "back.csv")
     (tmp_path / "none.csv").write_text("station,when\n0,1\n")

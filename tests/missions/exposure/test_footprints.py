@@ -141,7 +141,7 @@ def test_what_cannot_be_names_both_limits_in_under_five_lines(
     with pytest.raises(PlanError) as fault:
         line_spacing(rig, config.plan, STEP_M)
     lines = str(fault.value).splitlines()
-    assert f"{first} conflicts with {second}" in lines[0]
+    assert first in lines[0] and second in lines[0]
     assert 2 <= len(lines) <= 4
     assert all(line.startswith("  - ") for line in lines[1:])
 

@@ -95,14 +95,17 @@ def test_numbers_are_short(value: float | tuple[float, ...], unit: str, shown: s
     assert Setting("group", "name", value, unit, "equation", "source", "limit").text == shown
 
 
-def test_an_exposure_of_nothing_is_refused_with_what_bounds_it() -> None:
-    with pytest.raises(PlanError, match=r"allowed_blur_px 0\.001"):
-        imaging_settings(*survey(plan={"allowed_blur_px": 0.001}))
-
-
-def test_a_strobe_pulse_that_does_not_fit_is_refused() -> None:
-    plan = {"speed_mps": 1.0, "forward_overlap": 0.9, "strobe_lead_s": 0.1}
-    with pytest.raises(PlanError, match=r"strobe pulse of 0\.2004 s"):
+@pytest.mark.parametrize(
+    ("plan", "named"),
+    [
+        ({"allowed_blur_px": 0.001}, r"allowed_blur_px 0\.001"),
+        ({"speed_mps": 1.0, "forward_overlap": 0.9, "strobe_lead_s": 0.1}, r"0\.2004 s"),
+    ],
+)
+def test_exposures_and_pulses_that_do_not_fit_are_refused(
+    plan: dict[str, float], named: str
+) -> None:
+    with pytest.raises(PlanError, match=named):
         imaging_settings(*survey(plan=plan))
 
 

@@ -49,7 +49,6 @@ def test_a_duty_cycle_that_is_too_high_gets_ways_out_that_work() -> None:
     with pytest.raises(PlanError) as fault:
         strobe_load(config.imaging, config.plan, exposure_s, interval_s)
     text = str(fault.value)
-    assert "strobe pulse conflicts with heat of the strobe" in text
     assert 2 <= len(text.splitlines()) <= 4
     lead = float(re.search(r"strobe_lead_s ([\d.]+) instead", text)[1])
     changed = config.plan.model_copy(update={"strobe_lead_s": lead})

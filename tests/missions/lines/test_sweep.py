@@ -73,7 +73,7 @@ def test_lines_turn_into_the_current() -> None:
 
 def test_headings_that_cannot_be_flown_are_refused() -> None:
     parts = area_of(MultiPolygon([box(0, 0, 5, 5), box(20, 0, 25, 5)]), 1.0)
-    with pytest.raises(PlanError, match="not connected"):
+    with pytest.raises(PlanError, match=r"area\.turn_margin_m"):
         best_heading(
             parts, STEREO, Ways(parts.allowed), time_costs(0.2), (0.0, 0.0),
             cross_lines=0, closing_line=False,
@@ -101,10 +101,10 @@ def test_a_search_that_takes_long_shows_how_far_it_is(
     arguments = area, STEREO, Ways(area.allowed), time_costs(0.2), (0.0, 0.0)
     monkeypatch.setattr("missions.lines.sweep.time.monotonic", _ticks(1e-6).__next__)
     best_heading(*arguments, cross_lines=0, closing_line=False)
-    assert "headings tried" not in capsys.readouterr().err
+    assert not capsys.readouterr().err
     monkeypatch.setattr("missions.lines.sweep.time.monotonic", _ticks(5.0).__next__)
     best_heading(*arguments, cross_lines=0, closing_line=False)
-    assert "headings tried" in capsys.readouterr().err
+    assert capsys.readouterr().err
 
 
 def _ticks(step_s: float) -> Iterator[float]:

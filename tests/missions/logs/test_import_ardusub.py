@@ -114,7 +114,7 @@ def test_declination_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         dataflash_log([("PARM", 1, "COMPASS_DEC", math.radians(2.0)), *dive_messages()])
     )
     imported(tmp_path, log, declination_deg=3.4)
-    assert "declination of 2.00 degrees" in capsys.readouterr().err
+    assert "2.00 degrees" in capsys.readouterr().err
 
 
 def test_tide_by_hand(tmp_path: Path) -> None:

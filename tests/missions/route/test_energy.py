@@ -201,12 +201,11 @@ def test_a_current_above_the_vehicles_strength_is_refused_with_ways_out() -> Non
     with pytest.raises(PlanError) as caught:
         survey_costs(_config(2.0))
     text = str(caught.value)
-    assert "a current of 2.00 m/s towards 090 deg is above the strength of alice" in text
-    held = float(re.search(r"the ([\d.]+) m/s that alice holds", text)[1])  # type: ignore[index]
+    current, held = map(float, re.findall(r"([\d.]+) m/s", text)[:2])
+    assert current == 2.0 and "090 deg" in text
     assert 0.3 < held < 0.6  # turning, she is beam on: 300 N (m/s)^-2 against two T200
-    assert f"wait for a current of {held:.2f} m/s" in text
     assert math.isfinite(survey_costs(_config(held)).spot_w)
-    with pytest.raises(PlanError, match="above the strength"):
+    with pytest.raises(PlanError, match=f"{held + 0.015:.2f} m/s"):
         survey_costs(_config(held + 0.015))
 
 

@@ -103,8 +103,8 @@ def test_a_symmetric_hull_holds_its_water_symmetrically() -> None:
 
 
 def test_impossible_displacements_are_refused() -> None:
-    with pytest.raises(VehicleError, match="displaces 90 kg but its envelope holds"):
+    with pytest.raises(VehicleError, match="90 kg"):
         entrained_water(ALICE, 90.0, RHO)
     ahead = replace(SPARUS2, outline=SPARUS2.outline.moved(0.5))
-    with pytest.raises(VehicleError, match="cannot put the centre of buoyancy"):
+    with pytest.raises(VehicleError):
         entrained_water(ahead, 52.1, RHO)

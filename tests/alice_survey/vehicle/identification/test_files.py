@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from alice_survey.vehicle.files import (
 )
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
-from alice_survey.vehicle.identification.windows import inputs
+from alice_survey.vehicle.identification.windows import inputs, make_windows
 from alice_survey.vehicle.log import vehicle_log
 
 HERE = Path(__file__).parent
@@ -78,7 +79,7 @@ def test_json_says_the_same(tmp_path: Path) -> None:
 
 def test_a_name_is_a_known_vehicle() -> None:
     assert vehicle_from("alice").thrusters == vehicle("alice").thrusters
-    with pytest.raises(VehicleError, match="'nautilus' is not known"):
+    with pytest.raises(VehicleError, match="'nautilus'"):
         vehicle_from("nautilus")
 
 
@@ -114,7 +115,7 @@ def test_coefficients_go_through_a_file(tmp_path: Path) -> None:
     plain.write_text("X_uu = -3\n")
     assert coefficients_from_file(plain).values == {"X_uu": -3.0}
     (tmp_path / "other.json").write_text('{"format": "else 2", "values": {"X_uu": 1}}')
-    with pytest.raises(VehicleError, match="format 'else 2' is not"):
+    with pytest.raises(VehicleError, match="'else 2'"):
         coefficients_from_file(tmp_path / "other.json")
     (tmp_path / "none.json").write_text("{}")
     with pytest.raises(VehicleError, match=r"none\.json"):
@@ -149,11 +150,11 @@ def test_foreign_axes_become_ours(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('velocity = ["u", "v", "w"]\n', "give time, or time_step_s"),
-        ("time_step_s = 0\n", "time_step_s: Input should be greater than 0"),
-        ('time = "t"\nspeed = "u"\n', "speed: Extra inputs"),
-        ('time = "t"\nworld = "enu"\nangles_deg = ["a", "b", "c"]\n', "angles_deg are of frd"),
-        ('time = "t"\nvelocity = ["u", "v", "w"]\n', "column v is missing"),
+        ('velocity = ["u", "v", "w"]\n', "time_step_s"),
+        ("time_step_s = 0\n", "time_step_s"),
+        ('time = "t"\nspeed = "u"\n', "speed"),
+        ('time = "t"\nworld = "enu"\nangles_deg = ["a", "b", "c"]\n', "angles_deg"),
+        ('time = "t"\nvelocity = ["u", "v", "w"]\n', "column v "),
     ],
 )
 def test_faults_of_column_maps_are_named(tmp_path: Path, text: str, message: str) -> None:
@@ -164,31 +165,27 @@ def test_faults_of_column_maps_are_named(tmp_path: Path, text: str, message: str
     assert message in str(raised.value)
 
 
-def test_logs_without_what_a_fit_needs_are_refused() -> None:
-    from alice_survey.vehicle.identification.windows import make_windows
-
-    known, time_s = vehicle("alice"), np.arange(20) * 0.1
-    turns = np.tile([0.0, 0, 0, 1], (20, 1))
-    still = np.zeros((20, 3))
-    rpm = {t.name: np.zeros(20) for t in known.thrusters}
-    with pytest.raises(VehicleError, match="has no attitude"):
-        make_windows(vehicle_log(time_s, velocity_body=still, rpm=rpm), known)
-    with pytest.raises(VehicleError, match="neither velocities"):
-        make_windows(vehicle_log(time_s, quaternion_xyzw=turns, rpm=rpm), known)
-    with pytest.raises(VehicleError, match="has no input: give rpm_NAME"):
-        make_windows(vehicle_log(time_s, quaternion_xyzw=turns, velocity_body=still), known)
-    with pytest.raises(VehicleError, match="are not those of alice"):
-        make_windows(
-            vehicle_log(
-                time_s, quaternion_xyzw=turns, velocity_body=still, rpm={"port": np.zeros(20)}
-            ),
-            known,
-        )
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"quaternion_xyzw": None}, "heading_deg"),
+        ({"velocity_body": None}, "u_mps"),
+        ({"rpm": None}, "rpm_NAME"),
+        ({"rpm": {"port": np.zeros(20)}}, "alice: starboard"),
+    ],
+)
+def test_logs_without_what_a_fit_needs_are_refused(change: dict[str, Any], named: str) -> None:
+    known = vehicle("alice")
+    enough = {
+        "quaternion_xyzw": np.tile([0.0, 0, 0, 1], (20, 1)),
+        "velocity_body": np.zeros((20, 3)),
+        "rpm": {t.name: np.zeros(20) for t in known.thrusters},
+    }
+    with pytest.raises(VehicleError, match=named):
+        make_windows(vehicle_log(np.arange(20) * 0.1, **{**enough, **change}), known)
 
 
 def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[str]) -> None:
-    from alice_survey.vehicle.identification.windows import make_windows
-
     known, time_s = vehicle("alice"), np.arange(60) * 0.1
     rpm = {t.name: np.full(60, 600.0) for t in known.thrusters}
     rpm["port"][10:14] = np.nan
@@ -200,16 +197,16 @@ def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[
     first, second = make_windows(log, known)
     assert (len(first.record.time_s), len(second.record.time_s)) == (40, 10)
     np.testing.assert_array_equal(first.record.rps, 10.0)
-    assert "10 of 60 rows are not used" in capsys.readouterr().err
+    assert "10 of 60 rows" in capsys.readouterr().err
 
 
 def test_damping_must_damp(tmp_path: Path) -> None:
     path = tmp_path / "found.json"
     path.write_text('{"X_uu": -14.0, "Y_vv": 300.0}')
-    with pytest.raises(VehicleError, match=r"found.json: the damping of Y is positive"):
+    with pytest.raises(VehicleError, match=r"found\.json: .* Y "):
         coefficients_from_file(path)
     path.write_text('{"a": -14.0}')
-    with pytest.raises(VehicleError, match=r"found.json: coefficient 'a' is not known"):
+    with pytest.raises(VehicleError, match=r"found\.json: .*\'a\'"):
         coefficients_from_file(path)
 
 
@@ -229,5 +226,5 @@ def test_numbers_and_nesting_without_end(tmp_path: Path) -> None:
 def test_a_log_of_texts_alone(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text("time_step_s = 0.1")
     (tmp_path / "log.csv").write_text("a,b\nx,y\n")
-    with pytest.raises(VehicleError, match=r"log\.csv: holds no column of numbers"):
+    with pytest.raises(VehicleError, match=r"log\.csv"):
         read_foreign_log(tmp_path / "log.csv", read_column_map(tmp_path / "map.toml"))

@@ -150,26 +150,26 @@ def test_a_coefficient_without_effect_stops_at_its_bound() -> None:
 
 def test_parameters_that_a_log_does_not_determine_are_named() -> None:
     rest = fly(hidden({}), duration_s=5.0, asked=lambda time_s: np.zeros(5))
-    with pytest.raises(VehicleError, match="do not determine X_uu, gain_X: do not free them"):
+    with pytest.raises(VehicleError, match="X_uu, gain_X"):
         fitted(measured(rest, np.random.default_rng(0)), ("X_uu", "gain_X"))
     straight = fly(
         hidden({}), duration_s=10.0, asked=lambda time_s: np.array([20.0, 20.0, 0, 0, 0])
     )
-    with pytest.raises(VehicleError, match=r"cannot separate .*current_.*bias_"):
+    with pytest.raises(VehicleError, match=r"current_.*bias_"):
         fitted(straight, ("current", "bias_u_mps", "bias_v_mps", "bias_w_mps"))
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
+    ("names", "named"),
     [
-        ((), "no parameter is free"),
-        (("X_zz",), "parameter 'X_zz' is not known"),
-        (("Y_rdot", "N_vdot"), "are one parameter"),
-        (("X_uu", "X_uu"), "are one parameter"),
+        ((), None),
+        (("X_zz",), "'X_zz'"),
+        (("Y_rdot", "N_vdot"), "Y_rdot.*N_vdot"),
+        (("X_uu", "X_uu"), "X_uu"),
     ],
 )
-def test_wrong_names_are_refused(names: tuple[str, ...], message: str) -> None:
-    with pytest.raises(VehicleError, match=message):
+def test_wrong_names_are_refused(names: tuple[str, ...], named: str | None) -> None:
+    with pytest.raises(VehicleError, match=named):
         free_parameters(KNOWN, names)
 
 

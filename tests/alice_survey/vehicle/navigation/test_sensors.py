@@ -224,13 +224,13 @@ def test_gps_is_heard_at_the_surface_alone() -> None:
 
 def test_numbers_out_of_range_are_refused() -> None:
     suite = SensorSuite()
-    for wrong, words in (
-        (suite._replace(compass=CompassSpec(rate_hz=7.0)), "compass at 7 Hz"),
-        (suite._replace(gps=GpsSpec(rate_hz=-1.0)), "below 0"),
-        (suite._replace(pressure=PressureSpec(noise_m=0.0)), "more than 0"),
-        (suite._replace(dvl_dropouts_s=((3.0, 2.0),)), "ends too early"),
+    for wrong, named in (
+        (suite._replace(compass=CompassSpec(rate_hz=7.0)), "7 Hz"),
+        (suite._replace(gps=GpsSpec(rate_hz=-1.0)), "-1 Hz"),
+        (suite._replace(pressure=PressureSpec(noise_m=0.0)), "noise_m"),
+        (suite._replace(dvl_dropouts_s=((3.0, 2.0),)), "3 s to 2 s"),
     ):
-        with pytest.raises(VehicleError, match=words):
+        with pytest.raises(VehicleError, match=named):
             wrong.pack()
-    with pytest.raises(VehicleError, match="finite"):
+    with pytest.raises(VehicleError):
         new_navigation(suite.pack(), np.full(13, np.nan), np.random.default_rng(0))

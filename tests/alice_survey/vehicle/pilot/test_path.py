@@ -181,5 +181,5 @@ def test_a_path_that_makes_no_sense_is_refused(change: dict[str, object]) -> Non
         "altitude_m": 2.0, "speed_mps": 0.2,
     }  # fmt: skip
     path_from_legs(**good)  # type: ignore[arg-type]
-    with pytest.raises(VehicleError, match="path"):
+    with pytest.raises(VehicleError):
         path_from_legs(**{**good, **change})  # type: ignore[arg-type]

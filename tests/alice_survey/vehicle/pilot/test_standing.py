@@ -223,7 +223,7 @@ def test_a_vehicle_without_sway_turns_and_goes_on_but_takes_no_steps() -> None:
     heading = rows.estimate[on, vector.HEADING][-1]
     assert abs(off @ [math.cos(heading), math.sin(heading)]) < 2 * STOP_M
     assert np.linalg.norm(off) > 0.3
-    with pytest.raises(VehicleError, match=r"1 sway step, which the controller los cannot fly"):
+    with pytest.raises(VehicleError, match=r"1 sway step.* los "):
         guidance_of(STEPS, "sparus2")
 
 
