@@ -106,7 +106,7 @@ def looked_at(number: int) -> int:
 def reported(executor: Executor, capsys: pytest.CaptureFixture[str]) -> tuple[list[int], list[str]]:
     """Results until a fault, and all that a user saw."""
     results = []
-    with heard() as warnings, pytest.raises(AliceError, match="3 is too much"):
+    with heard() as warnings, pytest.raises(AliceError):
         results.extend(executor.map(looked_at, [0, 1, 2], label="look"))
         results.extend(executor.map(looked_at, [3], label="look again"))
     assert warnings == ["0 is even", "1 is odd", "2 is even", "3 is odd"]

@@ -189,7 +189,7 @@ def test_across_north_the_shorter_way_is_taken() -> None:
 def test_there_is_no_extrapolation() -> None:
     time_s, given_poses = poses()
     for at in (-0.1, 3.1):
-        with pytest.raises(ValueError, match="beyond"):
+        with pytest.raises(ValueError):
             interpolate_poses(time_s, given_poses, np.array([at]))
 
 

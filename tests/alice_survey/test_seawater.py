@@ -22,7 +22,7 @@ def test_anchors_of_the_levant_sea(capsys: pytest.CaptureFixture[str]) -> None:
     np.testing.assert_allclose(got, [1.3455, 1.3419, 1.3391], atol=5.1e-5)
     warning = capsys.readouterr().err
     assert warning.count("\n") == 1
-    assert "salinity_psu = 39 is beyond the 0 to 35 psu" in warning
+    assert "salinity_psu = 39" in warning and "0 to 35 psu" in warning
     n_water(24.0, 35.0, 0.0, 530.0)
     assert capsys.readouterr().err == ""
 
@@ -112,9 +112,9 @@ def test_arguments_broadcast() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "named"),
     [
-        ((36.0, 35.0, 0.0, 530.0), "temperature_c = 36: the index of water is known from -2 to 35"),
+        ((36.0, 35.0, 0.0, 530.0), "temperature_c = 36.*-2 to 35"),
         ((math.nan, 35.0, 0.0, 530.0), "temperature_c = nan"),
         ((20.0, -1.0, 0.0, 530.0), "salinity_psu = -1"),
         ((20.0, 330.0, 0.0, 530.0), "salinity_psu = 330"),
@@ -123,7 +123,6 @@ def test_arguments_broadcast() -> None:
         ((20.0, 35.0, 0.0, 0.53), "wavelength_nm = 0.53"),
     ],
 )
-def test_absurd_water_is_refused(arguments: tuple[float, ...], words: str) -> None:
-    with pytest.raises(ConfigError, match="known from") as error:
+def test_absurd_water_is_refused(arguments: tuple[float, ...], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
         n_water(*arguments)
-    assert words in str(error.value)

@@ -58,10 +58,9 @@ def test_a_track_file_is_plain_columns(tmp_path: Path) -> None:
 
 def test_times_must_increase_and_fit_the_poses() -> None:
     poses = track(3).ned_from_body
-    with pytest.raises(ValueError, match="increase"):
-        Trajectory(time_s=np.array([0.0, 1.0, 1.0]), ned_from_body=poses)
-    with pytest.raises(ValueError, match="poses"):
-        Trajectory(time_s=np.array([0.0, 1.0]), ned_from_body=poses)
+    for time_s in ([0.0, 1.0, 1.0], [0.0, 1.0]):
+        with pytest.raises(ValueError):
+            Trajectory(time_s=np.array(time_s), ned_from_body=poses)
 
 
 def test_columns_may_come_in_any_order_and_company(tmp_path: Path) -> None:
@@ -80,51 +79,38 @@ def test_a_file_without_rows_gives_empty_columns(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "named"),
     [
-        ("a\n1\n", "column b is missing"),
-        ("", "column a is missing"),
-        ("a,b\n1,2\n3,nan\n", "line 3: b is 'nan', not a finite number"),
-        ("a,b\n1,inf\n", "line 2: b is 'inf'"),
-        ("a,b\n1,\n", "line 2: b is ''"),
-        ("a,b\n1\n", "line 2: b is ''"),
-        ("a,b\nten,1\n", "line 2: a is 'ten'"),
+        ("a\n1\n", "column b"), ("", "column a"), ("a,b\n1,2\n3,nan\n", "line 3: b is 'nan'"),
+        ("a,b\n1,inf\n", "line 2: b is 'inf'"), ("a,b\n1,\n", "line 2: b is ''"),
+        ("a,b\n1\n", "line 2: b is ''"), ("a,b\nten,1\n", "line 2: a is 'ten'"),
     ],
-)
-def test_a_fault_is_reported_with_its_line(tmp_path: Path, content: str, words: str) -> None:
+)  # fmt: skip
+def test_a_fault_is_reported_with_its_line(tmp_path: Path, content: str, named: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(content)
     with pytest.raises(NavigationError) as fault:
         read_columns(path, ("a", "b"))
-    assert words in str(fault.value)
+    assert named in str(fault.value)
     assert str(path) in str(fault.value)
     assert "\n" not in str(fault.value)
 
 
 def test_a_missing_or_binary_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(NavigationError, match=r"none\.csv: cannot be read"):
+    with pytest.raises(NavigationError, match=r"none\.csv"):
         read_columns(tmp_path / "none.csv", ("a",))
     (tmp_path / "bin.csv").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(NavigationError, match=r"bin\.csv: cannot be read"):
+    with pytest.raises(NavigationError, match=r"bin\.csv"):
         read_columns(tmp_path / "bin.csv", ("a",))
 
 
-def test_a_track_whose_times_repeat_is_refused_in_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rows", "named"),
+    [("0,0,0,0,0,0,0\n0,0,0,0,0,0,0\n", "line 3: time_s"), ("", ""), ("1" * 200_000, "")],
+    ids=["times repeat", "no rows", "a cell without end"],
+)
+def test_a_wrong_track_is_refused(tmp_path: Path, rows: str, named: str) -> None:
     path = tmp_path / "track.csv"
-    path.write_text(",".join(TRACK_COLUMNS) + "\n0,0,0,0,0,0,0\n0,0,0,0,0,0,0\n")
-    with pytest.raises(NavigationError, match="line 3: time_s 0 does not increase"):
-        read_track(path)
-
-
-def test_an_empty_track_is_refused_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "track.csv"
-    path.write_text(",".join(TRACK_COLUMNS) + "\n")
-    with pytest.raises(NavigationError, match="no rows"):
-        read_track(path)
-
-
-def test_a_cell_without_end_is_refused_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "track.csv"
-    path.write_text(",".join(TRACK_COLUMNS) + "\n" + "1" * 200_000)
-    with pytest.raises(NavigationError, match=r"track\.csv: cannot be read"):
+    path.write_text(",".join(TRACK_COLUMNS) + "\n" + rows)
+    with pytest.raises(NavigationError, match=rf"track\.csv.*{named}"):
         read_track(path)

@@ -86,7 +86,7 @@ def test_a_picture_that_memory_is_too_short_for_is_not_called_damaged(tmp_path: 
     assert done.stderr == ""
     shape, shown = done.stdout.splitlines()
     assert shape == "(60, 80, 3)"
-    assert shown.startswith(f"memory ran out while {large} was read: give fewer --threads")
+    assert str(large) in shown and "--threads" in shown
 
 
 def test_pictures_are_read_as_opencv_reads_them(tmp_path: Path) -> None:

@@ -127,8 +127,5 @@ def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for end in (0, 100, len(whole) // 2):
         path.write_bytes(whole[:end])
-        with (
-            pytest.raises(WorkspaceError, match=r"dem\.tif: is damaged"),
-            opened_raster(path) as raster,
-        ):
+        with pytest.raises(WorkspaceError, match=r"dem\.tif"), opened_raster(path) as raster:
             raster.read(1)

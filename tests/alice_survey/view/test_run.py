@@ -107,17 +107,13 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         done = CliRunner().invoke(app, ["view", "-w", str(workspace), "--port", str(port)])
     assert done.exit_code == 1
-    assert str(done.exception) == (
-        f"port {port} of 127.0.0.1: address already in use: give another --port, or none"
-    )
+    assert str(port) in str(done.exception) and "--port" in str(done.exception)
 
 
 def test_nothing_to_show(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["view", "-w", str(tmp_path / "none"), "--no-browser"])
     assert done.exit_code == 1
-    assert "holds nothing to show: run 'alice-survey plan' or 'import-images'" in str(
-        done.exception
-    )
+    assert "'alice-survey plan'" in str(done.exception)
     assert not (tmp_path / "none").exists()
 
 

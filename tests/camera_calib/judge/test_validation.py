@@ -149,15 +149,13 @@ def test_the_same_calibration_twice_does_not_differ() -> None:
 
 def test_too_few_views_are_not_held_out(capsys: pytest.CaptureFixture[str]) -> None:
     def refuse(views: Sequence[TargetView]) -> Calibration:
-        raise CalibrationError(f"{len(views)} views are too few")
+        raise CalibrationError(f"{len(views)} views")
 
     assert hold_out(usual().views[:6], refuse, locate) is None
-    assert "5 views are too few" in capsys.readouterr().err
+    assert "5 views" in capsys.readouterr().err
 
 
-def test_halves_are_left_out_where_they_do_not_calibrate(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_halves_are_left_out_where_they_do_not_calibrate() -> None:
     found = usual()
 
     def calibrate(views: Sequence[TargetView]) -> Calibration:
@@ -169,7 +167,6 @@ def test_halves_are_left_out_where_they_do_not_calibrate(
 
     assert held is not None
     assert held.halves is None
-    assert "halves" in capsys.readouterr().err
 
 
 def test_lengths_are_exact_in_the_true_rig() -> None:

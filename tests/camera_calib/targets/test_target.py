@@ -118,7 +118,7 @@ def test_wrong_words_give_one_clear_line(text: str) -> None:
 def test_wrong_files_give_one_clear_line(change: dict[str, object], tmp_path: Path) -> None:
     path = tmp_path / "target.json"
     path.write_text(json.dumps(parse_target("chessboard 9x6 25mm").to_json() | change))
-    with pytest.raises(CalibrationError, match="target") as caught:
+    with pytest.raises(CalibrationError, match=r"target\.json") as caught:
         parse_target(str(path))
     assert "\n" not in str(caught.value)
 

@@ -67,7 +67,7 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     assert good.notes() == []
     assert good.far == ()
     assert good.checked == len({r.station for r in scene.records})
-    assert "stations lie" not in capsys.readouterr().err
+    assert not capsys.readouterr().err
     fine = np.full_like(sigmas, 0.02)
     jumped = positions.copy()
     station = scene.records[4].station
@@ -95,7 +95,7 @@ def test_a_rig_that_came_out_another_size_is_reported(capsys: pytest.CaptureFixt
     assert "-0.20 %" in notes(-2e-3, SURE)[0]
     assert "-0.20 %" in capsys.readouterr().err
     long = replace(SURE, mean=1.002)
-    assert "+0.20 +/- 0.01 %" in notes(NAN, long)[0]
+    assert "+0.20 " in notes(NAN, long)[0]
     assert notes(NAN, replace(long, mean_sigma=1e-3)) == []
 
 
@@ -193,7 +193,7 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     rotations = navigation_rotations(scene.records, scene.rig, mapped.lenses)
     straight = measure_doming(mapped.model, positions, sigmas, rotations)
     assert straight.notes() == []
-    assert "bent" not in capsys.readouterr().err
+    assert not capsys.readouterr().err
     assert straight.along is not None
     assert abs(straight.along.sag_m) < 5e-3
     focal = mapped.lenses["left"].pinhole.focal_px
@@ -205,7 +205,7 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     assert found.along is not None and straight.along is not None
     gained = found.along.curvature_per_m - straight.along.curvature_per_m
     assert gained == pytest.approx(0.05, rel=0.05)
-    assert "bent along the block" in capsys.readouterr().err
+    assert len(capsys.readouterr().err.splitlines()) == len(found.notes())
     assert found.to_json()["notes"] == found.notes() != []
 
 

@@ -142,8 +142,7 @@ def test_global_mapping_is_as_good_as_incremental() -> None:
     scene = make_scene(lines=3, stations=5, points=7000, noise_px=0.3)
     at_once, one_by_one = mapped_by(scene, "global"), mapped_by(scene, "incremental")
     assert at_once.models == one_by_one.models == (30,)
-    assert "global mapping" in at_once.notes[0]
-    assert "incremental mapping" in one_by_one.notes[0]
+    assert "global" in at_once.notes[0] and "incremental" in one_by_one.notes[0]
     assert 0.2e-3 < camera_rms(at_once, scene) < 1.2 * camera_rms(one_by_one, scene)
     errors = [m.model.compute_mean_reprojection_error() for m in (at_once, one_by_one)]
     assert errors[0] == pytest.approx(errors[1], rel=0.02)
@@ -158,16 +157,17 @@ def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
         assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
 
 
-def test_a_fall_back_is_reported(monkeypatch: pytest.MonkeyPatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_fall_back_is_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from reconstruct.mapping import mapper
 
     scene = make_scene(lines=1, stations=5, points=3000, noise_px=0.2)
     monkeypatch.setattr(mapper, "map_globally", lambda *_: [])
     mapped = mapped_by(scene, "auto")
     assert mapped.models[0] == 10
-    stated = "global mapping found no model: incremental mapping instead, with 10 of 10 pictures"
-    assert stated in mapped.notes
-    assert stated in capsys.readouterr().err
+    assert "10 of 10" in mapped.notes[0]
+    assert mapped.notes[0] in capsys.readouterr().err
 
 
 def test_a_model_that_lost_pictures_is_not_sound() -> None:
@@ -175,8 +175,9 @@ def test_a_model_that_lost_pictures_is_not_sound() -> None:
     model = mapped_by(scene, "global").model
     assert faults_of([model], 8) == []
     model.deregister_frame(2)
-    assert faults_of([model], 8) == ["lost 2 of 8 pictures"]
-    assert faults_of([], 8) == ["found no model"]
+    (fault,) = faults_of([model], 8)
+    assert "2 of 8" in fault
+    assert len(faults_of([], 8)) == 1
 
 
 def test_the_scale_is_the_rigs_whatever_the_first_guess() -> None:
@@ -210,4 +211,4 @@ def test_pictures_without_matches_are_left_out_and_counted() -> None:
     with TemporaryDirectory() as folder:
         mapped = map_calibrated(cut, scene.rig.cam_from_rig, lenses, Path(folder), 1)
     assert mapped.models[0] == 10
-    assert "lost 2 of 12 pictures" in mapped.notes[0]
+    assert "2 of 12" in mapped.notes[0]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.control import ControlFit, describe, tie_control
+from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.picked_points import Camera, find_spots
@@ -150,17 +150,18 @@ def test_a_wrong_pick_is_left_out_and_named() -> None:
     assert np.linalg.norm(spots["p4"].model - gauge.points(KNOWN)[4]) < 0.003
 
 
-def test_points_that_cannot_be_found_say_why() -> None:
+def test_points_that_cannot_be_found_are_named() -> None:
     gauge, picks = in_gauge(4), picks_of(KNOWN)
     once = next(p for p in picks if p.point == "p0")
     spots, lost = find_spots([once], gauge.cameras)
     assert not spots
-    assert "two or more" in lost["p0"]
+    assert lost.keys() == {"p0"}
     two = [p for p in picks if p.point == "p1"][:2]
     two[1] = Pick(image=two[1].image, point="p1", x_px=20, y_px=20, sigma_px=0.3)
     spots, lost = find_spots(two, gauge.cameras)
     assert not spots
-    assert "px off one common point" in lost["p1"]
+    assert lost.keys() == {"p1"}
+    assert " px" in lost["p1"]
 
 
 @pytest.mark.parametrize("stretch", [1.0, 3.7])
@@ -222,9 +223,6 @@ def test_control_and_navigation_place_together_within_their_sigmas(tmp_path: Pat
     assert max(after["north_m"], after["east_m"], after["down_m"]) < 0.004
     assert np.all(both.sigma_position_m < 0.1 * alone.sigma_position_m.max())
     assert 1e-5 < both.sigma_scale < 1e-3
-    text = describe(ties.score(both.ned_from_model, located=True))
-    assert "1 points held out" in text
-    assert "4 points used" in text
 
 
 def test_bars_scale_a_model_and_check_bars_score_it(tmp_path: Path) -> None:
@@ -255,23 +253,23 @@ def test_bars_scale_a_model_and_check_bars_score_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "named"),
     [
         ({"use": "yes"}, "use is 'yes'"),
         ({"kind": "tree"}, "kind is 'tree'"),
-        ({"sigma_m": "0"}, "sigma_m must be more than 0"),
+        ({"sigma_m": "0"}, "sigma_m.* 0"),
         ({"sigma_m": "nan"}, "sigma_m is 'nan'"),
-        ({"north_m": ""}, "needs either latitude_deg"),
-        ({"height_m": "3"}, "either depth_m or height_m"),
+        ({"north_m": ""}, "latitude_deg"),
+        ({"height_m": "3"}, "depth_m.*height_m"),
         ({"depth_m": "deep"}, "depth_m is 'deep'"),
         ({"north_m": "", "easting_m": 1, "northing_m": 2, "epsg": 999999}, "epsg"),
-        ({"kind": "bar", "from": "a", "to": "a"}, "two points"),
+        ({"kind": "bar", "from": "a", "to": "a"}, "bar"),
     ],
 )
-def test_wrong_rows_are_named(tmp_path: Path, change: dict[str, object], said: str) -> None:
+def test_wrong_rows_are_named(tmp_path: Path, change: dict[str, object], named: str) -> None:
     row: dict[str, object] = {"kind": "point", "name": "a", "use": "check", "sigma_m": 0.1,
                               "north_m": 1, "east_m": 2, "depth_m": 3, "length_m": 1}  # fmt: skip
-    with pytest.raises(WorkspaceError, match=said) as error:
+    with pytest.raises(WorkspaceError, match=named) as error:
         read_control(write(tmp_path / "control.csv", [row | change]))
     assert "line 2" in str(error.value)
 

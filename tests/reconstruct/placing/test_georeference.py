@@ -138,7 +138,7 @@ def test_positions_closer_than_their_sigma_do_not_place_a_model(
 ) -> None:
     records = [replace(r, roll_deg=np.nan, sigma_horizontal_m=50.0) for r in site().records]
     assert fit(site(), records, gauge(6, 1.0), known=True) is None
-    assert "do not place the model" in capsys.readouterr().err
+    assert len(capsys.readouterr().err.splitlines()) == 1
     nowhere = [replace(r, latitude_deg=np.nan) for r in site().records]
     assert fit(site(), nowhere, gauge(6, 1.0), known=True) is None
 

@@ -73,12 +73,11 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspace: Path) -> None:
-    text, found = survey_control(workspace)
+    _, found = survey_control(workspace)
     assert found["dictionary"] == "DICT_5X5_100"
     assert list(found["markers"]) == ["7"]
     assert found["markers"]["7"] >= 4
     assert found["detections"] == found["markers"]["7"]
-    assert "1 markers of DICT_5X5_100" in text
     picks = read_picks(workspace / "markers.csv")
     of_name = {r.image: (r, p) for r, p in zip(site().records, site().ned_from_cam, strict=True)}
     misses = []
@@ -120,7 +119,6 @@ def test_an_unknown_dictionary_is_refused(workspace: Path) -> None:
 
 
 def test_markers_of_another_dictionary_are_not_seen(workspace: Path) -> None:
-    text, found = survey_control(workspace, dictionary="DICT_7X7_100")
+    _, found = survey_control(workspace, dictionary="DICT_7X7_100")
     assert found["detections"] == 0
-    assert "no marker is in two of the 6 pictures" in text
     assert read_picks(workspace / "markers.csv") == []
