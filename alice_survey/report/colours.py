@@ -171,7 +171,7 @@ def read_shrunk(
         full = raster.transform
         # Exactly its own transform where nothing is shrunk.
         wide, high = raster.width / shape[1], raster.height / shape[0]
-        return values, opacity, full * Affine.scale(wide, high)
+        return values, opacity, Affine(full.a * wide, 0.0, full.c, 0.0, full.e * high, full.f)
 
 
 def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
@@ -22,15 +22,17 @@ def arc(curvature_per_m: float, length_m: float, heading_rad: float = 0.3) -> Pa
 
 
 @given(curvature=st.floats(-3.0, 3.0), length=st.floats(0.1, 20.0), share=st.floats(-0.5, 1.5))
+@example(curvature=1.0, length=0.5, share=-5e-324)
 @settings(deadline=None, max_examples=40)
 def test_places_are_those_reached_by_walking(curvature: float, length: float, share: float) -> None:
     path = arc(curvature, length)
-    n, e, heading, k = place_at(path, 0, share * length)
-    place, expected = oracle.walked(path, 0, share * length)
+    along = share * length
+    n, e, heading, k = place_at(path, 0, along)
+    place, expected = oracle.walked(path, 0, along)
     np.testing.assert_allclose([n, e], place, atol=1e-6 * (1 + length))
     assert heading == pytest.approx(expected, abs=1e-12)
     # Beyond its ends a leg goes on straight.
-    assert k == (curvature if 0.0 <= share <= 1.0 else 0.0)
+    assert k == (curvature if 0.0 <= along <= length else 0.0)
 
 
 def test_a_starboard_turn_from_north_ends_in_the_east() -> None:
