@@ -229,8 +229,8 @@ def _patch_in_sight(terrain: Terrain, camera: FlatPortCamera, poses: RigidTransf
             )
         corners += [from_ned[:, :2], (from_ned + (reach / along[:, 2])[:, None] * along)[:, :2]]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-    window = (low[0] - _PAD_M, high[0] + _PAD_M, low[1] - _PAD_M, high[1] + _PAD_M)
-    return terrain.patch(tuple(float(w) for w in window))  # type: ignore[arg-type]
+    (south, west), (north, east) = (low - _PAD_M).tolist(), (high + _PAD_M).tolist()
+    return terrain.patch((south, north, west, east))
 
 
 def _cast(patch: Patch, world: Floats) -> tuple[Floats, NDArray[np.uint32], Floats]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.steady import drag_power
@@ -42,10 +43,8 @@ class LinePower:
 
     def to_json(self) -> dict[str, Any]:
         """The powers as numbers; None where it cannot be flown."""
-        return {
-            key: (value if isinstance(value, str) or math.isfinite(value) else None)
-            for key, value in vars(self).items()
-        }
+        values: dict[str, Any] = json_values(self)
+        return values
 
 
 def three_ways(
