@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,6 +17,7 @@ from camera_calib.rig import design_rig
 from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
 from reconstruct.views.range_shift import range_shift
+from tests.cameras import changed
 
 DATUM = Datum(32.8236, 34.9553)
 FRAME = WorldFrame(
@@ -161,7 +162,7 @@ def port_view(centre: list[float], rpy_deg: list[float]) -> View:
     """A nadir camera 100 mm behind a port that is tilted by 2 degrees."""
     rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
     tilt = np.deg2rad(2.0)
-    camera = replace(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
+    camera = changed(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
     lens = flat_port_lens(camera, 1.5, 2.5)
     turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
     return View(

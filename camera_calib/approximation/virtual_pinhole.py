@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 
 _GRID = 15
 
@@ -58,7 +58,7 @@ class VirtualPinhole:
 
 
 def best_pinhole(
-    camera: FlatPortCamera, near_m: float, far_m: float, working_range_m: float | None = None
+    camera: Camera, near_m: float, far_m: float, working_range_m: float | None = None
 ) -> VirtualPinhole:
     """The pinhole with the least rms residual over the frame and a range of distances.
 
@@ -75,11 +75,11 @@ def best_pinhole(
     depths = 1.0 / np.linspace(1.0 / far_m, 1.0 / near_m, 7)
 
     def at(shift_m: float) -> VirtualPinhole:
-        x_m, y_m, z_m = (shift_m * component for component in camera.normal)
+        x_m, y_m, z_m = (shift_m * component for component in camera.port.axis_cam)
         return VirtualPinhole(
             width_px=camera.width_px,
             height_px=camera.height_px,
-            focal_px=camera.n_water * (camera.fx_px + camera.fy_px) / 2,
+            focal_px=camera.focal_in_water_px,
             cx_px=camera.cx_px,
             cy_px=camera.cy_px,
             centre_x_m=x_m,
@@ -88,7 +88,7 @@ def best_pinhole(
             working_range_m=working,
         )
 
-    reach = 2.0 * (camera.port_distance_m + camera.glass_thickness_m) + 1e-6
+    reach = 2.0 * float(np.linalg.norm(camera.front_cam)) + 1e-6
     best = minimize_scalar(
         lambda shift: float(np.sqrt(np.nanmean(residual_px(camera, at(shift), depths) ** 2))),
         bounds=(-reach, reach),
@@ -98,7 +98,7 @@ def best_pinhole(
     return at(float(best.x))
 
 
-def residual_px(camera: FlatPortCamera, pinhole: VirtualPinhole, depths_m: Array) -> Array:
+def residual_px(camera: Camera, pinhole: VirtualPinhole, depths_m: Array) -> Array:
     """Distance of a warped picture's pixels from where the pinhole would see each point.
 
     Args:

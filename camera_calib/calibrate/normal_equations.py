@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, Freedom
+from camera_calib.ports.values import lowest
 from camera_calib.rig import Covariance, Rig
 
 Flags = NDArray[np.bool_]
@@ -24,14 +25,13 @@ Indices = NDArray[np.intp]
 _SINGULAR = 1e-13
 """Least eigenvalue of the rig's information, scaled to 1 if all else were known."""
 _TURNS = len(POSE) // 2
-_LOW = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_glass": 1.0, "n_water": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
     """One guess of all unknowns."""
 
-    cameras: tuple[FlatPortCamera, ...]
+    cameras: tuple[Camera, ...]
     rotations: Array
     """(C, 3, 3) cam_from_rig, and (C, 3) its translation."""
     shifts: Array
@@ -68,15 +68,17 @@ class CalibrationProblem:
         self.prior_at = np.array(
             [self.names.index(n) for n in self.prior.parameters], dtype=np.intp
         )
-        self.lens_columns, self.lens_at = self._columns(PARAMETERS)
-        self.pose_columns, self.pose_at = self._columns(POSE)
+        self.lens_columns, self.lens_at = self._columns(
+            [camera.parameters for camera in rig.cameras.values()]
+        )
+        self.pose_columns, self.pose_at = self._columns([POSE] * len(rig.cameras))
         self.views = [np.flatnonzero(self.seen[:, c].any(axis=1)) for c in range(len(rig.cameras))]
-        self.low = np.array([_LOW.get(name.split(".")[1], -np.inf) for name in self.names])
+        self.low = np.array([lowest(name.split(".")[1]) for name in self.names])
 
-    def _columns(self, fields: Sequence[str]) -> tuple[list[Indices], list[Indices]]:
-        """For each camera: which of the fields are adjusted, and where they stand in the vector."""
+    def _columns(self, of: Sequence[Sequence[str]]) -> tuple[list[Indices], list[Indices]]:
+        """For each camera: which of its fields are adjusted, and where they stand in the vector."""
         columns, places = [], []
-        for camera in self.rig.cameras:
+        for camera, fields in zip(self.rig.cameras, of, strict=True):
             mine = [f for f in fields if f"{camera}.{f}" in self.names]
             columns.append(np.array([fields.index(f) for f in mine], dtype=np.intp))
             at = [self.names.index(f"{camera}.{f}") for f in mine]
@@ -98,7 +100,7 @@ class CalibrationProblem:
         """Adjusted parameters of the cameras; 0 for those of poses."""
         vector = np.zeros(len(self.names))
         for c, camera in enumerate(state.cameras):
-            fields = [PARAMETERS[i] for i in self.lens_columns[c]]
+            fields = [camera.parameters[i] for i in self.lens_columns[c]]
             vector[self.lens_at[c]] = [camera.parameter(field) for field in fields]
         return vector
 
@@ -112,7 +114,7 @@ class CalibrationProblem:
         cameras, rotations, shifts = [], state.rotations.copy(), state.shifts.copy()
         for c, camera in enumerate(state.cameras):
             changed = {
-                PARAMETERS[i]: float(values[at])
+                camera.parameters[i]: float(values[at])
                 for i, at in zip(self.lens_columns[c], self.lens_at[c], strict=True)
             }
             cameras.append(camera.with_parameters(changed) if changed else camera)

@@ -7,7 +7,7 @@ multiple of the noise are then left out, and named.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -26,16 +26,19 @@ from camera_calib.calibration import (
     residuals_px,
     stack_views,
 )
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.freedom import (
     PINHOLE,
-    PORT,
     Freedom,
     Prior,
     intrinsics,
+    lens_kind,
     of_cameras,
+    of_ports,
     pose_names,
 )
+from camera_calib.ports.none import NO_PORT
+from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
 
 Intrinsics = Literal["held", "prior", "free"]
@@ -164,7 +167,7 @@ def calibrate_in_air(
     """
     names = intrinsics(lens)
     if start is None:
-        blank = {name: blank_camera(size, **IN_AIR) for name, size in sizes.items()}
+        blank = {name: blank_camera(size, lens) for name, size in sizes.items()}
         start = first_rig(views, points, blank, lens)
     free = (*of_cameras(start, names), *pose_names(start))
     return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
@@ -196,7 +199,7 @@ def calibrate_through_ports(
             covariance to serve as a prior.
     """
     extra = Prior.around(start, sigmas or {})
-    free = [*of_cameras(start, PORT), *pose_names(start)]
+    free = [*of_ports(start), *pose_names(start)]
     if known == "free":
         free += of_cameras(start, intrinsics(lens))
     if known == "prior":
@@ -211,7 +214,7 @@ def calibrate_through_ports(
 def calibrate_in_water_alone(
     views: Sequence[TargetView],
     points: Array,
-    cameras: Mapping[str, FlatPortCamera],
+    cameras: Mapping[str, Camera],
     lens: str = "opencv5",
     sigmas: Mapping[str, float] | None = None,
 ) -> Calibration:
@@ -232,27 +235,22 @@ def calibrate_in_water_alone(
     return replace(found, warnings=(*found.warnings, *unobservable(found)))
 
 
-def blank_camera(size: tuple[int, int], **port: Any) -> FlatPortCamera:
+def blank_camera(size: tuple[int, int], lens: str, port: PortValues = NO_PORT) -> Camera:
     """A camera of which only its port and the size of its pictures are known.
 
     Args:
         size: width and height of its pictures.
-        **port: fields of `FlatPortCamera`; `IN_AIR` without a port.
+        lens: name of a lens model (`freedom.LENSES`).
+        port: as far as it is known.
     """
     width, height = size
-    return FlatPortCamera(
-        width_px=width,
-        height_px=height,
-        fx_px=float(width),
-        fy_px=float(width),
-        cx_px=width / 2.0,
-        cy_px=height / 2.0,
-        **port,
-    )
+    middle = {"cx_px": width / 2.0, "cy_px": height / 2.0}
+    first = lens_kind(lens)(fx_px=float(width), fy_px=float(width), **middle)
+    return Camera(width_px=width, height_px=height, lens=first, port=port)
 
 
 def first_rig(
-    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: str
 ) -> Rig:
     """A rig near the truth from views alone: each camera, then their relative poses.
 
@@ -270,8 +268,8 @@ def first_rig(
 
 
 def first_cameras(
-    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
-) -> dict[str, FlatPortCamera]:
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: str
+) -> dict[str, Camera]:
     """Each camera near the truth from its own views, its port held.
 
     Raises:
@@ -289,16 +287,18 @@ def first_cameras(
 
 
 def _alone(
-    name: str, blank: FlatPortCamera, views: Sequence[TargetView], points: Array, lens: str
-) -> FlatPortCamera:
+    name: str, blank: Camera, views: Sequence[TargetView], points: Array, lens: str
+) -> Camera:
     """One camera's intrinsics, its port held: first its focal length and k1, then all."""
     mine = [
         TargetView(name=v.name, pixels={name: v.pixels[name]}) for v in views if name in v.pixels
     ]
     size = (blank.width_px, blank.height_px)
-    focal_px = first_focal_px([v.pixels[name] for v in mine], points, size) / blank.n_water
+    focal_px = (
+        first_focal_px([v.pixels[name] for v in mine], points, size) / blank.port.magnification
+    )
     rig = Rig(
-        cameras={name: replace(blank, fx_px=focal_px, fy_px=focal_px)},
+        cameras={name: blank.with_parameters({"fx_px": focal_px, "fy_px": focal_px})},
         cam_from_rig={name: RigidTransform.identity()},
         body_from_rig=RigidTransform.identity(),
         source="first values",

@@ -17,12 +17,11 @@ from shapely import Polygon
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.fov.focus import (
     FocusedLens,
     air_rays,
     apparent_depths,
-    glass_z_m,
 )
 from camera_calib.rig import Rig, design_rig
 
@@ -62,8 +61,8 @@ class FovRow:
     lens_mm: float
     altitude_m: float
     n_water: float
-    port_distance_m: float
-    glass_thickness_m: float
+    port: str
+    """What it is, in words."""
     horizontal_m: float
     """Width of the footprint along the middle row."""
     vertical_m: float
@@ -249,7 +248,7 @@ def _row(
     lens_mm = (focal_m or image_m) * 1e3
     w, h = float(camera.width_px), float(camera.height_px)
     corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
-    floor_z = glass_z_m(camera) + altitude_m
+    floor_z = float(camera.front_cam[2]) + altitude_m
     edges = camera.at_depth(np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]), floor_z)
     horizontal = float(np.linalg.norm(edges[1] - edges[0]))
     corner_pixels = np.clip(corners, 0.5, [w - 0.5, h - 0.5])
@@ -275,8 +274,7 @@ def _row(
         lens_mm=lens_mm,
         altitude_m=altitude_m,
         n_water=camera.n_water,
-        port_distance_m=camera.port_distance_m,
-        glass_thickness_m=camera.glass_thickness_m,
+        port=camera.port.words,
         horizontal_m=horizontal,
         vertical_m=float(np.linalg.norm(edges[3] - edges[2])),
         pixel_centre_mm=float(pixel_mm[0]),
@@ -294,7 +292,7 @@ def _row(
         focus_set_m=focus_m,
         hyperfocal_air_m=hyperfocal,
         hyperfocal_altitude_m=float(
-            np.mean((hyperfocal - at_centre.offset_m) / at_centre.slope),
+            np.mean(at_centre.altitudes_m(hyperfocal)),
         ),
         near_altitude_m=near,
         far_altitude_m=far,
@@ -307,7 +305,7 @@ def _row(
     )
 
 
-def _pixel_sizes_mm(camera: FlatPortCamera, pixels: Array, floor_z: float) -> Array:
+def _pixel_sizes_mm(camera: Camera, pixels: Array, floor_z: float) -> Array:
     """Root of the area of unit squares around pixels (N, 2), on the sea floor."""
     square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     x, y = np.moveaxis(camera.at_depth(pixels[:, None] + square, floor_z)[..., :2], -1, 0)
@@ -323,7 +321,7 @@ def _widest_deg(corner_rays: Array) -> float:
     return float(np.degrees(np.arctan2(sines, (a * b).sum(axis=1))).max())
 
 
-def _pair(rig: Rig) -> tuple[FlatPortCamera, FlatPortCamera, RigidTransform] | None:
+def _pair(rig: Rig) -> tuple[Camera, Camera, RigidTransform] | None:
     """Left, right and `right_from_left`; None for a single camera."""
     if len(rig.cameras) < 2:
         return None
@@ -371,7 +369,7 @@ def disparity_per_m(rig: Rig, floor_z_m: float) -> float:
     left, right, right_from_left = pair
     middle = right_from_left.inv().translation / 2
     pixel = left.project(np.array([middle[0], middle[1], floor_z_m]))
-    step = 1e-4 * (floor_z_m - glass_z_m(left))
+    step = 1e-4 * (floor_z_m - float(left.front_cam[2]))
     along_ray = left.at_depth(
         np.stack([pixel, pixel]), np.array([floor_z_m - step, floor_z_m + step])
     )

@@ -93,10 +93,7 @@ def validation_tables(validation: PaperValidation) -> list[TextTable]:
 
 def _footprints(rows: Sequence[FovRow]) -> TextTable:
     first = rows[0]
-    notes = [
-        f"n_water {first.n_water:g}, port {first.port_distance_m * 1e3:g} mm + glass "
-        f"{first.glass_thickness_m * 1e3:g} mm; altitude of the port's outer glass"
-    ]
+    notes = [f"n_water {first.n_water:g}, {first.port}; altitude of the port's outer glass"]
     if math.isfinite(first.baseline_m):
         notes.append(
             f"stereo: baseline {first.baseline_m * 1e3:.1f} mm, share of the left footprint that "
@@ -227,8 +224,7 @@ def angles_table(angles: Sequence[AngleRow]) -> TextTable:
     first = angles[0]
     return TextTable(
         title=(
-            f"A flat port against the lens's angle: n {first.n_water:g}, port "
-            f"{first.port_distance_m * 1e3:g} mm + glass {first.glass_thickness_m * 1e3:g} mm, "
+            f"A flat port against the lens's angle: n {first.n_water:g}, {first.port}, "
             f"{first.altitude_m:g} m"
         ),
         header=(

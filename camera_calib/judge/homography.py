@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
 from camera_calib.calibration import Calibration, stack_views
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.judge.fit_quality import (
     Profile,
     largest_radius_px,
@@ -115,7 +115,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
 
 
 def _fit_view(
-    camera: FlatPortCamera,
+    camera: Camera,
     pinhole: VirtualPinhole,
     target_points: Array,
     pixels: Array,
@@ -149,7 +149,7 @@ def _is_flat(points: Array) -> bool:
 
 
 def homography_residuals(
-    camera: FlatPortCamera,
+    camera: Camera,
     pinhole: VirtualPinhole,
     target_points: Array,
     pixels: Array,

@@ -22,7 +22,7 @@ from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
-from camera_calib.flat_port import FlatPortCamera, pose_jacobian
+from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import NO_PRIOR, Prior
 from camera_calib.judge.fit_quality import rms_length_px, within_gate
 from camera_calib.judge.uncertainty import (
@@ -217,7 +217,7 @@ def halves_difference(
     )
 
 
-def _best_pose(first: FlatPortCamera, second: FlatPortCamera, anchors_cam: Array) -> RigidTransform:
+def _best_pose(first: Camera, second: Camera, anchors_cam: Array) -> RigidTransform:
     """`second_from_first` that makes both project the anchors most alike (Gauss-Newton)."""
     wanted = first.project(anchors_cam)
     pose = RigidTransform.identity()

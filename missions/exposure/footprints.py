@@ -11,10 +11,9 @@ import numpy as np
 from shapely.affinity import translate
 
 from alice_survey.base.config import PlanConfig
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov.focus import apparent_distance_m
+from camera_calib.camera import Camera
+from camera_calib.fov.focus import altitude_of_apparent_m, apparent_distance_m
 from camera_calib.rig import Rig
-from missions.exposure.focus import altitude_of_apparent_m
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import LEAST_ALTITUDE_M, Way, conflict
 from missions.values.footprint import (
@@ -28,7 +27,7 @@ from missions.values.footprint import (
 )
 
 _PORT = (
-    "exact flat port: Snell's law at both faces of the glass (camera_calib.flat_port); paraxial "
+    "exact flat port: Snell's law at both faces of the glass (camera_calib.camera); paraxial "
     "pixel: D = d + g/n_glass + a/n_water"
 )
 _GEOMETRY = "geometry of level footprints"
@@ -102,12 +101,12 @@ def footprint_at(rig: Rig, altitude_m: float, step_m: float) -> FootprintAt:
     )
 
 
-def pixel_on_floor_m(camera: FlatPortCamera, altitude_m: float) -> float:
+def pixel_on_floor_m(camera: Camera, altitude_m: float) -> float:
     """Size of the central pixel on the sea floor (paraxial)."""
     return apparent_distance_m(camera, altitude_m) / camera.fx_px
 
 
-def altitude_for_pixel_m(camera: FlatPortCamera, pixel_m: float) -> float:
+def altitude_for_pixel_m(camera: Camera, pixel_m: float) -> float:
     """The inverse of `pixel_on_floor_m`; negative where even the glass is too far."""
     return altitude_of_apparent_m(camera, pixel_m * camera.fx_px)
 

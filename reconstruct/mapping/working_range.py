@@ -11,7 +11,7 @@ from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import match_descriptors
@@ -39,7 +39,7 @@ class WorkingDistances:
 class _StereoTask:
     first: Path
     second: Path
-    cameras: tuple[FlatPortCamera, FlatPortCamera]
+    cameras: tuple[Camera, Camera]
     second_from_first: RigidTransform
     ratio: float
 
@@ -82,7 +82,7 @@ def find_distances(
     altitudes = np.array([r.altitude_m for r in records])
     if np.isfinite(altitudes).any():
         reference = rig.cameras[rig.reference]
-        glass = reference.port_distance_m + reference.glass_thickness_m
+        glass = float(reference.front_cam[2])
         middle = float(np.nanmedian(altitudes)) + glass
         if tasks:
             warn(f"{len(depths)} points in stereo matches: the altitude sets the working range")
@@ -104,7 +104,7 @@ def stereo_depths(task: _StereoTask) -> Array:
     start_b, ray_b = first_from_second.apply(start_b), first_from_second.rotation.apply(ray_b)
     along_a, gap = ray_passes(start_a, ray_a, start_b, ray_b)
     depth: Array = start_a[:, 2] + along_a * ray_a[:, 2]
-    focal = first.n_water * first.fx_px
+    focal = first.focal_in_water_px
     with np.errstate(invalid="ignore"):
         good = (along_a > 0) & (gap * focal < _LARGEST_GAP_PX * depth)
     return depth[good]

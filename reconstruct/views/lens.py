@@ -16,7 +16,7 @@ from alice_survey.base.contents import one_line
 from alice_survey.base.errors import CalibrationError, WorkspaceError
 from alice_survey.base.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
-from camera_calib.flat_port import FlatPortCamera, camera_from_json
+from camera_calib.camera import Camera, camera_from_json
 
 _LARGEST_GROWTH = 1.5
 """An undistorted picture has at most this many times the width and height of the one taken."""
@@ -73,7 +73,7 @@ class Lens(Protocol):
 class FlatPortLens:
     """A calibrated camera behind a flat port, and the axial pinhole that stands in for it."""
 
-    camera: FlatPortCamera
+    camera: Camera
     virtual: VirtualPinhole
 
     @property
@@ -164,7 +164,7 @@ class ColmapLens:
         }
 
 
-def flat_port_lens(camera: FlatPortCamera, near_m: float, far_m: float) -> FlatPortLens:
+def flat_port_lens(camera: Camera, near_m: float, far_m: float) -> FlatPortLens:
     """The best pinhole for distances between near and far from the entrance pupil."""
     return FlatPortLens(camera=camera, virtual=best_pinhole(camera, near_m, far_m))
 

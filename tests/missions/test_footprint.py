@@ -19,12 +19,12 @@ from missions.values.footprint import (
     footprint_ne,
     footprint_polygon,
     footprint_size_m,
-    glass_point_cam,
     joint_swath,
     level_pose,
     overlap,
     step_for_overlap,
 )
+from tests.cameras import changed
 
 RIG = design_rig(CameraConfig(), WaterConfig())
 LEFT = RIG.cameras["left"]
@@ -69,7 +69,7 @@ def test_a_level_footprint_is_the_same_wherever_it_points(
 
 def test_altitude_counts_from_the_outer_glass() -> None:
     pose = level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.7)
-    glass = pose.apply(glass_point_cam(LEFT))
+    glass = pose.apply(LEFT.front_cam)
     np.testing.assert_allclose(glass, [0.0, 0.0, 13.0], atol=1e-12)
     assert pose.translation[2] == pytest.approx(12.97)
 
@@ -126,7 +126,7 @@ def leaning(rig: Rig) -> Rig:
     normal = (math.sin(0.02), 0.0, math.cos(0.02))
     return replace(
         rig,
-        cameras={"left": rig.cameras["left"], "right": replace(LEFT, normal=normal)},
+        cameras={"left": rig.cameras["left"], "right": changed(LEFT, normal=normal)},
         cam_from_rig={"left": RigidTransform.identity(), "right": right},
     )
 
@@ -141,7 +141,7 @@ def test_what_a_swath_promises_is_seen(altitude_m: float, forward: float, rig: R
     """Slow twin: the union of both cameras' real footprints along a line holds the swath."""
     step_m = step_for_overlap(footprint_size_m(LEFT, altitude_m)[1], forward)
     depth_m = 50.0
-    glass_body = rig.body_from_cam("left").apply(glass_point_cam(LEFT))
+    glass_body = rig.body_from_cam("left").apply(LEFT.front_cam)
     union = {}
     for name in rig.cameras:
         shapes = []

@@ -10,13 +10,13 @@ from camera_calib.approximation.virtual_pinhole import (
     best_pinhole,
     residual_px,
 )
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from tests.camera_calib.approximation.ports import STUDY, behind_port
 
 DEPTHS_M = np.linspace(1.5, 2.5, 5)
 
 
-def rms(camera: FlatPortCamera, pinhole: VirtualPinhole) -> float:
+def rms(camera: Camera, pinhole: VirtualPinhole) -> float:
     return float(np.sqrt(np.mean(residual_px(camera, pinhole, DEPTHS_M) ** 2)))
 
 

@@ -8,11 +8,11 @@ from alice_survey.base.errors import CalibrationError
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.freedom import (
-    PORT,
     Freedom,
     Prior,
     intrinsics,
     of_cameras,
+    of_ports,
     pose_names,
     value,
 )
@@ -113,7 +113,7 @@ def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
         covariance = 0.3 * found.rig.covariance.matrix[np.ix_(at, at)]
         mean = rng.multivariate_normal(true, covariance)
         prior = Prior(parameters=lens, mean=mean, covariance=covariance)
-        ports = (*of_cameras(DESIGN, PORT), *pose_names(DESIGN))
+        ports = (*of_ports(DESIGN), *pose_names(DESIGN))
         freedom = Freedom(free=ports, prior=prior)
         first, second = (
             adjusted(found.views[i::2], found.target_points, found.rig, freedom).rig

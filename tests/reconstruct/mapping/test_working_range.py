@@ -62,8 +62,7 @@ def test_cameras_without_refraction_need_no_distance(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=2, points=10)
     paths = features_of(scene, tmp_path)
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
-    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": 1.0}
-    cameras = {name: replace(camera, **bare) for name, camera in scene.rig.cameras.items()}
+    cameras = {name: camera.in_air() for name, camera in scene.rig.cameras.items()}
     rig = replace(scene.rig, cameras=cameras)
     found = find_distances(blind, paths, rig, given_m=None, ratio=0.8, executor=SERIAL)
     assert 0 < found.near_m < found.far_m and found.source == "no refraction"
