@@ -46,7 +46,9 @@ class Target:
     alone_px: float = 0.15
     """Noise of a coordinate that is independent."""
     together_px: float = 0.0
-    """Noise of a coordinate that goes together in a picture, over a third of the board."""
+    """Noise of a coordinate that goes together in a picture."""
+    reach: float = 0.33
+    """How far it goes together, over the diagonal of the board."""
     place_m: float = 0.0
     """Noise of the places of corners on the board, along each axis of its plane."""
 
@@ -89,9 +91,9 @@ def bent(target: Target, rng: np.random.Generator) -> Array:
     return out + middle
 
 
-def _waves(points: Array, rng: np.random.Generator) -> Array:
-    """(N, 2) a field of unit variance over the board, with the reach of a third of it."""
-    reach_m = np.linalg.norm(np.ptp(points, axis=0)) / 3.0
+def _waves(points: Array, reach: float, rng: np.random.Generator) -> Array:
+    """(N, 2) a field of unit variance over the board."""
+    reach_m = reach * np.linalg.norm(np.ptp(points, axis=0))
     waves = rng.normal(0.0, 1.0 / reach_m, (_WAVES, 2))
     phase = points[:, :2] @ waves.T
     amplitude = rng.normal(0.0, np.sqrt(1.0 / _WAVES), (2, 2, _WAVES))
@@ -121,7 +123,7 @@ def views_of(target: Target, rng: np.random.Generator, count: int = _VIEWS) -> l
             continue
         pixels = pixels + rng.normal(0.0, target.alone_px, pixels.shape)
         if target.together_px:
-            pixels += target.together_px * _waves(plain, rng)
+            pixels += target.together_px * _waves(plain, target.reach, rng)
         views.append(TargetView(name=f"{len(views):02d}", pixels={"camera": pixels}))
     return views
 

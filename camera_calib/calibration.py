@@ -41,7 +41,8 @@ class CornerNoise:
     alone: float
     """Variance of independent errors, over that of all without correlation."""
     together: Array
-    """(R,) variances of errors that go together in a picture, by their reach, in the same unit."""
+    """(R,) variances of errors that go together in a picture, by their reach, then, for several
+    cameras, in all pictures of a view; in the same unit."""
     place_sigmas_m: tuple[float, float]
     """Sigmas of the places of corners on the target, along each axis of its plane and across."""
 
@@ -110,6 +111,20 @@ class Calibration:
         """(N, 3) points of the target as drawn, metres."""
         drawn: Array = self.target_points - self.shape.offsets_m
         return drawn
+
+    @property
+    def shared(self) -> Array:
+        """(P, M) factor of the part of the rig's covariance that other views of the same target
+        have in common: by errors of the priors' means and of the places of its corners."""
+        covariance = self.rig.covariance
+        if covariance is None:
+            return np.zeros((0, 0))
+        if self.spread is not None:
+            return self.spread.shared[: len(covariance.parameters)]
+        prior = self.freedom.prior
+        at = [covariance.parameters.index(name) for name in prior.parameters]
+        factor: Array = covariance.matrix[:, at] @ np.linalg.cholesky(prior.information)
+        return factor
 
     @property
     def sigma_px(self) -> Array:

@@ -11,6 +11,8 @@ under the errors as found (P. J. Huber 1967, "The behavior of maximum likelihood
 nonstandard conditions").
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
@@ -28,6 +30,23 @@ _AXES = (slice(0, 2), slice(2, 3))
 """Components of a place's offset with a variance of their own: in the target's plane, across it."""
 _LEAST_ALONE = 0.05
 """Least share of the noise's variance that is independent."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """Errors that go together within a picture, or in all pictures of a view."""
+
+    kernel: Array
+    """(N, N) correlation of an axis between points."""
+    in_all: bool
+    """Whether all cameras of a view err alike: the board bends in a hand, or moves."""
+
+    def smoothed(self, values: Array, seen: Array) -> Array:
+        """The correlation applied to (V, C, N, 2, m), with (V, C, N) of 0 where unseen."""
+        base = values.sum(axis=1, keepdims=True) if self.in_all else values
+        spread = self.kernel @ base.reshape(*base.shape[:3], -1)
+        out: Array = spread.reshape(base.shape) * seen[..., None, None]
+        return out
 
 
 class _Rows:
@@ -72,12 +91,15 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
     rows = _Rows(problem, found)
     diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
     squares = cdist(problem.points, problem.points, "sqeuclidean")
-    kernels = [np.eye(len(problem.points))]
-    kernels += [np.exp(-0.5 * squares / (reach * diagonal_m) ** 2) for reach in _REACHES]
+    parts = [_Part(kernel=np.eye(len(problem.points)), in_all=False)]
+    for in_all in (False, True)[: len(problem.rig.cameras)]:
+        for reach in _REACHES:
+            kernel = np.exp(-0.5 * squares / (reach * diagonal_m) ** 2)
+            parts.append(_Part(kernel=kernel, in_all=in_all))
     inverse = found.covariance.matrix
-    products = _Products(rows, kernels, inverse)
+    products = _Products(rows, parts, inverse)
     theta = products.variances()
-    pictures, places = theta[: len(kernels)], theta[len(kernels) :]
+    pictures, places = theta[: len(parts)], theta[len(parts) :]
     pictures[0] = max(pictures[0], _LEAST_ALONE)
     meat = np.einsum("k,kpq->pq", pictures, products.by_rig)
     prior_at = problem.prior_at
@@ -107,11 +129,11 @@ class _Products:
     matrices, the mean of r^T K_i r is the sum of v_j tr(K_i M K_j M).
     """
 
-    def __init__(self, rows: _Rows, kernels: list[Array], inverse: Array) -> None:
+    def __init__(self, rows: _Rows, parts: list[_Part], inverse: Array) -> None:
         views, size = len(rows.seen), len(inverse)
-        self.rows, self.kernels, self.inverse = rows, kernels, inverse
-        self.smoothed = [_smoothed(k, rows.by_rig, rows.seen) for k in kernels]
-        self.poses = [_smoothed(k, rows.poses, rows.seen) for k in kernels]
+        self.rows, self.parts, self.inverse = rows, parts, inverse
+        self.smoothed = [part.smoothed(rows.by_rig, rows.seen) for part in parts]
+        self.poses = [part.smoothed(rows.poses, rows.seen) for part in parts]
         flat = rows.by_rig.reshape(-1, size)
         self.by_rig = np.stack([flat.T @ s.reshape(-1, size) for s in self.smoothed])
         """(K, P, P) slopes' products under every part within pictures."""
@@ -128,7 +150,7 @@ class _Products:
 
     def variances(self) -> Array:
         """Variances of the parts within pictures, then of places by axes (square metres)."""
-        count = len(self.kernels)
+        count = len(self.parts)
         size = count + len(_AXES)
         left = self._left_places()
         table, seen = np.zeros((size, size)), np.zeros(size)
@@ -137,7 +159,7 @@ class _Products:
                 table[i, j] = table[j, i] = self._of_pictures(i, j)
             for j, axes in enumerate(_AXES):
                 table[i, count + j] = table[count + j, i] = self._of_both(i, axes)
-            smooth = _smoothed(self.kernels[i], self.rows.missed[..., None], self.rows.seen)
+            smooth = self.parts[i].smoothed(self.rows.missed[..., None], self.rows.seen)
             seen[i] = float((self.rows.missed * smooth[..., 0]).sum())
         pulled = np.einsum("vcnai,vcna->ni", self.rows.by_place, self.rows.missed)
         for i, axes in enumerate(_AXES):
@@ -153,7 +175,9 @@ class _Products:
 
     def _of_pictures(self, i: int, j: int) -> float:
         seen, inverse = self.rows.seen, self.inverse
-        both = self.kernels[i] * self.kernels[j]
+        both = self.parts[i].kernel * self.parts[j].kernel
+        if self.parts[i].in_all and self.parts[j].in_all:
+            seen = seen.sum(axis=1, keepdims=True)
         total = 2.0 * float(np.einsum("vcn,nm,vcm->", seen, both, seen, optimize=True))
         total -= 2.0 * float((self.poses[i] * self.poses[j]).sum())
         total += float((self.overlap[i] * self.overlap[j]).sum())
@@ -167,7 +191,8 @@ class _Products:
         rows, inverse = self.rows, self.inverse
         places = rows.by_place[..., axes]
         posed = self.place_of_pose[:, :, axes]
-        total = float((places**2).sum())
+        alike = places.sum(axis=1) if self.parts[i].in_all else places
+        total = float((alike**2).sum())
         returned = np.einsum("vcnai,vnik->vcnak", places, posed)
         total -= 2.0 * float((self.poses[i] * returned).sum())
         total += float((self.overlap[i] * np.einsum("vnik,vnil->vkl", posed, posed)).sum())
@@ -188,11 +213,3 @@ class _Products:
         own = np.einsum("vcnai,vcnaj->nij", rows.by_place, rows.by_place)
         blocks[np.arange(count), :, np.arange(count)] += own
         return blocks
-
-
-def _smoothed(kernel: Array, values: Array, seen: Array) -> Array:
-    """A kernel (N, N) applied to (V, C, N, 2, m) within every picture and axis."""
-    views, cameras, count, _, width = values.shape
-    spread = kernel @ values.reshape(views, cameras, count, 2 * width)
-    out: Array = spread.reshape(values.shape) * seen[..., None, None]
-    return out
