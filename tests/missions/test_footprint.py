@@ -50,10 +50,10 @@ def test_the_size_is_of_the_largest_upright_rectangle_that_is_seen(
 ) -> None:
     """Also where a lens makes the sides hollow, or a tilted port makes them lean."""
     normal = (math.sin(tilt), 0.0, math.cos(tilt))
-    camera = replace(LEFT, k1=k1, normal=normal)
+    camera = changed(LEFT, k1=k1, normal=normal)
     across, along = footprint_size_m(camera, altitude_m)
 
-    floor_z = glass_point_cam(camera)[2] + altitude_m
+    floor_z = camera.front_cam[2] + altitude_m
     seen = camera.at_depth(camera.border(400), floor_z)[:, :2]
     top, right, bottom, left = (
         np.vstack([seen, seen[:1]])[400 * k : 400 * k + 401] for k in range(4)

@@ -94,7 +94,11 @@ def test_the_sure_rectangle_lies_between_the_corners(lens_mm: float, altitude_m:
     row = fov_table([lens_mm], [altitude_m], 1.34, PORT)[0]
     halves = np.array([3384, 2710]) * 3.69e-3 / 2
     sine = math.sin(math.atan(np.hypot(*halves) / lens_mm))
-    layers = ((PORT.port_distance_m, 1.0), (PORT.glass_thickness_m, 1.52), (altitude_m, 1.34))
+    layers = (
+        (PORT.port.port_distance_m, 1.0),
+        (PORT.port.glass_thickness_m, 1.52),
+        (altitude_m, 1.34),
+    )
     reach = sum(thick * math.tan(math.asin(sine / n)) for thick, n in layers)
     sure = (row.sure_horizontal_m, row.sure_vertical_m)
     assert sure == pytest.approx(2 * reach * halves / np.hypot(*halves), rel=1e-9)
