@@ -185,9 +185,9 @@ class _Solver(CalibrationProblem):
         self.covariance(equations)  # names what the views leave open, if that is the reason
         if drop < 0:
             raise CalibrationError(
-                f"the adjustment is stuck {math.sqrt(gain):.2g} sigmas from its end, where measured "
-                "points leave what the camera model sees: start from values nearer to the truth, "
-                "such as another port distance"
+                f"the adjustment is stuck {math.sqrt(gain):.2g} sigmas from its end, where "
+                "measured points leave what the camera model sees: start from values nearer to the "
+                "truth, such as another port distance"
             )
         raise CalibrationError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
@@ -216,7 +216,9 @@ class _Solver(CalibrationProblem):
             self.rig,
             cameras=dict(zip(names, state.cameras, strict=True)),
             cam_from_rig={name: poses[i] for i, name in enumerate(names)},
-            covariance=covariance.marginal(self.names[: len(self.names) - len(of_shape.parameters)]),
+            covariance=covariance.marginal(
+                self.names[: len(self.names) - len(of_shape.parameters)]
+            ),
         )
         return Adjustment(
             rig=rig,
