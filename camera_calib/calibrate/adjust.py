@@ -185,9 +185,9 @@ class _Solver(CalibrationProblem):
         self.covariance(equations)  # names what the views leave open, if that is the reason
         if drop < 0:
             raise CalibrationError(
-                f"the adjustment is stuck {math.sqrt(gain):.2g} sigmas from its end, where measured "
-                "points leave what the camera model sees: start from values nearer to the truth, "
-                "such as another port distance"
+                f"the adjustment is stuck {math.sqrt(gain):.2g} sigmas from its end, where "
+                "measured points leave what the camera model sees: start from values nearer to the "
+                "truth, such as another port distance"
             )
         raise CalibrationError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
