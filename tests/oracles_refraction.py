@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.block_solver import Equations
 from alice_survey.base.frames import Array
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.normal_equations import LinearObservations
@@ -97,6 +98,17 @@ def dense_normal_equations(linear: LinearObservations, stations: int) -> tuple[A
             jacobian[rows, at : at + 3] = linear.by_point[o]
             jacobian[rows, size - count :] = linear.by_shared[o]
     return jacobian.T @ jacobian, jacobian.T @ linear.miss.ravel()
+
+
+def dense_of(equations: Equations) -> Array:
+    """The whole matrix of normal equations: poses, then what is shared."""
+    count, wide = equations.slope.shape
+    poses = np.zeros((count, wide, count, wide))
+    for row, column, block in zip(equations.rows, equations.columns, equations.blocks, strict=True):
+        poses[row, :, column] = block
+    border = equations.border.reshape(count * wide, -1)
+    square = poses.reshape(count * wide, count * wide)
+    return np.block([[square, border], [border.T, equations.shared]])
 
 
 def laid_onto(

@@ -5,14 +5,13 @@ pixels as taken depend on stations, on points and on every parameter of the rig.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.flat_port import PARAMETERS, pose_jacobian
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
@@ -54,8 +53,8 @@ class Pixels:
 class RigState:
     """One guess of all unknowns."""
 
-    cameras: tuple[FlatPortCamera, ...]
-    cam_from_rig: tuple[RigidTransform, ...]
+    rig: Rig
+    """The cameras that took pictures, the reference first."""
     turns: Array
     """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
     centres: Array
@@ -124,8 +123,11 @@ def start_state(
         as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
     ]
     return RigState(
-        cameras=tuple(rig.cameras[name] for name in names),
-        cam_from_rig=tuple(rig.cam_from_rig[name] * reference.inv() for name in names),
+        rig=replace(
+            rig,
+            cameras={name: rig.cameras[name] for name in names},
+            cam_from_rig={name: rig.cam_from_rig[name] * reference.inv() for name in names},
+        ),
         turns=np.array([p.rotation.as_matrix() for p in poses]),
         centres=np.array([p.translation for p in poses]),
         points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
@@ -134,15 +136,15 @@ def start_state(
 
 
 def exact_observations(
-    state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
+    state: RigState, pixels: Pixels, fields: Sequence[str], *, lever: bool
 ) -> LinearObservations:
     """The observations linearised; those that no ray explains do not count."""
     count = len(fields) + 3 * lever
     arm = state.points[pixels.point] - state.centres[pixels.station]
     by_point = np.zeros((len(arm), 2, 3))
     by_shared, miss = np.zeros((len(arm), 2, count)), np.zeros((len(arm), 2))
-    for c, name in enumerate(names):
-        pose, turn = state.cam_from_rig[c], state.cam_from_rig[c].rotation.as_matrix()
+    for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
+        camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
         mine = [(g, f.split(".")[1]) for g, f in enumerate(fields) if f.split(".")[0] == name]
         source = np.array([_SLOPES.index(parameter) for _, parameter in mine], dtype=np.int64)
         target = np.array([g for g, _ in mine], dtype=np.int64)
@@ -150,7 +152,7 @@ def exact_observations(
         for first in range(0, len(every), _BLOCK):
             rows = every[first : first + _BLOCK]
             turned = _in_rig(arm, rows, pixels.station, state.turns) @ turn.T
-            at, by_cam, by_camera = state.cameras[c].project_jacobian(turned + pose.translation)
+            at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
             _put(
                 rows, at, by_cam, turn, state.turns, pixels.station, pixels.taken,
                 np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2),

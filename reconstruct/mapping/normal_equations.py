@@ -4,19 +4,15 @@ Every pixel depends on the pose of one station, on one point, and perhaps on a f
 all share. With R, c the pose `world_from_rig` and X the point, the pixel depends on
 R^T (X - c) only, so that with P its slopes by X those by a small rotation about the axes of the
 world (R' = exp(turn) R) and by a motion of c are P [X - c]x and -P. Points are eliminated one by
-one (Schur complement; Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6),
-which leaves a block-sparse system of the stations with a border of what is shared.
+one, which leaves a block-sparse system of the stations with a border of what is shared
+(`alice_survey.base.block_solver`).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import bsr_matrix, csc_matrix
-from scipy.sparse.linalg import splu
 
+from alice_survey.base.block_solver import Equations, Flags, Indices, PoseCovariance, Step
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
@@ -26,7 +22,6 @@ LEAST_POINTS = 4
 """A station that sees fewer is not determined."""
 TURN_INFORMATION = 1.0
 """1/rad^2 of a station whose position is given: a line does not determine its own roll."""
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,34 +59,23 @@ class LinearObservations:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ReducedSystem:
-    """The normal equations of stations and of what is shared, the points eliminated."""
+class PointEquations(Equations):
+    """Normal equations of stations and of what is shared, the points eliminated."""
 
-    pointers: Indices
-    """(F + 1,) and (B,): the blocks of every station's row, and their columns, sorted."""
-    columns: Indices
-    blocks: Array
-    """(B, 6, 6) blocks."""
-    border: Array
-    """(6 F, G) block between stations and what is shared."""
-    shared: Array
-    """(G, G) block of what is shared."""
-    slope: Array
-    """(6 F,) gradient by the stations."""
-    shared_slope: Array
-    """(G,) gradient by what is shared."""
+    linear: LinearObservations
     point_inverse: Array
     """(P, 3, 3) covariance of the points where all else is known."""
 
-    @property
-    def matrix(self) -> csc_matrix:
-        """(6 F, 6 F) matrix of the stations."""
-        size = POSE * (len(self.pointers) - 1)
-        blocks = (self.blocks, self.columns, self.pointers)
-        return csc_matrix(bsr_matrix(blocks, shape=(size, size), blocksize=(POSE, POSE)))
+    def point_steps(self, step: Step) -> Array:
+        """How far every point moves, (P, 3), where all else takes a step."""
+        linear = self.linear
+        return moved_points(
+            linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared,
+            linear.miss, self.point_inverse, step.poses, step.shared,
+        )  # fmt: skip
 
 
-def reduce_points(linear: LinearObservations, stations: int) -> ReducedSystem:
+def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
     """Eliminate the points.
 
     Args:
@@ -103,42 +87,19 @@ def reduce_points(linear: LinearObservations, stations: int) -> ReducedSystem:
     rows, columns = np.nonzero(meets)
     pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
     columns = columns.astype(np.int64)
-    blocks, border, shared, slope, shared_slope, inverse = _reduce(
+    blocks, border, shared, slope, shared_slope, inverse, promised = _reduce(
         linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
         pointers, columns,
     )  # fmt: skip
-    return ReducedSystem(
-        pointers=pointers,
-        columns=columns,
-        blocks=blocks,
-        border=border.reshape(POSE * stations, -1),
-        shared=shared,
-        slope=slope.ravel(),
-        shared_slope=shared_slope,
-        point_inverse=inverse,
-    )
-
-
-def solver_of(matrix: csc_matrix, free: NDArray[np.bool_]) -> Callable[[Array], Array]:
-    """A solver of symmetric equations whose unknowns that are not free are held at zero."""
-    kept = np.flatnonzero(free)
-    cut: Any = matrix[kept][:, kept]
-    factor_of: Any = splu
-    factor = factor_of(
-        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+    return PointEquations(
+        pointers=pointers, columns=columns, blocks=blocks, border=border, shared=shared,
+        slope=slope, shared_slope=shared_slope, free=np.ones((stations, POSE), dtype=np.bool_),
+        promised=promised, linear=linear, point_inverse=inverse,
     )  # fmt: skip
-
-    def solve(right: Array) -> Array:
-        solution = np.zeros_like(right)
-        solution[kept] = factor.solve(np.ascontiguousarray(right[kept]))
-        return solution
-
-    return solve
 
 
 @compiled
-def _mark(starts: Indices, station: Indices, meets: NDArray[np.bool_]) -> None:
+def _mark(starts: Indices, station: Indices, meets: Flags) -> None:
     """Mark the pairs of stations that see a point in common, in place."""
     for p in range(starts.shape[0] - 1):
         for a in range(starts[p], starts[p + 1]):
@@ -187,7 +148,7 @@ def _invert(m: Array, out: Array) -> None:
 def _reduce(
     starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
     pointers: Indices, columns: Indices,
-) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Array, Array, float]:  # fmt: skip
     points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, by_shared.shape[2]
     longest = 0
     for p in range(points):
@@ -199,7 +160,7 @@ def _reduce(
     pose = np.empty((longest, 2, 6))
     cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
     together, solved = np.empty((3, count)), np.empty((3, count))
-    own, pull = np.empty((3, 3)), np.empty(3)
+    own, pull, promised = np.empty((3, 3)), np.empty(3), 0.0
     for p in range(points):
         first, end = starts[p], starts[p + 1]
         own[:], pull[:], together[:] = 0.0, 0.0, 0.0
@@ -215,6 +176,8 @@ def _reduce(
         _invert(own, inverse[p])
         back = inverse[p]
         for i in range(3):
+            for j in range(3):
+                promised += pull[i] * back[i, j] * pull[j]
             for g in range(count):
                 solved[i, g] = 0.0
                 for j in range(3):
@@ -274,7 +237,7 @@ def _reduce(
     for g in range(count):
         for h in range(g):
             shared[h, g] = shared[g, h]
-    return blocks, border, shared, slope, shared_slope, inverse
+    return blocks, border, shared, slope, shared_slope, inverse, promised
 
 
 @compiled
@@ -320,7 +283,7 @@ def point_covariances(
         by_point: (O, 2, 3).
         arm: (O, 3).
         inverse: (P, 3, 3) V^-1.
-        pointers: pattern of `blocks`, as in `ReducedSystem`.
+        pointers: pattern of `blocks`, as in `Equations`.
         columns: of the matrix.
         blocks: (B, 6, 6) covariances between the stations that see a point in common.
     """
@@ -362,23 +325,16 @@ class Gauge:
         """Take stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
         self.middle = centres.mean(axis=0)
         arms = centres - self.middle
-        count = len(arms)
-        self.motions = np.zeros((count, POSE, 7 if scale_free else 6))
+        self.motions = np.zeros((len(arms), POSE, 7 if scale_free else 6))
         self.motions[:, :3, :3] = np.eye(3)
         self.motions[:, 3:] = self.of_points(centres)
-        self.weights = np.tile([depth**2] * 3 + [1.0] * 3, count)
-        flat = self.flat
-        self.spread = np.linalg.inv(flat.T @ (self.weights[:, None] * flat))
-        far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
-        self.held = list(range(POSE))
+        self.weighed = self.motions * np.array([depth**2] * 3 + [1.0] * 3)[:, None]
+        self.spread = np.linalg.inv(_product(self.motions, self.weighed))
+        self.held: Flags = np.zeros((len(arms), POSE), dtype=np.bool_)
+        self.held[0] = True
         if scale_free:
-            along = int(np.argmax(np.abs(arms[far] - arms[0])))
-            self.held.append(POSE * far + 3 + along)
-
-    @property
-    def flat(self) -> Array:
-        """(6 F, 6 or 7)."""
-        return self.motions.reshape(-1, self.motions.shape[2])
+            far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
+            self.held[far, 3 + int(np.argmax(np.abs(arms[far] - arms[0])))] = True
 
     def of_points(self, points: Array) -> Array:
         """What the same motions do to (N, 3) points, (N, 3, 6 or 7)."""
@@ -390,3 +346,45 @@ class Gauge:
         if found.shape[2] > POSE:
             found[:, :, POSE] = arms
         return found
+
+    def motion_in(self, steps: Array) -> Array:
+        """How much of each motion (6 or 7, G) steps (F, 6, G) of the stations are."""
+        found: Array = self.spread @ _product(self.weighed, steps)
+        return found
+
+    def placed(self, equations: PointEquations, given: Array) -> PointEquations:
+        """The equations of steps on top of a motion of the whole block, which is what is shared.
+
+        Pictures say nothing of that motion, so that given poses alone determine it. Steps and
+        motion are apart, since the information on a vague place would be lost in that on the shape.
+
+        Args:
+            equations: of the stations, with nothing shared.
+            given: (F, 6) information on each pose from elsewhere; those held move with the whole.
+        """
+        border = given[:, :, None] * self.motions
+        slope = np.zeros(border.shape[2])
+        return replace(
+            equations.knowing(given[:, :, None] * np.eye(POSE)),
+            border=border, shared=_product(self.motions, border), shared_slope=slope,
+        )  # fmt: skip
+
+    def shape_blocks(self, covariance: PoseCovariance) -> Array:
+        """Covariances (B, 6, 6) of stations without these motions, where the equations have blocks.
+
+        Args:
+            covariance: of the stations, whatever holds their place.
+        """
+        along = covariance.times(self.weighed) @ self.spread
+        across = along - 0.5 * self.motions @ self.motion_in(along)
+        rows, columns = covariance.equations.rows, covariance.equations.columns
+        blocks = self.motions[rows] @ across[columns].swapaxes(1, 2)
+        blocks += across[rows] @ self.motions[columns].swapaxes(1, 2)
+        found: Array = covariance.blocks() - blocks
+        return found
+
+
+def _product(first: Array, second: Array) -> Array:
+    """Sum over all stations, (A, B), of (F, 6, A) transposed times (F, 6, B)."""
+    found: Array = np.tensordot(first, second, axes=([0, 1], [0, 1]))
+    return found
