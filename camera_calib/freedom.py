@@ -180,13 +180,11 @@ class Prior:
                 f"the rig ({rig.source}) has no covariance to serve as a prior: calibrate it, or "
                 "hold its parameters or leave them free"
             )
-        found = rig.covariance.parameters
-        kept = tuple(name for name in names if name in found)
-        at = [found.index(name) for name in kept]
+        kept = tuple(name for name in names if name in rig.covariance.parameters)
         return cls(
             parameters=kept,
             mean=np.array([value(rig, name) for name in kept]),
-            covariance=rig.covariance.matrix[np.ix_(at, at)],
+            covariance=rig.covariance.marginal(kept).matrix,
         )
 
     def and_also(self, other: "Prior") -> "Prior":

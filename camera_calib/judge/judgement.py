@@ -240,8 +240,7 @@ def _camera(
     pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
     halves = None
     if held is not None and held.halves is not None:
-        prior = held.used.freedom.prior
-        halves = halves_difference(held.halves, name, pixels, range_m, anchors, prior)
+        halves = halves_difference(held.halves, name, pixels, range_m, anchors)
     coarse, compensating = pixels[::2, ::2], compensation(rig, name, anchors)
     return CameraJudgement(
         seen=seen,
