@@ -225,10 +225,7 @@ def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Fr
     problem = CalibrationProblem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
     weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
     equations = problem.equations(problem.state(_TRUTH, poses), weights)
-    by_poses = np.linalg.solve(equations.view, equations.view_slope[..., None])[..., 0]
-    slope = equations.rig_slope - np.einsum("vpi,vi->p", equations.between, by_poses)
-    step: Array = -problem.covariance(equations).matrix @ slope
-    return step
+    return equations.step().shared
 
 
 def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIAL) -> Mode:

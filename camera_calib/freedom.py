@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import inverse_of
+from alice_survey.base.block_solver import Indices, inverse_of
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import PARAMETERS
@@ -75,6 +75,17 @@ def value(rig: Rig, name: str) -> float:
     pose = rig.cam_from_rig[camera]
     vector = np.concatenate([pose.rotation.as_rotvec(), pose.translation])
     return float(vector[POSE.index(field)])
+
+
+def wanted_slopes(names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
+    """Which slopes of a camera's pixels are by one of the names, and which name that is.
+
+    The slopes are those by the camera's own parameters, then by its pose on the rig.
+    """
+    slopes = {f"{camera}.{field}": i for i, field in enumerate((*PARAMETERS, *POSE))}
+    pairs = [(slopes[name], i) for i, name in enumerate(names) if name in slopes]
+    columns, at = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    return columns, at
 
 
 def at_bound(rig: Rig, names: Sequence[str]) -> NDArray[np.bool_]:

@@ -69,6 +69,17 @@ class Equations:
     promised: float = 0.0
     """Twice the drop by unknowns that were eliminated before."""
 
+    @classmethod
+    def apart(
+        cls, *, blocks: Array, border: Array, shared: Array, slope: Array, shared_slope: Array
+    ) -> "Equations":
+        """Equations of poses that do not meet, all free, with one block (F, K, K) each."""
+        count = np.arange(len(blocks) + 1)
+        return cls(
+            pointers=count, columns=count[:-1], blocks=blocks, border=border, shared=shared,
+            slope=slope, shared_slope=shared_slope, free=np.ones(slope.shape, dtype=np.bool_),
+        )  # fmt: skip
+
     @cached_property
     def rows(self) -> Indices:
         """(B,) the pose whose row each block is in."""
@@ -284,7 +295,7 @@ class Problem(Protocol[Guess, Normal]):
     def cost(self, guess: Guess, noise: Array) -> float:
         """Half the robust sum of squares, in sigmas; inf where a guess loses an observation."""
 
-    def equations(self, guess: Guess, noise: Array) -> Normal:
+    def linearised(self, guess: Guess, noise: Array) -> Normal:
         """Normal equations at a guess, weights and priors included."""
 
     def moved(self, guess: Guess, equations: Normal, step: Step) -> Guess | None:
@@ -304,7 +315,9 @@ class Minimum(Generic[Guess]):
     length: float
     """Of the last step, in sigmas."""
     is_settled: bool
-    """Whether that is as short as requested, no observation is lost and the noise is steady."""
+    """Whether that is as short as requested, damped or not, and the noise is steady."""
+    is_stuck: bool
+    """Whether no step improves, however short: longer ones lose observations."""
 
 
 def minimise(
@@ -314,7 +327,7 @@ def minimise(
     settled: float,
     most_steps: int,
     damping: float = 0.0,
-    least_damping: float = math.inf,
+    least_damping: float = _LEAST_DAMPING,
 ) -> Minimum[Guess]:
     """Minimise a robust sum of squares from a guess near its minimum.
 
@@ -324,11 +337,11 @@ def minimise(
         settled: length of a step and relative change of the noise at which it ends.
         most_steps: it ends, not settled, after so many.
         damping: of the first step, as a share of the diagonal; less where steps are good.
-        least_damping: it does not settle with more, unless nothing improves.
+        least_damping: with which it may settle.
     """
-    guess, noise = start, problem.noise(start)
+    guess, noise, is_stuck = start, problem.noise(start), False
     for _ in range(most_steps):
-        equations, cost = problem.equations(guess, noise), problem.cost(guess, noise)
+        equations, cost = problem.linearised(guess, noise), problem.cost(guess, noise)
         pinned = problem.at_bound(guess) & (equations.shared_slope > 0)
         while True:
             step = equations.step(damping, pinned)
@@ -342,9 +355,15 @@ def minimise(
             guess = tried
         before, noise = noise, problem.noise(guess)
         is_settled = short and bool(np.all(np.abs(noise / before - 1.0) < settled))
-        if is_settled and (damping <= least_damping or drop < 0):
+        if is_settled and drop < 0:  # damping shortens any step
+            step = equations.step(least_damping, pinned)
+            is_settled, is_stuck = step.length < settled, step.length >= settled
+            break
+        if is_settled and damping <= least_damping:
             break
         is_settled = False
         good = short or drop > 0.25 * step.gain
         damping = max(damping * (0.01 if good else 0.5), _LEAST_DAMPING)
-    return Minimum(guess=guess, noise=noise, length=step.length, is_settled=is_settled)
+    return Minimum(
+        guess=guess, noise=noise, length=step.length, is_settled=is_settled, is_stuck=is_stuck
+    )

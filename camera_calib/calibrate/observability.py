@@ -88,7 +88,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     problem = CalibrationProblem(pixels, calibration.target_points, rig, wider)
     weights = np.where(problem.seen, calibration.sigma_px[..., None] ** -2.0, 0.0)
     state = problem.state(rig, calibration.rig_from_target)
-    information = problem.information(problem.equations(state, weights))
+    information = problem.equations(state, weights).information
     adjusted = freedom.names(rig)
     a = [problem.names.index(n) for n in adjusted]
     b = [problem.names.index(n) for n in held]

@@ -11,8 +11,8 @@ import numpy as np
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS, pose_jacobian
-from camera_calib.freedom import POSE as TURN_AND_SHIFT
+from camera_calib.flat_port import pose_jacobian
+from camera_calib.freedom import wanted_slopes
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.database import Observations, as_transform
@@ -20,8 +20,6 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import LinearObservations
 from reconstruct.views.lens import Lens
 
-_SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
-"""What a camera's pixels depend on: itself, and its place on the rig."""
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
 _MOST_OBSERVATIONS = 500_000
@@ -145,9 +143,7 @@ def exact_observations(
     by_shared, miss = np.zeros((len(arm), 2, count)), np.zeros((len(arm), 2))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
-        mine = [(g, f.split(".")[1]) for g, f in enumerate(fields) if f.split(".")[0] == name]
-        source = np.array([_SLOPES.index(parameter) for _, parameter in mine], dtype=np.int64)
-        target = np.array([g for g, _ in mine], dtype=np.int64)
+        source, target = wanted_slopes(fields, name)
         every = np.flatnonzero(pixels.camera == c)
         for first in range(0, len(every), _BLOCK):
             rows = every[first : first + _BLOCK]

@@ -151,7 +151,7 @@ def fit_rig(
     found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
     if not found.is_settled:
         warn(f"the rig's refinement did not settle in {_STEPS} steps: trust it with care")
-    covariance = inverse_of(problem.equations(found.guess, found.noise).information)
+    covariance = inverse_of(problem.linearised(found.guess, found.noise).information)
     state = found.guess.state
     sigma_px, variance = found.noise.tolist()
     weights = cauchy_weights(found.guess.linear.miss, sigma_px)
@@ -256,7 +256,7 @@ class _SurveyProblem:
         pixels = cauchy_cost(guess.linear.miss, sigma) / variance
         return 0.5 * float(pixels + off @ self.information @ off + (fixes**2).sum())
 
-    def equations(self, guess: _Guess, noise: Array) -> PointEquations:
+    def linearised(self, guess: _Guess, noise: Array) -> PointEquations:
         """Normal equations with the points eliminated."""
         sigma, variance = noise
         weights = cauchy_weights(guess.linear.miss, sigma)
