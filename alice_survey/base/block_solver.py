@@ -57,27 +57,20 @@ class Equations:
     blocks: Array
     """(B, K, K) between poses; those of a pose and itself are all there."""
     border: Array
-    """(F, K, G) between poses and what is shared."""
+    """(F, K, G + 1) between poses and what is shared, then the gradient by the poses."""
     shared: Array
-    """(G, G)."""
-    slope: Array
-    """(F, K) gradient by the poses."""
-    shared_slope: Array
-    """(G,) gradient by what is shared."""
+    """(G + 1, G + 1) of what is shared, then the gradient by it; last, minus twice the drop that
+    unknowns promise that were eliminated before."""
     free: Flags
     """(F, K) which unknowns of the poses may move: a gauge holds some."""
-    promised: float = 0.0
-    """Twice the drop by unknowns that were eliminated before."""
 
     @classmethod
-    def apart(
-        cls, *, blocks: Array, border: Array, shared: Array, slope: Array, shared_slope: Array
-    ) -> "Equations":
+    def apart(cls, blocks: Array, border: Array, shared: Array) -> "Equations":
         """Equations of poses that do not meet, all free, with one block (F, K, K) each."""
-        count = np.arange(len(blocks) + 1)
+        count, free = np.arange(len(blocks) + 1), np.ones(blocks.shape[:2], dtype=np.bool_)
         return cls(
             pointers=count, columns=count[:-1], blocks=blocks, border=border, shared=shared,
-            slope=slope, shared_slope=shared_slope, free=np.ones(slope.shape, dtype=np.bool_),
+            free=free,
         )  # fmt: skip
 
     @cached_property
@@ -110,27 +103,30 @@ class Equations:
 
     def step(self, damping: float = 0.0, pinned: Flags | None = None) -> Step:
         """The step of all unknowns but those of what is shared that are pinned."""
-        moving = np.arange(len(self.shared)) if pinned is None else np.flatnonzero(~pinned)
-        border = self.border[..., moving]
-        solved = self.factor(damping).solve(
-            np.concatenate([border, self.slope[..., None]], axis=-1)
-        )
-        reduced = np.tensordot(border, solved, axes=([0, 1], [0, 1]))
-        shared = np.zeros(len(self.shared))
+        shared = np.zeros(len(self.shared) - 1)
+        moving = np.flatnonzero(np.ones_like(shared) if pinned is None else ~pinned)
+        kept = np.append(moving, len(shared))
+        border = self.border[..., kept]
+        solved = self.factor(damping).solve(border)
+        reduced = self.shared[np.ix_(kept, kept)] - product_of(border, solved)
         diagonal = np.diag(self.shared)[moving]
         scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        schur = (self.shared[np.ix_(moving, moving)] - reduced[:, :-1]) * np.outer(scale, scale)
+        schur, slope = reduced[:-1, :-1] * np.outer(scale, scale), reduced[:-1, -1] * scale
         schur[np.diag_indices_from(schur)] += damping + _ROUNDING
-        slope = (self.shared_slope[moving] - reduced[:, -1]) * scale
         if moving.size:
             try:
-                shared[moving] = -scale * cho_solve(cho_factor(schur), slope)
+                step = -cho_solve(cho_factor(schur), slope)
             except np.linalg.LinAlgError:  # rounding left it indefinite
-                shared[moving] = -scale * np.linalg.lstsq(schur, slope, rcond=1e-13)[0]
-        poses = -solved[..., -1] - solved[..., :-1] @ shared[moving]
-        gain = self.promised - float(self.shared_slope @ shared) - float((self.slope * poses).sum())
-        along = -float(slope @ (shared[moving] / scale)) if moving.size else gain
-        return Step(poses=poses, shared=shared, gain=gain, length=math.sqrt(max(along, 0.0)))
+                step = -np.linalg.lstsq(schur, slope, rcond=1e-13)[0]
+            shared[moving] = scale * step
+        along = -float(shared[moving] @ reduced[:-1, -1])
+        gain = along - float(reduced[-1, -1])
+        return Step(
+            poses=-solved[..., -1] - solved[..., :-1] @ shared[moving],
+            shared=shared,
+            gain=gain,
+            length=math.sqrt(max(along if moving.size else gain, 0.0)),
+        )
 
     @cached_property
     def undamped(self) -> "PoseFactor":
@@ -140,34 +136,25 @@ class Equations:
     @cached_property
     def response(self) -> Array:
         """(F, K, G) how poses follow a change of what is shared."""
-        return -self.undamped.solve(self.border)
+        return -self.undamped.solve(self.border[..., :-1])
 
     @property
     def information(self) -> Array:
         """(G, G) information on what is shared, the poses marginalised."""
-        reduced = np.tensordot(self.border, self.response, axes=([0, 1], [0, 1]))
-        information: Array = self.shared + 0.5 * (reduced + reduced.T)
+        reduced = product_of(self.border[..., :-1], self.response)
+        information: Array = self.shared[:-1, :-1] + 0.5 * (reduced + reduced.T)
         return information
 
-
-class PoseCovariance:
-    """Covariance of the poses, what is shared marginalised."""
-
-    def __init__(self, equations: Equations) -> None:
-        self.equations, self.follow = equations, equations.response
-        self.shared = inverse_of(equations.information)
-
-    def times(self, right: Array) -> Array:
-        """The covariance times (F, K, R)."""
-        inner = self.shared @ np.tensordot(self.follow, right, axes=([0, 1], [0, 1]))
-        product: Array = self.equations.undamped.solve(right) + self.follow @ inner
+    def covariance_times(self, right: Array) -> Array:
+        """The covariance of the poses, what is shared marginalised, times (F, K, R)."""
+        inner = inverse_of(self.information) @ product_of(self.response, right)
+        product: Array = self.undamped.solve(right) + self.response @ inner
         return product
 
-    def blocks(self) -> Array:
-        """(B, K, K) covariances of those poses between which the equations have blocks."""
-        rows, columns = self.equations.rows, self.equations.columns
-        moved = self.follow[rows] @ self.shared @ self.follow[columns].swapaxes(1, 2)
-        return self.equations.undamped.inverse_blocks() + moved
+    def covariance_blocks(self) -> Array:
+        """(B, K, K) covariances of those poses between which there are blocks."""
+        across = inverse_of(self.information) @ self.response[self.columns].swapaxes(1, 2)
+        return self.undamped.inverse_blocks() + self.response[self.rows] @ across
 
 
 class PoseFactor:
@@ -184,7 +171,7 @@ class PoseFactor:
             return np.asarray(np.linalg.solve(self.blocks, right))
         order, factor = self._sparse
         solved = np.empty_like(right)
-        flat = right[order].reshape(self.equations.slope.size, right.shape[2])
+        flat = right[order].reshape(self.equations.free.size, right.shape[2])
         solved[order] = factor.solve(flat).reshape(right.shape)
         return solved
 
@@ -192,7 +179,7 @@ class PoseFactor:
     def _sparse(self) -> tuple[Indices, Any]:
         """The order in which poses are eliminated, and the factor of them in that order."""
         rows, columns, count = self.equations.rows, self.equations.columns, len(self.equations.free)
-        whole, size = np.ones(len(rows)), self.equations.slope.size
+        whole, size = np.ones(len(rows)), self.equations.free.size
         whole[self.equations.own] = 2.0 * count
         place = _factor(csc_matrix((whole, (rows, columns))), "MMD_AT_PLUS_A").perm_c
         order: Indices = np.argsort(place)
@@ -209,7 +196,7 @@ class PoseFactor:
         pose meets is met by the next one of it too, so that Z is known there (K. Takahashi, J.
         Fagan & M.-S. Chin 1973, "Formation of a sparse bus impedance matrix").
         """
-        count, wide = self.equations.slope.shape
+        count, wide = self.equations.free.shape
         order, factor = self._sparse
         place = np.argsort(order)
         rows, columns = self.equations.rows, self.equations.columns
@@ -251,6 +238,12 @@ class PoseFactor:
         free = self.equations.free
         found *= free[rows, :, None] & free[columns, None, :]
         return found
+
+
+def product_of(first: Array, second: Array) -> Array:
+    """Sum over all poses, (A, B), of (F, K, A) transposed times (F, K, B)."""
+    product: Array = np.tensordot(first, second, axes=([0, 1], [0, 1]))
+    return product
 
 
 def inverse_of(matrix: Array) -> Array:
@@ -306,10 +299,12 @@ class Problem(Protocol[Guess, Normal]):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Minimum(Generic[Guess]):
+class Minimum(Generic[Guess, Normal]):
     """Where an adjustment ended."""
 
     guess: Guess
+    equations: Normal
+    """From which the last step was taken."""
     noise: Array
     """(N,) scales of the loss there."""
     length: float
@@ -328,7 +323,7 @@ def minimise(
     most_steps: int,
     damping: float = 0.0,
     least_damping: float = _LEAST_DAMPING,
-) -> Minimum[Guess]:
+) -> Minimum[Guess, Normal]:
     """Minimise a robust sum of squares from a guess near its minimum.
 
     Args:
@@ -342,7 +337,7 @@ def minimise(
     guess, noise, is_stuck = start, problem.noise(start), False
     for _ in range(most_steps):
         equations, cost = problem.linearised(guess, noise), problem.cost(guess, noise)
-        pinned = problem.at_bound(guess) & (equations.shared_slope > 0)
+        pinned = problem.at_bound(guess) & (equations.shared[:-1, -1] > 0)
         while True:
             step = equations.step(damping, pinned)
             short = step.length < settled
@@ -365,5 +360,6 @@ def minimise(
         good = short or drop > 0.25 * step.gain
         damping = max(damping * (0.01 if good else 0.5), _LEAST_DAMPING)
     return Minimum(
-        guess=guess, noise=noise, length=step.length, is_settled=is_settled, is_stuck=is_stuck
-    )
+        guess=guess, equations=equations, noise=noise, length=step.length, is_settled=is_settled,
+        is_stuck=is_stuck,
+    )  # fmt: skip

@@ -185,7 +185,7 @@ class _Solver(CalibrationProblem):
         )  # fmt: skip
         if found.is_settled or at_most is not None:
             return self.result(found)
-        self.covariance(self.linearised(found.guess, found.noise))  # names what views leave open
+        self.covariance(found.equations)  # names what the views leave open, if that is the reason
         if found.is_stuck:
             raise CalibrationError(
                 f"the adjustment is stuck {found.length:.2g} sigmas from its end, where measured "
@@ -203,7 +203,7 @@ class _Solver(CalibrationProblem):
         weights: Array = np.where(self.seen, HUBER / np.maximum(length, HUBER), 0.0)
         return weights
 
-    def result(self, found: Minimum[_Guess]) -> Adjustment:
+    def result(self, found: Minimum[_Guess, Equations]) -> Adjustment:
         """The adjusted rig and poses, with the covariance at this guess."""
         state, weights = found.guess.state, self.weights(found.guess, found.noise)
         noise_px = self._noise(found.guess.lengths, weights)

@@ -118,8 +118,7 @@ class CalibrationProblem:
     def equations(self, state: State, weights: Array) -> Equations:
         """Normal equations, with the prior, for weights (V, C, N) in 1/px^2."""
         count, views = len(self.names), len(self.pixels)
-        shared, shared_slope = np.zeros((count, count)), np.zeros(count)
-        border, slope = np.zeros((views, 6, count)), np.zeros((views, 6))
+        shared, border = np.zeros((count + 1, count + 1)), np.zeros((views, 6, count + 1))
         blocks = np.zeros((views, 6, 6))
         for slopes in self.slopes(state):
             c, v, at, rows = slopes.camera, slopes.views, slopes.at, slopes.rows
@@ -129,18 +128,15 @@ class CalibrationProblem:
             rows = rows.reshape(len(v), 2 * len(self.points), rows.shape[-1])
             square = rows.transpose(0, 2, 1) @ rows
             p = len(at)
-            total = square.sum(axis=0)
-            shared[np.ix_(at, at)] += total[:p, :p]
-            shared_slope[at] += total[:p, -1]
-            border[v[:, None], :, at] += square[:, :p, p:-1]
+            rest, at = np.append(np.arange(p), -1), np.append(at, count)
+            shared[np.ix_(at, at)] += square.sum(axis=0)[np.ix_(rest, rest)]
+            border[v[:, None], :, at] += square[:, rest, p:-1]
             blocks[v] += square[:, p:-1, p:-1]
-            slope[v] += square[:, p:-1, -1]
         at = self.prior_at
         shared[np.ix_(at, at)] += self.prior_information
-        shared_slope[at] += self.prior_information @ self.prior_residuals(state)
-        return Equations.apart(
-            blocks=blocks, border=border, shared=shared, slope=slope, shared_slope=shared_slope
-        )
+        shared[at, -1] += self.prior_information @ self.prior_residuals(state)
+        shared[-1, -1] = 0.0
+        return Equations.apart(blocks, border, shared)
 
     def slopes(self, state: State) -> Iterator[Slopes]:
         """Derivatives of all pixels, camera by camera."""
@@ -182,7 +178,7 @@ class CalibrationProblem:
         if not self.names:
             return Covariance(parameters=(), matrix=np.zeros((0, 0)))
         # Held against what the views would determine if poses and all else were known.
-        diagonal = np.diag(equations.shared)
+        diagonal = np.diag(equations.shared)[:-1]
         blind = [n for n, d in zip(self.names, diagonal, strict=True) if not d > 0]
         if blind:
             raise CalibrationError(f"no picture depends on {', '.join(blind)}: hold it")

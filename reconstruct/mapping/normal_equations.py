@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alice_survey.base.block_solver import Equations, Flags, Indices, PoseCovariance, Step
+from alice_survey.base.block_solver import Equations, Flags, Indices, Step, product_of
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
@@ -36,10 +36,13 @@ class LinearObservations:
     """(O, 2, 3) slopes of the pixel by the point in the world."""
     arm: Array
     """(O, 3) vector from the station's origin to the point, in the world."""
-    by_shared: Array
-    """(O, 2, G) slopes by what all share; G may be 0."""
-    miss: Array
-    """(O, 2) computed pixel minus the observed one."""
+    rest: Array
+    """(O, 2, G + 1) slopes by what all share, then computed pixel minus the observed one."""
+
+    @property
+    def miss(self) -> Array:
+        """(O, 2) computed pixel minus the observed one."""
+        return self.rest[..., -1]
 
     @property
     def seen_by(self) -> Indices:
@@ -49,13 +52,8 @@ class LinearObservations:
 
     def weighted(self, weights: Array) -> "LinearObservations":
         """The same observations with the squares of each weighted, (O,)."""
-        root = np.sqrt(weights)[:, None]
-        return replace(
-            self,
-            by_point=root[:, :, None] * self.by_point,
-            by_shared=root[:, :, None] * self.by_shared,
-            miss=root * self.miss,
-        )
+        root = np.sqrt(weights)[:, None, None]
+        return replace(self, by_point=root * self.by_point, rest=root * self.rest)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,10 +66,28 @@ class PointEquations(Equations):
 
     def point_steps(self, step: Step) -> Array:
         """How far every point moves, (P, 3), where all else takes a step."""
+        return self.follow(step.poses, np.append(step.shared, 1.0))
+
+    def follow(self, poses: Array, rest: Array) -> Array:
+        """Motions (P, 3) of points by steps (F, 6) of stations and (G + 1,) of the `rest`."""
         linear = self.linear
-        return moved_points(
-            linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared,
-            linear.miss, self.point_inverse, step.poses, step.shared,
+        return _follow(
+            linear.starts, linear.station, linear.by_point, linear.arm, linear.rest,
+            self.point_inverse, poses, rest,
+        )  # fmt: skip
+
+    def point_covariances(self, blocks: Array) -> Array:
+        """Covariance of every point, (P, 3, 3), from those of its stations.
+
+        With G = -V^-1 W^T what a point does when its stations move: V^-1 + G C G^T.
+
+        Args:
+            blocks: (B, 6, 6) covariances between the stations that see a point in common.
+        """
+        linear = self.linear
+        return _point_covariances(
+            linear.starts, linear.station, linear.by_point, linear.arm, self.point_inverse,
+            self.pointers, self.columns, blocks,
         )  # fmt: skip
 
 
@@ -87,14 +103,12 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
     rows, columns = np.nonzero(meets)
     pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
     columns = columns.astype(np.int64)
-    blocks, border, shared, slope, shared_slope, inverse, promised = _reduce(
-        linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
-        pointers, columns,
-    )  # fmt: skip
+    blocks, border, shared, inverse = _reduce(
+        linear.starts, linear.station, linear.by_point, linear.arm, linear.rest, pointers, columns
+    )
     return PointEquations(
         pointers=pointers, columns=columns, blocks=blocks, border=border, shared=shared,
-        slope=slope, shared_slope=shared_slope, free=np.ones((stations, POSE), dtype=np.bool_),
-        promised=promised, linear=linear, point_inverse=inverse,
+        free=np.ones((stations, POSE), dtype=np.bool_), linear=linear, point_inverse=inverse,
     )  # fmt: skip
 
 
@@ -146,38 +160,33 @@ def _invert(m: Array, out: Array) -> None:
 
 @compiled
 def _reduce(
-    starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
+    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array,
     pointers: Indices, columns: Indices,
-) -> tuple[Array, Array, Array, Array, Array, Array, float]:  # fmt: skip
-    points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, by_shared.shape[2]
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, rest.shape[2]
     longest = 0
     for p in range(points):
         longest = max(longest, starts[p + 1] - starts[p])
     blocks = np.zeros((columns.shape[0], 6, 6))
     border, shared = np.zeros((stations, 6, count)), np.zeros((count, count))
-    slope, shared_slope = np.zeros((stations, 6)), np.zeros(count)
     inverse = np.empty((points, 3, 3))
     pose = np.empty((longest, 2, 6))
     cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
-    together, solved = np.empty((3, count)), np.empty((3, count))
-    own, pull, promised = np.empty((3, 3)), np.empty(3), 0.0
+    own, together, solved = np.empty((3, 3)), np.empty((3, count)), np.empty((3, count))
     for p in range(points):
         first, end = starts[p], starts[p + 1]
-        own[:], pull[:], together[:] = 0.0, 0.0, 0.0
+        own[:], together[:] = 0.0, 0.0
         for o in range(first, end):
             for row in range(2):
                 for i in range(3):
                     s = by_point[o, row, i]
-                    pull[i] += s * miss[o, row]
                     for j in range(3):
                         own[i, j] += s * by_point[o, row, j]
                     for g in range(count):
-                        together[i, g] += s * by_shared[o, row, g]
+                        together[i, g] += s * rest[o, row, g]
         _invert(own, inverse[p])
         back = inverse[p]
         for i in range(3):
-            for j in range(3):
-                promised += pull[i] * back[i, j] * pull[j]
             for g in range(count):
                 solved[i, g] = 0.0
                 for j in range(3):
@@ -201,19 +210,13 @@ def _reduce(
             k, s = o - first, station[o]
             at = find_block(pointers, columns, s, s)
             for i in range(6):
-                for j in range(6):
-                    blocks[at, i, j] += (
-                        pose[k, 0, i] * pose[k, 0, j] + pose[k, 1, i] * pose[k, 1, j]
-                    )
-                value = pose[k, 0, i] * miss[o, 0] + pose[k, 1, i] * miss[o, 1]
-                for j in range(3):
-                    value -= gain[k, i, j] * pull[j]
-                slope[s, i] += value
                 u, v = pose[k, 0, i], pose[k, 1, i]
+                for j in range(6):
+                    blocks[at, i, j] += u * pose[k, 0, j] + v * pose[k, 1, j]
                 x, y, z = gain[k, i, 0], gain[k, i, 1], gain[k, i, 2]
                 for g in range(count):
                     border[s, i, g] += (
-                        u * by_shared[o, 0, g] + v * by_shared[o, 1, g]
+                        u * rest[o, 0, g] + v * rest[o, 1, g]
                         - x * together[0, g] - y * together[1, g] - z * together[2, g]
                     )  # fmt: skip
             for other in range(first, end):
@@ -223,29 +226,26 @@ def _reduce(
                     for j in range(6):
                         block[i, j] -= x * cross[m, j, 0] + y * cross[m, j, 1] + z * cross[m, j, 2]
             for g in range(count):
-                u, v = by_shared[o, 0, g], by_shared[o, 1, g]
+                u, v = rest[o, 0, g], rest[o, 1, g]
                 if u == 0.0 and v == 0.0:  # of another camera
                     continue
-                for h in range(g + 1):
-                    shared[g, h] += u * by_shared[o, 0, h] + v * by_shared[o, 1, h]
-                shared_slope[g] += u * miss[o, 0] + v * miss[o, 1]
+                for h in range(min(g + 1, count - 1)):
+                    shared[g, h] += u * rest[o, 0, h] + v * rest[o, 1, h]
         for g in range(count):
             for j in range(3):
-                shared_slope[g] -= solved[j, g] * pull[j]
                 for h in range(g + 1):
                     shared[g, h] -= together[j, g] * solved[j, h]
     for g in range(count):
         for h in range(g):
             shared[h, g] = shared[g, h]
-    return blocks, border, shared, slope, shared_slope, inverse, promised
+    return blocks, border, shared, inverse
 
 
 @compiled
-def moved_points(
-    starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
-    inverse: Array, steps: Array, shared_step: Array,
+def _follow(
+    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array,
+    inverse: Array, steps: Array, rest_steps: Array,
 ) -> Array:  # fmt: skip
-    """How far every point moves, (P, 3), where stations take steps (F, 6)."""
     points = starts.shape[0] - 1
     moved = np.empty((points, 3))
     pose, pull = np.empty((2, 6)), np.empty(3)
@@ -254,11 +254,11 @@ def moved_points(
         for o in range(starts[p], starts[p + 1]):
             by_pose(by_point[o], arm[o], pose)
             for row in range(2):
-                value = miss[o, row]
+                value = 0.0
                 for i in range(6):
                     value += pose[row, i] * steps[station[o], i]
-                for g in range(shared_step.shape[0]):
-                    value += by_shared[o, row, g] * shared_step[g]
+                for g in range(rest_steps.shape[0]):
+                    value += rest[o, row, g] * rest_steps[g]
                 for i in range(3):
                     pull[i] -= by_point[o, row, i] * value
         for i in range(3):
@@ -269,24 +269,10 @@ def moved_points(
 
 
 @compiled
-def point_covariances(
+def _point_covariances(
     starts: Indices, station: Indices, by_point: Array, arm: Array, inverse: Array,
     pointers: Indices, columns: Indices, blocks: Array,
 ) -> Array:  # fmt: skip
-    """Covariance of every point, (P, 3, 3), from those of its stations.
-
-    With G = -V^-1 W^T what a point does when its stations move: V^-1 + G C G^T.
-
-    Args:
-        starts: as `LinearObservations`; so `station`, `by_point` and `arm`.
-        station: (O,).
-        by_point: (O, 2, 3).
-        arm: (O, 3).
-        inverse: (P, 3, 3) V^-1.
-        pointers: pattern of `blocks`, as in `Equations`.
-        columns: of the matrix.
-        blocks: (B, 6, 6) covariances between the stations that see a point in common.
-    """
     points = starts.shape[0] - 1
     found = inverse.copy()
     longest = 0
@@ -329,7 +315,7 @@ class Gauge:
         self.motions[:, :3, :3] = np.eye(3)
         self.motions[:, 3:] = self.of_points(centres)
         self.weighed = self.motions * np.array([depth**2] * 3 + [1.0] * 3)[:, None]
-        self.spread = np.linalg.inv(_product(self.motions, self.weighed))
+        self.spread = np.linalg.inv(product_of(self.motions, self.weighed))
         self.held: Flags = np.zeros((len(arms), POSE), dtype=np.bool_)
         self.held[0] = True
         if scale_free:
@@ -349,7 +335,7 @@ class Gauge:
 
     def motion_in(self, steps: Array) -> Array:
         """How much of each motion (6 or 7, G) steps (F, 6, G) of the stations are."""
-        found: Array = self.spread @ _product(self.weighed, steps)
+        found: Array = self.spread @ product_of(self.weighed, steps)
         return found
 
     def placed(self, equations: PointEquations, given: Array) -> PointEquations:
@@ -362,29 +348,22 @@ class Gauge:
             equations: of the stations, with nothing shared.
             given: (F, 6) information on each pose from elsewhere; those held move with the whole.
         """
-        border = given[:, :, None] * self.motions
-        slope = np.zeros(border.shape[2])
-        return replace(
-            equations.knowing(given[:, :, None] * np.eye(POSE)),
-            border=border, shared=_product(self.motions, border), shared_slope=slope,
-        )  # fmt: skip
+        count = self.motions.shape[2]
+        border, shared = given[:, :, None] * self.motions, np.zeros((count + 1, count + 1))
+        shared[:-1, :-1] = product_of(self.motions, border)
+        border = np.concatenate([border, equations.border], axis=2)
+        found = equations.knowing(given[:, :, None] * np.eye(POSE))
+        return replace(found, border=border, shared=shared)
 
-    def shape_blocks(self, covariance: PoseCovariance) -> Array:
+    def shape_blocks(self, equations: Equations) -> Array:
         """Covariances (B, 6, 6) of stations without these motions, where the equations have blocks.
 
         Args:
-            covariance: of the stations, whatever holds their place.
+            equations: of the stations, whatever holds their place.
         """
-        along = covariance.times(self.weighed) @ self.spread
+        along = equations.covariance_times(self.weighed) @ self.spread
         across = along - 0.5 * self.motions @ self.motion_in(along)
-        rows, columns = covariance.equations.rows, covariance.equations.columns
+        rows, columns = equations.rows, equations.columns
         blocks = self.motions[rows] @ across[columns].swapaxes(1, 2)
         blocks += across[rows] @ self.motions[columns].swapaxes(1, 2)
-        found: Array = covariance.blocks() - blocks
-        return found
-
-
-def _product(first: Array, second: Array) -> Array:
-    """Sum over all stations, (A, B), of (F, 6, A) transposed times (F, 6, B)."""
-    found: Array = np.tensordot(first, second, axes=([0, 1], [0, 1]))
-    return found
+        return equations.covariance_blocks() - blocks

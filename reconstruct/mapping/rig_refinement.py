@@ -94,15 +94,14 @@ class RigFit:
 
     def to_json(self) -> dict[str, Any]:
         """What `port.json` says."""
-        sigmas = np.sqrt(np.diag(self.covariance))
-        scale = 1.0 / np.where(sigmas > 0, sigmas, np.inf)
+        known = Covariance(parameters=self.parameters, matrix=self.covariance)
         return {
             "parameters": list(self.parameters),
             "before": self.before.tolist(),
             "after": self.after.tolist(),
             "prior_sigmas": self.prior_sigmas.tolist(),
-            "sigmas": sigmas.tolist(),
-            "correlation": (self.covariance * np.outer(scale, scale)).tolist(),
+            "sigmas": list(known.sigmas.values()),
+            "correlation": known.correlation.tolist(),
             "sigma_px": self.sigma_px,
             "observations": self.observations,
             "stations": len(self.stations),
@@ -151,7 +150,7 @@ def fit_rig(
     found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
     if not found.is_settled:
         warn(f"the rig's refinement did not settle in {_STEPS} steps: trust it with care")
-    covariance = inverse_of(problem.linearised(found.guess, found.noise).information)
+    covariance = inverse_of(found.equations.information)
     state = found.guess.state
     sigma_px, variance = found.noise.tolist()
     weights = cauchy_weights(found.guess.linear.miss, sigma_px)
@@ -213,7 +212,7 @@ class _SurveyProblem:
 
     def _seen(self, state: RigState) -> _Guess:
         linear = exact_observations(state, self.pixels, self.fields, lever=self.fixes is not None)
-        lost = np.flatnonzero((linear.by_point == 0.0).all(axis=(1, 2)))
+        lost = np.flatnonzero(~linear.by_point[:, 0].any(axis=1))
         return _Guess(state=state, linear=linear, lost=lost)
 
     def values(self, state: RigState) -> Array:
@@ -226,18 +225,16 @@ class _SurveyProblem:
         off = np.concatenate([self.prior.misfit(state.rig), state.lever - self.first_lever])
         return off[: len(self.information)]
 
-    def off_fixes(self, state: RigState, fixes: NavigationFixes) -> tuple[Array, Array]:
-        """Misses (F, 3) of the fixes in sigmas, and slopes (F, 3, 9) by station and lever arm.
-
-        Both are zero where there is no fix.
-        """
-        known = np.isfinite(fixes.positions + fixes.sigmas)
+    def fix_rows(self, state: RigState) -> Array:
+        """Fixes in sigmas: slopes (F, 3, 10) by station and lever arm, then misses; 0 for none."""
+        if self.fixes is None:
+            return np.zeros((len(state.turns), 3, POSE + 4))
         arms = state.turns @ state.lever
         unit = np.broadcast_to(np.eye(3), state.turns.shape)
-        slopes = np.concatenate([-cross_matrices(arms), unit, state.turns], axis=2)
-        off = (state.centres + arms - fixes.positions) / fixes.sigmas
-        slopes = slopes / fixes.sigmas[:, :, None]
-        return np.where(known, off, 0.0), np.where(known[:, :, None], slopes, 0.0)
+        off = (state.centres + arms - self.fixes.positions)[:, :, None]
+        rows = np.concatenate([-cross_matrices(arms), unit, state.turns, off], axis=2)
+        rows = rows / self.fixes.sigmas[:, :, None]
+        return np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
 
     def noise(self, guess: _Guess) -> Array:
         """Sigma of a keypoint's coordinate for the weights, and variance that scales them."""
@@ -250,9 +247,7 @@ class _SurveyProblem:
         if np.setdiff1d(guess.lost, self.start.lost).size:
             return math.inf
         sigma, variance = noise
-        off, fixes = self.misfit(guess.state), np.zeros(0)
-        if self.fixes is not None:
-            fixes = self.off_fixes(guess.state, self.fixes)[0]
+        off, fixes = self.misfit(guess.state), self.fix_rows(guess.state)[..., -1]
         pixels = cauchy_cost(guess.linear.miss, sigma) / variance
         return 0.5 * float(pixels + off @ self.information @ off + (fixes**2).sum())
 
@@ -262,25 +257,19 @@ class _SurveyProblem:
         weights = cauchy_weights(guess.linear.miss, sigma)
         weights[self.start.lost] = 0.0
         found = reduce_points(guess.linear.weighted(weights / variance), len(guess.state.centres))
-        shared = found.shared + self.information
-        shared_slope = found.shared_slope + self.information @ self.misfit(guess.state)
+        found.shared[:-1, :-1] += self.information
+        found.shared[:-1, -1] += self.information @ self.misfit(guess.state)
         if self.fixes is None:
-            free = found.free.copy()
-            free[0] = False
-            return replace(found, shared=shared, shared_slope=shared_slope, free=free)
-        off, slopes = self.off_fixes(guess.state, self.fixes)
-        square = slopes.swapaxes(1, 2) @ slopes
-        slope = (slopes.swapaxes(1, 2) @ off[:, :, None])[:, :, 0]
-        fixed = np.flatnonzero(slopes[:, 0, 3])
+            found.free[0] = False
+            return found
+        rows = self.fix_rows(guess.state)
+        square = rows.swapaxes(1, 2) @ rows
+        square[:, -1, -1] = 0.0
+        fixed = np.flatnonzero(rows.any(axis=(1, 2)))
         square[fixed[:, None], np.arange(3), np.arange(3)] += TURN_INFORMATION
-        border = found.border.copy()
-        border[:, :, -3:] += square[:, :POSE, POSE:]
-        shared[-3:, -3:] += square[:, POSE:, POSE:].sum(axis=0)
-        shared_slope[-3:] += slope[:, POSE:].sum(axis=0)
-        return replace(
-            found.knowing(square[:, :POSE, :POSE]), border=border, shared=shared,
-            slope=found.slope + slope[:, :POSE], shared_slope=shared_slope,
-        )  # fmt: skip
+        found.border[:, :, -4:] += square[:, :POSE, POSE:]
+        found.shared[-4:, -4:] += square[:, POSE:, POSE:].sum(axis=0)
+        return found.knowing(square[:, :POSE, :POSE])
 
     def moved(self, guess: _Guess, equations: PointEquations, step: Step) -> _Guess | None:
         """The guess after a step; None where a camera would leave its range."""

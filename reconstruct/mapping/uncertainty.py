@@ -24,7 +24,6 @@ import pycolmap
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.block_solver import PoseCovariance
 from alice_survey.base.contents import read_arrays, taken_from
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array
@@ -46,8 +45,6 @@ from reconstruct.mapping.normal_equations import (
     TURN_INFORMATION,
     Gauge,
     LinearObservations,
-    moved_points,
-    point_covariances,
     reduce_points,
 )
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
@@ -155,13 +152,9 @@ def estimate(
     equations = replace(equations, free=~(gauge.held | loose[:, None]))
     if given is not None:
         equations = gauge.placed(equations, given * ~loose[:, None])
-    noise = equations.point_inverse
-    blocks = gauge.shape_blocks(PoseCovariance(equations))
+    blocks = gauge.shape_blocks(equations)
     blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
-    points = point_covariances(
-        linear.starts, linear.station, linear.by_point, linear.arm, noise,
-        equations.pointers, equations.columns, blocks,
-    )  # fmt: skip
+    points = equations.point_covariances(blocks)
     frame_cov = blocks[equations.own]
     if calibration is not None:
         shape = calibration.without(gauge)
@@ -175,7 +168,7 @@ def estimate(
         frame_cov=frame_cov,
         point_ids=seen.point_ids,
         point_cov=points,
-        point_noise=noise,
+        point_noise=equations.point_inverse,
         sigma_px=float(np.sqrt(variance / weights.mean())),
     )
 
@@ -250,7 +243,7 @@ def pinhole_observations(
     points, local, pixels = seen.points, seen.in_cameras, seen.pixels
     order = np.argsort(seen.point, kind="stable")
     station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
-    miss = np.empty((len(order), 2))
+    rest = np.empty((len(order), 2, 1))
     centres = _centres(model, frames)
     for n, number in enumerate(seen.pictures.tolist()):
         image, rows = model.images[number], seen.of(n)
@@ -260,7 +253,7 @@ def pinhole_observations(
         slopes = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=-1)
         turn = image.cam_from_world().matrix()[:, :3]
         by_point[rows] = slopes.reshape(-1, 2, 3) @ turn
-        miss[rows] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
+        rest[rows, :, 0] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
         station[rows] = np.searchsorted(frames, image.frame_id)
     counts = np.bincount(seen.point, minlength=len(points))
     linear = LinearObservations(
@@ -268,8 +261,7 @@ def pinhole_observations(
         station=station[order],
         by_point=by_point[order],
         arm=(points[seen.point] - centres[station])[order],
-        by_shared=np.zeros((len(order), 2, 0)),
-        miss=miss[order],
+        rest=rest[order],
     )
     return linear, order.astype(np.int64)
 
@@ -360,12 +352,9 @@ def _response(linear: LinearObservations, count: int, given: Array | None) -> tu
         equations = equations.knowing(given[:, :, None] * np.eye(POSE))
     equations = replace(equations, free=free)
     stations = equations.response
-    still = np.zeros_like(linear.miss)
+    count = stations.shape[2]
     points = [
-        moved_points(
-            linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, still,
-            equations.point_inverse, np.ascontiguousarray(stations[:, :, g]), unit,
-        )
-        for g, unit in enumerate(np.eye(stations.shape[2]))
-    ]  # fmt: skip
+        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
+        for g, unit in enumerate(np.eye(count, count + 1))
+    ]
     return stations, np.stack(points, axis=-1)

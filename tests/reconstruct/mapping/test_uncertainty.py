@@ -75,7 +75,7 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     stations = int(few.station.max()) + 1
     reduced = reduce_points(few, stations)
     hessian, slope = dense_normal_equations(few, stations)
-    size, count = 6 * stations, few.by_shared.shape[2]
+    size, count = 6 * stations, few.rest.shape[2] - 1
     own = np.r_[0:size, len(slope) - count : len(slope)]
     rest = np.r_[size : len(slope) - count]
     back = np.linalg.inv(hessian[np.ix_(rest, rest)])
@@ -85,7 +85,7 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     pull = slope[own] - hessian[np.ix_(own, rest)] @ back @ slope[rest]
     scale = np.abs(expected).max()
     np.testing.assert_allclose(dense_of(reduced), expected, atol=1e-9 * scale)
-    together = np.concatenate([reduced.slope.ravel(), reduced.shared_slope])
+    together = np.concatenate([reduced.border[..., -1].ravel(), reduced.shared[:-1, -1]])
     np.testing.assert_allclose(together, pull, atol=1e-9 * np.abs(slope).max())
 
     rng = np.random.default_rng(1)
@@ -175,8 +175,7 @@ def _few(linear: LinearObservations, points: int, rng: np.random.Generator) -> L
         station=linear.station[:end],
         by_point=linear.by_point[:end],
         arm=linear.arm[:end],
-        by_shared=rng.normal(0, 100, (end, 2, 2)),
-        miss=linear.miss[:end],
+        rest=np.concatenate([rng.normal(0, 100, (end, 2, 2)), linear.rest[:end]], axis=2),
     )
 
 
