@@ -231,9 +231,7 @@ def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Fr
     problem = CalibrationProblem(pixels, BOARD, _TRUTH, freedom, shape)
     weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
     equations = problem.equations(problem.state(_TRUTH, poses), weights)
-    by_poses = np.linalg.solve(equations.view, equations.view_slope[..., None])[..., 0]
-    slope = equations.rig_slope - np.einsum("vpi,vi->p", equations.between, by_poses)
-    step: Array = -problem.covariance(equations).matrix @ slope
+    step: Array = equations.step().shared
     return step[: len(step) - len(shape.parameters)]
 
 

@@ -89,7 +89,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     problem = CalibrationProblem(pixels, calibration.drawn_points, rig, wider, shape)
     weights = np.where(problem.seen, calibration.sigma_px[..., None] ** -2.0, 0.0)
     state = problem.state(rig, calibration.rig_from_target)
-    information = problem.information(problem.equations(state, weights))
+    information = problem.equations(state, weights).information
     of_rig = freedom.names(rig)
     adjusted = (*of_rig, *shape.parameters)
     a = [problem.names.index(n) for n in adjusted]

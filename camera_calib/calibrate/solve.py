@@ -12,12 +12,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.block_solver import Flags
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibrate.adjust import Adjustment, adjust
 from camera_calib.calibrate.corner_noise import spread_of
-from camera_calib.calibrate.normal_equations import CalibrationProblem, Flags
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
 from camera_calib.calibration import (
