@@ -5,13 +5,17 @@ ripples; OpenCV projects it; corner errors are random waves over every picture, 
 the board, and noise.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.executor import SERIAL, Executor
+from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.solve import blank_camera, calibrate
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import IN_AIR
