@@ -299,11 +299,11 @@ class PictureCamera(JsonRecord):
 
 
 class CamerasRecord(JsonRecord):
-    """`sparse/cameras.json`: lenses by camera, and the pictures of a model."""
+    """`sparse/cameras.json`: the cameras and the pictures of a model."""
 
     path: ClassVar = "sparse/cameras.json"
     cameras: dict[str, dict[str, Any]]
-    """As `reconstruct.views.lens` reads them."""
+    """As `camera_calib.approximation.pinhole_warp` reads them."""
     images: dict[str, PictureCamera]
 
 

@@ -14,7 +14,7 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
 from reconstruct.views.model import View
-from reconstruct.views.sight import FAST, KernelLens, pixel_at
+from reconstruct.views.range_shift import FAST, KernelLens, pixel_at
 
 Float32 = NDArray[np.float32]
 Look = tuple[NDArray[np.uint8], NDArray[np.bool_]]
@@ -212,7 +212,7 @@ def count_witnesses(
     Args:
         depth: (H, W) of the reference.
         sigma: (H, W) of it.
-        slopes: (H, W, 2) ray slopes of the reference, see `sight.slopes_of`.
+        slopes: (H, W, 2) ray slopes of the reference, see `range_shift.slopes_of`.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
         other_depth: (h, w) of the other view.
         other_sigma: (h, w) of it.

@@ -26,7 +26,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.views.interpolation import spline_slopes, spline_weights
 from reconstruct.views.model import View
-from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
+from reconstruct.views.range_shift import FAST, KernelLens, line_of, pixel_at
 
 Float32 = NDArray[np.float32]
 
@@ -97,15 +97,12 @@ def pixel_lines(lens: KernelLens, height: int, width: int) -> Float32:
 
     Slopes x/z, y/z at an inverse depth of zero, and how they change with it.
     """
-    pinhole, shift = lens
     lines = np.empty((height, width, 4), np.float32)
     for row in range(height):
         for column in range(width):
-            a, b = field_of(lens, column + 0.5, row + 0.5)
-            lines[row, column, 0] = (column + 0.5 - a * shift[3] - pinhole[2]) / pinhole[0]
-            lines[row, column, 1] = (row + 0.5 - b * shift[3] - pinhole[3]) / pinhole[1]
-            lines[row, column, 2] = a / pinhole[0]
-            lines[row, column, 3] = b / pinhole[1]
+            line = line_of(lens, column + 0.5, row + 0.5)
+            for k in range(4):
+                lines[row, column, k] = line[k]
     return lines
 
 
@@ -279,7 +276,7 @@ def _sums(
     shape = inverse.shape
     pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
     likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    lines = pixel_lines(lens_of(reference.view), *shape)
+    lines = pixel_lines(reference.view.kernel_lens, *shape)
     samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
     mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
     spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean
@@ -291,7 +288,7 @@ def _sums(
             lines,
             other.spline,
             other.valid,
-            lens_of(other.view),
+            other.view.kernel_lens,
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
         )
         known = np.isfinite(rest) & reference.valid

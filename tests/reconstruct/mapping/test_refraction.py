@@ -38,8 +38,8 @@ def scene_at(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> Scene:
 @cache
 def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapped, object]:
     scene = scene_at(port_m, tilt_deg, noise_px)
-    seen, lenses = warped_scene(scene)
-    return near_truth(scene, seen, lenses, np.random.default_rng(1)), seen
+    seen, warps = warped_scene(scene)
+    return near_truth(scene, seen, warps, np.random.default_rng(1)), seen
 
 
 def exact(scene: Scene, start: tuple[Mapped, object], folder: Path) -> tuple[Mapped, Convergence]:
@@ -92,7 +92,7 @@ def test_keypoints_end_where_the_field_of_the_lens_says(tmp_path: Path) -> None:
     scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
     mapped, _ = exact(scene, start, tmp_path)
     for number, image in mapped.model.images.items():
-        shift = range_shift(mapped.lenses[scene.records[number - 1].camera])
+        shift = range_shift(mapped.warps[scene.records[number - 1].camera])
         at = image.get_observation_point2D_idxs()
         warped = start[1].pixels[number - 1][at]
         points = [mapped.model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()]
@@ -114,8 +114,8 @@ def test_a_camera_in_plain_air_is_left_as_it_is(tmp_path: Path) -> None:
         for r, pose, ids in zip(scene.records, scene.ned_from_cam, scene.ids, strict=True)
     ]
     scene = replace(scene, pixels=pixels)
-    seen, lenses = warped_scene(scene)
-    start = near_truth(scene, seen, lenses, np.random.default_rng(1))
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
     mapped, found = refract(start, seen, tmp_path)
     assert max(found.moved_px) < 1e-6
     assert found.corrected_px < 1e-6
@@ -133,8 +133,8 @@ def test_wrong_matches_go_and_right_ones_stay(tmp_path: Path) -> None:
         rows[bad] += rng.choice([-1.0, 1.0], (2, 2)) * rng.uniform(25, 40, (2, 2))
         spoiled += 2
     wrong = replace(scene, pixels=pixels)
-    seen, lenses = warped_scene(wrong)
-    start = near_truth(wrong, seen, lenses, np.random.default_rng(1))
+    seen, warps = warped_scene(wrong)
+    start = near_truth(wrong, seen, warps, np.random.default_rng(1))
     mapped, found = refract(start, seen, tmp_path)
     total = start.model.compute_num_observations()
     assert spoiled <= found.removed < spoiled + 0.25 * total
@@ -162,7 +162,7 @@ def test_with_matches_lost_observations_come_back(tmp_path: Path) -> None:
 
 def test_navigation_takes_part_and_the_rig_keeps_the_scale(tmp_path: Path) -> None:
     scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
-    adjust = NavigationAdjuster(scene.records, scene.rig, start[0].lenses, DATUM)
+    adjust = NavigationAdjuster(scene.records, scene.rig, start[0].warps, DATUM)
     assert adjust.sigmas is None
     mapped, found = refract(start[0], start[1], tmp_path, adjust)
     assert found.settled

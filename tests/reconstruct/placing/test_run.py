@@ -71,10 +71,10 @@ def test_points_are_seen_where_the_model_says(drone: Path) -> None:
     patches: dict[int, list[np.ndarray]] = {}
     for index, view in enumerate(model.views):
         grey = pictures.grey(view.image)
-        assert grey.shape == (view.height_px, view.width_px)
+        assert grey.shape == (view.pinhole.height_px, view.pinhole.width_px)
         seen = model.observations[model.observations[:, 1] == index, 0]
         for point, (x, y) in zip(seen, view.project(model.points_world[seen]), strict=True):
-            if 12 < x < view.width_px - 12 and 12 < y < view.height_px - 12:
+            if 12 < x < view.pinhole.width_px - 12 and 12 < y < view.pinhole.height_px - 12:
                 patch = cv2.getRectSubPix(grey, (3, 3), (float(x) - 0.5, float(y) - 0.5))
                 patches.setdefault(int(point), []).append(patch.mean())
     pairs = np.array([p[:2] for p in patches.values() if len(p) > 1], dtype=float)
@@ -154,9 +154,9 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
         marks = []
         for other in scaled.views:
             pixel = (
-                Pictures.open(nowhere).lens(other.image).from_pinhole(other.project(point[None]))[0]
+                Pictures.open(nowhere).warp(other.image).from_pinhole(other.project(point[None]))[0]
             )
-            if np.all((pixel > 5) & (pixel < [other.width_px - 20, other.height_px - 20])):
+            if np.all((pixel > 5) & (pixel < np.array(other.pinhole.size_px) - 20)):
                 marks.append(f"{other.image}:{pixel[0] - 0.5:.4f},{pixel[1] - 0.5:.4f}")
         picks.append("+".join(marks))
     assert all("+" in pick for pick in picks)
@@ -189,7 +189,7 @@ def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
     seen = model.observations[model.observations[:, 1] == 1, 0]
     misses = []
     for point in model.points_world[seen[::10]]:
-        pixel = pictures.lens(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
+        pixel = pictures.warp(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
         found = find_point(f"{view.image}:{pixel[0]},{pixel[1]}", model, pictures)
         misses.append(np.linalg.norm(found - point))
     height = np.median(view.world_from_cam.inv().apply(model.points_world[seen])[:, 2])
@@ -221,7 +221,7 @@ def test_real_stereo_without_calibration_gets_one_rigid_rig(
     np.testing.assert_allclose(np.linalg.norm(shifts, axis=1), 1.0, rtol=1e-6)
     np.testing.assert_allclose(shifts - shifts[0], 0, atol=1e-6)
     view = next(v for v in read_model(folder / "sparse").views if v.camera == "left")
-    assert 600 < view.fx_px < 1100  # of 680 pixels width
+    assert 600 < view.pinhole.fx_px < 1100  # of 680 pixels width
 
 
 def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None:

@@ -9,42 +9,43 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import design_rig
-from reconstruct.views.lens import FlatPortLens, flat_port_lens
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import (
     RangeShift,
-    field_of,
     no_shift,
     range_shift,
 )
 
 
-def lens_of(distance_m: float, tilt_deg: float) -> FlatPortLens:
+def warp_of(distance_m: float, tilt_deg: float) -> PinholeWarp:
     from dataclasses import replace
 
     camera = design_rig(CameraConfig(port_distance_m=distance_m), WaterConfig(), scale=4)
     left = camera.cameras[camera.reference]
     tilt = np.deg2rad(tilt_deg)
-    return flat_port_lens(replace(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
+    return best_warp(replace(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 2.0])
 @pytest.mark.parametrize("distance_m", [0.0, 0.02, 0.1])
 def test_the_shift_is_exact_at_every_distance(distance_m: float, tilt_deg: float) -> None:
     """Against points traced through the port: the field is linear in inverse depth."""
-    lens = lens_of(distance_m, tilt_deg)
-    shift = range_shift(lens)
+    warp = warp_of(distance_m, tilt_deg)
+    shift = range_shift(warp)
     rng = np.random.default_rng(3)
-    size = [lens.camera.width_px, lens.camera.height_px]
+    size = [warp.camera.width_px, warp.camera.height_px]
     taken = rng.uniform(0.02, 0.98, (500, 2)) * size
-    warped = lens.to_pinhole(taken)
+    warped = warp.to_pinhole(taken)
     for depth_m in (0.6, 1.5, 2.0, 2.5, 6.0):
-        spots = lens.camera.at_depth(taken, depth_m)
-        ideal = lens.virtual.project(spots)
-        depth = lens.pinhole_from_cam.apply(spots)[:, 2]
-        exact = field_of(lens, warped) * (1 / depth - shift.inverse_working)[:, None]
+        spots = warp.camera.at_depth(taken, depth_m)
+        points = warp.pinhole_from_cam.apply(spots)
+        ideal, depth = warp.pinhole.project(points), points[:, 2]
+        field = warp.lines(taken)[1] * warp.pinhole.focal_px
+        exact = field * (1 / depth - 1 / warp.working_depth_m)[:, None]
         np.testing.assert_allclose(warped + exact, ideal, atol=1e-8)
+        np.testing.assert_allclose(warp.to_pinhole(taken, depth_m), ideal, atol=1e-8)
         moved = np.abs(ideal - warped).max()
         np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=2e-3 * moved + 1e-9)
         np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=3e-3 * moved + 1e-9)
@@ -58,7 +59,7 @@ def test_without_a_port_nothing_shifts() -> None:
 
 @cache
 def tilted_shift() -> RangeShift:
-    return range_shift(lens_of(0.1, 2.0))
+    return range_shift(warp_of(0.1, 2.0))
 
 
 @given(x=st.floats(0, 846), y=st.floats(0, 677), depth=st.floats(0.8, 10.0))
@@ -73,27 +74,21 @@ def test_kernels_and_scales_agree(x: float, y: float, depth: float) -> None:
 
 def test_a_view_sees_points_through_its_port() -> None:
     """A view's pixel of a point is that of the exact camera, carried to the warped picture."""
-    lens = lens_of(0.1, 2.0)
+    warp = warp_of(0.1, 2.0)
     rng = np.random.default_rng(5)
-    size = [lens.camera.width_px, lens.camera.height_px]
+    size = [warp.camera.width_px, warp.camera.height_px]
     taken = rng.uniform(0.05, 0.95, (200, 2)) * size
-    spots = lens.camera.at_depth(taken, rng.uniform(1.2, 3.0, 200))
-    pinhole = lens.pinhole
+    spots = warp.camera.at_depth(taken, rng.uniform(1.2, 3.0, 200))
     view = View(
         image="a",
         camera="left",
         station=0,
-        width_px=pinhole.width_px,
-        height_px=pinhole.height_px,
-        fx_px=pinhole.focal_px,
-        fy_px=pinhole.focal_px,
-        cx_px=pinhole.cx_px,
-        cy_px=pinhole.cy_px,
+        pinhole=warp.pinhole,
         world_from_cam=RigidTransform.identity(),
-        shift=range_shift(lens),
+        shift=range_shift(warp),
     )
-    points = lens.pinhole_from_cam.apply(spots)
-    np.testing.assert_allclose(view.project(points), lens.to_pinhole(taken), atol=5e-3)
-    assert np.abs(view.project_ideal(points) - lens.to_pinhole(taken)).max() > 0.2
+    points = warp.pinhole_from_cam.apply(spots)
+    np.testing.assert_allclose(view.project(points), warp.to_pinhole(taken), atol=5e-3)
+    assert np.abs(view.project_ideal(points) - warp.to_pinhole(taken)).max() > 0.2
     depth = points[:, 2]
     np.testing.assert_allclose(view.at_depth(view.project(points), depth), points, atol=1e-6)
