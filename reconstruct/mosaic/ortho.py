@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from reconstruct.views.range_shift import KernelLens, Nodes, between_nodes, pixel_at
+from reconstruct.views.range_shift import FAST, KernelLens, Nodes, between_nodes, warped_at
 
 Float32 = NDArray[np.float32]
 
@@ -75,7 +75,7 @@ def visible_cells(
     return visible
 
 
-@compiled
+@compiled(error_model="numpy", fastmath=FAST)
 def look_up(
     height: Float32,
     wanted: tuple[NDArray[np.bool_], int],
@@ -127,6 +127,7 @@ def look_up(
     t = cam_from_enu
     half = 0.5 * min(size[0], size[1])
     squares, side = wanted
+    pinhole, field, inverse_working = lens  # out of the loop: taking it apart costs time
     for row in range(rows):
         north = first_enu[1] - row * pixel
         cell_row = math.floor(first_cell[0] + row * cells_per_pixel + 0.5)
@@ -150,7 +151,10 @@ def look_up(
                 continue
             a = t[0, 0] * east + t[0, 1] * north + t[0, 2] * up + t[0, 3]
             b = t[1, 0] * east + t[1, 1] * north + t[1, 2] * up + t[1, 3]
-            u, v = pixel_at(lens, a, b, c)
+            inverse = 1.0 / c
+            u = pinhole[0] * a * inverse + pinhole[2]
+            v = pinhole[1] * b * inverse + pinhole[3]
+            u, v = warped_at(field, inverse_working, u, v, inverse)
             if u < 0.0 or v < 0.0 or u > warped_size[0] or v > warped_size[1]:
                 continue
             u, v, _, _, _, _ = between_nodes(taken, u, v)

@@ -150,14 +150,15 @@ def between_nodes(
     Beyond the picture the values are those of its nearest edge, and constant.
     """
     nodes, across, down = values
-    u = min(max(0.0, x * across), nodes.shape[1] - 1.0)
-    v = min(max(0.0, y * down), nodes.shape[0] - 1.0)
-    if u != x * across:
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    u, v = x * across, y * down
+    column = min(max(0, int(u)), columns - 2)
+    row = min(max(0, int(v)), rows - 2)
+    p, q = min(max(0.0, u - column), 1.0), min(max(0.0, v - row), 1.0)
+    if p != u - column:
         across = 0.0
-    if v != y * down:
+    if q != v - row:
         down = 0.0
-    column, row = min(int(u), nodes.shape[1] - 2), min(int(v), nodes.shape[0] - 2)
-    p, q = u - column, v - row
     a, b = nodes[row, column, 0], nodes[row, column, 1]
     a_x, b_x = nodes[row, column + 1, 0] - a, nodes[row, column + 1, 1] - b
     a_y, b_y = nodes[row + 1, column, 0] - a, nodes[row + 1, column, 1] - b
@@ -177,10 +178,8 @@ def warped_at(
 ) -> tuple[float, float]:
     """The warped picture's pixel of what the pinhole sees at pixel (u, v), by Newton's method."""
     x, y = u, v
-    if inverse_working == 0.0:
-        return x, y
     step = inverse_depth - inverse_working
-    for _ in range(_MOST_STEPS):
+    for _ in range(0 if inverse_working == 0.0 else _MOST_STEPS):
         a, b, a_x, a_y, b_x, b_y = between_nodes(field, x, y)
         miss_x, miss_y = x + a * step - u, y + b * step - v
         a_x, b_y = 1.0 + a_x * step, 1.0 + b_y * step
@@ -190,27 +189,18 @@ def warped_at(
         move_y = (a_x * miss_y - b_x * miss_x) * scale
         x, y = x - move_x, y - move_y
         if not abs(move_x) + abs(move_y) > _STILL_PX:
-            break
+            return x, y
     return x, y
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def pixel_at(lens: KernelLens, x: float, y: float, z: float) -> tuple[float, float]:
-    """The warped picture's pixel of a point before the camera (z > 0)."""
-    pinhole, field, inverse_working = lens
-    inverse = 1.0 / z
-    u = pinhole[0] * x * inverse + pinhole[2]
-    v = pinhole[1] * y * inverse + pinhole[3]
-    return warped_at(field, inverse_working, u, v, inverse)
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def line_of(lens: KernelLens, x: float, y: float) -> tuple[float, float, float, float]:
-    """The line of spots that a warped picture shows at a pixel.
+def line_of(
+    pinhole: Array, field: Nodes, inverse_working: float, x: float, y: float
+) -> tuple[float, float, float, float]:
+    """The line of spots that a warped picture shows at a pixel, by a `KernelLens`.
 
     Slopes x/z and y/z at an inverse depth of zero, and how they change with it.
     """
-    pinhole, field, inverse_working = lens
     a, b, _, _, _, _ = between_nodes(field, x, y)
     return (
         (x - a * inverse_working - pinhole[2]) / pinhole[0],
@@ -228,10 +218,11 @@ def slopes_of(depth: NDArray[np.float32], lens: KernelLens) -> NDArray[np.float3
         depth: (H, W) of the view.
         lens: of the view.
     """
+    pinhole, field, inverse_working = lens
     slopes = np.empty((*depth.shape, 2), np.float32)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
-            x, y, by_x, by_y = line_of(lens, column + 0.5, row + 0.5)
+            x, y, by_x, by_y = line_of(pinhole, field, inverse_working, column + 0.5, row + 0.5)
             inverse = 1.0 / depth[row, column]
             slopes[row, column, 0] = x + by_x * inverse
             slopes[row, column, 1] = y + by_y * inverse
