@@ -368,7 +368,8 @@ def _model_inputs(workspace: Path) -> list[Path]:
 
 
 def _dense_inputs(workspace: Path) -> list[Path]:
-    return [*_there(workspace / "mapping" / "covariance.npz"), *_model_inputs(workspace)]
+    poses = workspace / "mapping" / "covariance.npz", workspace / "sparse" / "registration.json"
+    return [*_there(*poses), *_model_inputs(workspace)]
 
 
 def _dense_summary(folder: Path) -> Summary:

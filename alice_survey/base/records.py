@@ -223,6 +223,14 @@ class GeoreferenceRecord(JsonRecord):
     scale_of_navigation_sigma: float | None = None
 
 
+class SimilarityRecord(JsonRecord):
+    """`target = scale * rotation * source + translation`; the identity by default."""
+
+    scale: float = Field(1.0, gt=0)
+    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 class RegistrationRecord(JsonRecord):
     """`sparse/registration.json`."""
 
@@ -237,7 +245,9 @@ class RegistrationRecord(JsonRecord):
     baseline: float | None = None
     rig_factor: float | None = None
     scale_source: str | None
-    world_per_mapping_unit: float = 1.0
+    gauge: str = ""
+    """Digest of the mapped model, as in its `MappingRecord`."""
+    world_from_mapping: SimilarityRecord = SimilarityRecord()
     working_range: RangeRecord | None = None
     georeference: GeoreferenceRecord | None = None
 

@@ -25,6 +25,7 @@ from alice_survey.base.records import (
     PicturesRecord,
     RegistrationRecord,
     ScaleRecord,
+    SimilarityRecord,
 )
 from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
@@ -218,7 +219,12 @@ def _registration(
         baseline=baseline if np.isfinite(baseline) else None,
         rig_factor=mapping.rig_factor,
         scale_source=placed.scale_source,
-        world_per_mapping_unit=placed.world_from_model.scale,
+        gauge=mapping.gauge,
+        world_from_mapping=SimilarityRecord(
+            scale=placed.world_from_model.scale,
+            quaternion_xyzw=tuple(placed.world_from_model.rotation.as_quat().tolist()),
+            translation=tuple(placed.world_from_model.translation.tolist()),
+        ),
         working_range=mapping.distances,
         georeference=None if fit is None else GeoreferenceRecord.model_validate(fit.to_json()),
     )

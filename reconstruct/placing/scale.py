@@ -59,11 +59,11 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
     model = read_model(sparse)
     pictures = Pictures.open(workspace)
     first, second = (find_point(token, model, pictures) for token in tokens)
-    world_per_unit = RegistrationRecord.read(sparse / "registration.json").world_per_mapping_unit
+    world_from_mapping = RegistrationRecord.read(sparse / "registration.json").world_from_mapping
     distance = float(np.linalg.norm(second - first))
     if not distance > 0:
         raise ReconstructionError(f"the two points are one and the same: {points!r}")
-    metres_per_unit = length_m * world_per_unit / distance
+    metres_per_unit = length_m * world_from_mapping.scale / distance
     ScaleRecord.save(
         workspace / SCALE_FILE,
         {

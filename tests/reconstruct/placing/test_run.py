@@ -7,12 +7,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import AliceError, ReconstructionError
 from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.base.manifest import read_manifest, write_manifest
+from alice_survey.base.records import RegistrationRecord
 from alice_survey.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
@@ -79,6 +81,20 @@ def test_points_are_seen_where_the_model_says(drone: Path) -> None:
                 patches.setdefault(int(point), []).append(patch.mean())
     pairs = np.array([p[:2] for p in patches.values() if len(p) > 1], dtype=float)
     assert np.corrcoef(pairs.T)[0, 1] > 0.8
+
+
+def test_the_place_is_written_as_it_moved_the_mapping(drone: Path) -> None:
+    """Points of `mapping/` through the similarity of `registration.json` are those of `sparse/`."""
+    move = RegistrationRecord.read(drone / "sparse" / "registration.json").world_from_mapping
+    mapped = pycolmap.Reconstruction(drone / "mapping" / "model").points3D
+    points = np.array([mapped[i].xyz for i in sorted(mapped)])
+    turned = Rotation.from_quat(move.quaternion_xyzw).apply(points)
+    np.testing.assert_allclose(
+        move.scale * turned + move.translation,
+        read_model(drone / "sparse").points_world,
+        atol=1e-6,
+    )
+    assert abs(move.scale - 1.0) > 0.1
 
 
 def test_the_track_agrees_with_the_model(drone: Path) -> None:
