@@ -173,6 +173,18 @@ class AcceptanceRecord(JsonRecord):
     notes: Notes = ()
 
 
+class WarpRecord(JsonRecord):
+    """How well a pinhole stands in for a camera."""
+
+    offset_m: float
+    """Largest distance by which rays of the frame miss the pinhole's centre."""
+    contraction: float
+    """Change of a pixel's shift with the pixel, over the distances: below 1 the warp is one to one.
+    """
+    cut_share: float
+    """Share of the frame that the pinhole's picture leaves out."""
+
+
 class MappingRecord(JsonRecord):
     """`mapping/mapping.json`."""
 
@@ -186,6 +198,7 @@ class MappingRecord(JsonRecord):
     rig_factor: float | None = None
     distances: RangeRecord | None = None
     refraction: RefractionRecord | None = None
+    warps: dict[str, WarpRecord] = Field(default_factory=dict)
     doming: DomingRecord | None = None
     acceptance: AcceptanceRecord | None = None
     gauge: str = ""

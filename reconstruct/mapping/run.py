@@ -31,7 +31,12 @@ from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.rig_refinement import RefinedSurvey, frees_rig, refine_rig
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.mapping.uncertainty import save_uncertainty
-from reconstruct.mapping.working_range import WorkingDistances, find_distances
+from reconstruct.mapping.working_range import (
+    WorkingDistances,
+    find_distances,
+    warn_of_warps,
+    warp_record,
+)
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
@@ -204,6 +209,7 @@ def _warps(
         name: best_warp(inputs.rig.cameras[name], distances.near_m, distances.far_m)
         for name in _camera_names(inputs)
     }
+    warn_of_warps(warps, distances)
     return warps, distances
 
 
@@ -330,6 +336,9 @@ def _write(
             "rig_factor": mapped.rig_factor,
             "distances": None if distances is None else vars(distances),
             "refraction": None if refracted is None else vars(refracted),
+            "warps": {
+                name: warp_record(warp, distances).to_json() for name, warp in mapped.warps.items()
+            },
             "doming": None if doming is None else doming.to_json(),
             "acceptance": None if accepted is None else accepted.to_json(),
             "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),

@@ -92,3 +92,39 @@ def test_a_view_sees_points_through_its_port() -> None:
     assert np.abs(view.project_ideal(points) - warp.to_pinhole(taken)).max() > 0.2
     depth = points[:, 2]
     np.testing.assert_allclose(view.at_depth(view.project(points), depth), points, atol=1e-6)
+
+
+@given(
+    matrix=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
+    largest=st.floats(0.01, 0.9),
+    depth=st.sampled_from([0.5, 1.0, 4.0, np.inf]),
+)
+def test_the_contraction_is_the_fields_own_and_below_one_the_inverse_exists(
+    matrix: list[float], largest: float, depth: float
+) -> None:
+    """A field that is linear in the pixel: its slopes and the inverse map are known."""
+    slopes = np.array(matrix).reshape(2, 2)
+    size = np.linalg.norm(slopes, ord=2)
+    if size < 1e-3:
+        return
+    step = 1.0 / depth - 0.5
+    slopes = slopes / size * largest / abs(step)
+    x, y = np.linspace(-400, 400, 33), np.linspace(-300, 300, 25)
+    nodes = np.stack(np.meshgrid(x, y), axis=-1) @ slopes.T
+    shift = RangeShift(nodes=nodes, width_px=800.0, height_px=600.0, inverse_working=0.5)
+    assert shift.contraction(np.array([2.0, depth])) == pytest.approx([0.0, largest], rel=1e-6)
+    warped = np.random.default_rng(0).uniform([100, 100], [700, 500], (40, 2))
+    ideal = warped + step * (warped - [400, 300]) @ slopes.T
+    np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=1e-9)
+    np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=1e-4)
+
+
+def test_from_a_contraction_of_one_two_pixels_show_one_spot() -> None:
+    x, y = np.linspace(-400, 400, 33), np.linspace(-300, 300, 25)
+    nodes = np.stack(np.meshgrid(-3.0 * x, 0.0 * y), axis=-1)
+    shift = RangeShift(nodes=nodes, width_px=800.0, height_px=600.0, inverse_working=0.5)
+    far, near = shift.contraction(np.array([1.25, 1.2])).tolist()
+    assert far == pytest.approx(0.9)
+    assert near == pytest.approx(1.0)
+    shown = shift.ideal(np.array([[350.0, 300.0], [450.0, 300.0]]), 1.2)
+    np.testing.assert_allclose(shown[0], shown[1], atol=1e-6)
