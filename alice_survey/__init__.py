@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from alice_survey.base.errors import AliceError
     from alice_survey.base.frames import Datum
     from alice_survey.base.seawater import n_water
-    from camera_calib.flat_port import FlatPortCamera
+    from camera_calib.camera import Camera, flat_port_camera
+    from camera_calib.lenses.fisheye import FisheyeLens
+    from camera_calib.lenses.opencv import OpenCVLens
+    from camera_calib.ports.dome import DomePort
+    from camera_calib.ports.flat import FlatPort
     from camera_calib.rig import Covariance, Rig, design_rig, read_rig, write_rig
     from camera_calib.triangulate import Triangulation, triangulate
     from missions.values.plan_file import Plan, read_plan
@@ -37,7 +41,11 @@ _HOMES = {
     "alice_survey.base.errors": ("AliceError",),
     "alice_survey.base.frames": ("Datum",),
     "alice_survey.base.seawater": ("n_water",),
-    "camera_calib.flat_port": ("FlatPortCamera",),
+    "camera_calib.camera": ("Camera", "flat_port_camera"),
+    "camera_calib.lenses.fisheye": ("FisheyeLens",),
+    "camera_calib.lenses.opencv": ("OpenCVLens",),
+    "camera_calib.ports.dome": ("DomePort",),
+    "camera_calib.ports.flat": ("FlatPort",),
     "camera_calib.rig": ("Covariance", "Rig", "design_rig", "read_rig", "write_rig"),
     "camera_calib.triangulate": ("Triangulation", "triangulate"),
     "missions.values.plan_file": ("Plan", "read_plan"),
@@ -45,10 +53,40 @@ _HOMES = {
 }
 
 __all__ = [
-    "AliceError", "Covariance", "Datum", "Dem", "FlatPortCamera", "Mosaic", "Plan", "Rig",
-    "SparseModel", "Survey", "SurveyConfig", "Track", "Triangulation", "View", "design_rig",
-    "load_config", "n_water", "plot_dem", "plot_mosaic", "plot_plan", "plot_track", "read_dem",
-    "read_model", "read_mosaic", "read_plan", "read_rig", "read_track", "triangulate", "write_rig",
+    "AliceError",
+    "Camera",
+    "Covariance",
+    "Datum",
+    "Dem",
+    "DomePort",
+    "FisheyeLens",
+    "FlatPort",
+    "Mosaic",
+    "OpenCVLens",
+    "Plan",
+    "Rig",
+    "SparseModel",
+    "Survey",
+    "SurveyConfig",
+    "Track",
+    "Triangulation",
+    "View",
+    "design_rig",
+    "flat_port_camera",
+    "load_config",
+    "n_water",
+    "plot_dem",
+    "plot_mosaic",
+    "plot_plan",
+    "plot_track",
+    "read_dem",
+    "read_model",
+    "read_mosaic",
+    "read_plan",
+    "read_rig",
+    "read_track",
+    "triangulate",
+    "write_rig",
 ]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera, pose_jacobian
+from camera_calib.camera import Camera, pose_jacobian
 
 LEAST_INLIERS = 6
 
@@ -49,7 +49,7 @@ Mask = NDArray[np.bool_]
 class Sighting:
     """What one camera of the rig saw: pixels and the points they show, row by row."""
 
-    camera: FlatPortCamera
+    camera: Camera
     pixels: Array
     """(N, 2); a row that is not finite is left out."""
     points_world: Array
@@ -172,7 +172,7 @@ def _start(
         camera = sighting.camera
         points, directions = camera.unproject(sighting.pixels)
         back_m = camera.n_water * (
-            camera.port_distance_m + camera.glass_thickness_m / camera.n_glass
+            camera.port.port_distance_m + camera.port.glass_thickness_m / camera.port.n_glass
         )
         focal_px = camera.n_water * math.sqrt(camera.fx_px * camera.fy_px)
         centres.append(points - back_m * directions)

@@ -27,11 +27,11 @@ from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
 from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import (
-    PORT,
     Freedom,
     Prior,
     intrinsics,
     of_cameras,
+    of_ports,
     pose_names,
     value,
 )
@@ -55,7 +55,7 @@ _NOISE_PX = 0.1
 _VIEWS = 25
 _TRUTH = built_rig()
 _LENS = of_cameras(_TRUTH, intrinsics("opencv5"))
-_PORTS = (*of_cameras(_TRUTH, PORT), *pose_names(_TRUTH))
+_PORTS = (*of_ports(_TRUTH), *pose_names(_TRUTH))
 _BASELINE = "baseline_m"
 RIG = (*_PORTS, _BASELINE)
 """What the goals of the errors are for."""

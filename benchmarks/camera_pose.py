@@ -17,7 +17,7 @@ from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.figures import Figure, Goal
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 
 PUBLISHED = {
     0.0: (0.0008, 0.020),
@@ -121,7 +121,7 @@ def simulated(rng: np.random.Generator, noise_px: float) -> tuple[Sighting, Rigi
     """One trial's sighting, its true pose (`cam_from_world`) and which rows are right."""
     normal = rng.uniform([-0.2, -0.2, 0.8], [0.2, 0.2, 1.2])
     x, y, z = (normal / np.linalg.norm(normal)).tolist()
-    camera = FlatPortCamera(
+    camera = flat_port_camera(
         width_px=int(_SIZE[0]),
         height_px=int(_SIZE[1]),
         fx_px=_FOCAL_PX,

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,7 +28,7 @@ import pycolmap
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import design_rig
 
 _CORES = 2
@@ -78,10 +78,10 @@ class Row:
         return found
 
 
-def lens_camera() -> FlatPortCamera:
+def lens_camera() -> Camera:
     """The paper's camera with all five common distortion terms."""
     camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
-    return replace(camera, k1=-0.12, k2=0.08, p1=2e-4, p2=-3e-4, k3=0.01)
+    return camera.with_parameters({"k1": -0.12, "k2": 0.08, "p1": 2e-4, "p2": -3e-4, "k3": 0.01})
 
 
 def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
@@ -97,7 +97,7 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
     pixels = rng.uniform([0, 0], [camera.width_px, camera.height_px], (points_count, 2))
     points = camera.at_depth(pixels, rng.uniform(0.6, 10.0, points_count))
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
-    distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    distortion = np.array([camera.parameter(name) for name in ("k1", "k2", "p1", "p2", "k3")])
     zero = np.zeros(3)
     colmap = pycolmap.Camera(
         model="FULL_OPENCV",
@@ -114,7 +114,7 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
         found: Array = cv2.undistortPoints(some, matrix, distortion, criteria=_UNTIL)
         return found.reshape(-1, 2)
 
-    in_air = replace(camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0)
+    in_air = camera.in_air()
     _same("cv2.projectPoints", opencv(points), in_air.project(points), _SAME_PX)
     _same("COLMAP's projection", colmap.img_from_cam(points), in_air.project(points), _SAME_PX)
     rays = np.hstack([opencv_back(pixels), np.ones((points_count, 1))])
@@ -159,11 +159,15 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
         row("unproject", "unproject", "COLMAP's cam_from_img"),
     ]
     if aquacal is not None:
-        rows.append(against_aquacal(replace(camera, glass_thickness_m=0.0), points, runs, aquacal))
+        rows.append(
+            against_aquacal(
+                camera.with_parameters({"glass_thickness_m": 0.0}), points, runs, aquacal
+            )
+        )
     return rows
 
 
-def against_aquacal(camera: FlatPortCamera, points: Array, runs: int, python: Path) -> Row:
+def against_aquacal(camera: Camera, points: Array, runs: int, python: Path) -> Row:
     """Projection through one interface, in turns with AquaCal in a process of its own."""
     some = points[: min(len(points), 20_000)]
     with TemporaryDirectory() as folder:
@@ -172,9 +176,9 @@ def against_aquacal(camera: FlatPortCamera, points: Array, runs: int, python: Pa
             case,
             points=some,
             matrix=[[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-            distortion=[camera.k1, camera.k2, camera.p1, camera.p2, camera.k3],
+            distortion=[camera.parameter(name) for name in ("k1", "k2", "p1", "p2", "k3")],
             size=[camera.width_px, camera.height_px],
-            port_distance_m=camera.port_distance_m,
+            port_distance_m=camera.port.port_distance_m,
             n_water=camera.n_water,
         )
         with _peer(python, case) as (name, run):

@@ -1,7 +1,7 @@
 """Parameters of a rig that an adjustment may change, and their priors.
 
-A rig's parameters are called `<camera>.<name>`. Names of a camera are those of
-`flat_port.PARAMETERS`; every camera but the reference also has its pose `cam_from_rig`: a rotation
+A rig's parameters are called `<camera>.<name>`. Names of a camera are its
+`parameters`; every camera but the reference also has its pose `cam_from_rig`: a rotation
 vector (`rx_rad, ry_rad, rz_rad`) and the translation (`x_m, y_m, z_m`). Small changes, and so
 sigmas, of the rotation are turns about the camera's own axes: R becomes exp(r) R.
 """
@@ -13,15 +13,14 @@ import numpy as np
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.lenses.values import LensValues
 from camera_calib.rig import Rig
 
 POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 """Pose parameters of a camera that is not the reference; its rotation first."""
 PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
-PORT = ("port_distance_m", "normal_x", "normal_y")
-"""Port parameters that a calibration estimates; glass and indices are known better."""
-
 _ONE_WATER = ".n_water"
 _SAME = 1.0 - 0.5e-6
 """Correlation of two priors of one number: both differ by 0.001 sigma."""
@@ -35,8 +34,14 @@ LENSES: Mapping[str, tuple[str, ...]] = {
     "rational": (*_OPENCV4, "k3", "k4", "k5", "k6"),
     "prism": (*_OPENCV4, "k3", "s1", "s2", "s3", "s4"),
     "full": (*_OPENCV4, "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
 }
-"""Distortion terms by the name of a lens model."""
+"""Distortion terms by the name of a lens model; only those of the fisheye are not OpenCV's."""
+
+
+def lens_kind(lens: str) -> type[LensValues]:
+    """The kind of lens behind the name of a lens model."""
+    return FisheyeLens if lens == FisheyeLens.model else OpenCVLens
 
 
 def intrinsics(lens: str) -> tuple[str, ...]:
@@ -52,7 +57,7 @@ def intrinsics(lens: str) -> tuple[str, ...]:
 
 def all_names(rig: Rig) -> tuple[str, ...]:
     """Every parameter of a rig, camera by camera, then the poses."""
-    cameras = [f"{camera}.{name}" for camera in rig.cameras for name in PARAMETERS]
+    cameras = [f"{camera}.{name}" for camera, one in rig.cameras.items() for name in one.parameters]
     return (*cameras, *pose_names(rig))
 
 
@@ -64,7 +69,7 @@ def pose_names(rig: Rig) -> tuple[str, ...]:
 def value(rig: Rig, name: str) -> float:
     """The value of one parameter of a rig."""
     camera, field = name.split(".")
-    if field in PARAMETERS:
+    if field in rig.cameras[camera].parameters:
         return rig.cameras[camera].parameter(field)
     pose = rig.cam_from_rig[camera]
     vector = np.concatenate([pose.rotation.as_rotvec(), pose.translation])
@@ -131,13 +136,11 @@ class Prior:
                 f"the rig ({rig.source}) has no covariance to serve as a prior: calibrate it, or "
                 "hold its parameters or leave them free"
             )
-        found = rig.covariance.parameters
-        kept = tuple(name for name in names if name in found)
-        at = [found.index(name) for name in kept]
+        kept = tuple(name for name in names if name in rig.covariance.parameters)
         return cls(
             parameters=kept,
             mean=np.array([value(rig, name) for name in kept]),
-            covariance=rig.covariance.matrix[np.ix_(at, at)],
+            covariance=rig.covariance.marginal(kept).matrix,
         )
 
     def and_also(self, other: "Prior") -> "Prior":
@@ -183,6 +186,13 @@ class Freedom:
 
 
 HELD = Freedom()
+
+
+def of_ports(rig: Rig) -> tuple[str, ...]:
+    """Parameters of the ports that a calibration finds."""
+    return tuple(
+        f"{name}.{p}" for name, camera in rig.cameras.items() for p in camera.port.estimated
+    )
 
 
 def of_cameras(rig: Rig, names: Iterable[str]) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """The rig: cameras behind their ports, fixed to each other and to the vehicle; `rig.json`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,12 @@ from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
-from camera_calib.flat_port import FlatPortCamera, camera_from_json
+from camera_calib.camera import Camera, camera_from_json
+from camera_calib.optics import LENSES
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.none import NO_PORT
+from camera_calib.ports.values import PortValues
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}
 _NORM_TOLERANCE = 1e-3
@@ -53,11 +58,13 @@ class Covariance:
 
     def without(self, field: str) -> "Covariance":
         """Covariance without one parameter of every camera: it is marginalised."""
-        names = self.parameters
-        kept = [i for i, name in enumerate(names) if not name.endswith(f".{field}")]
-        return Covariance(
-            parameters=tuple(names[i] for i in kept), matrix=self.matrix[np.ix_(kept, kept)]
-        )
+        return self.marginal(n for n in self.parameters if not n.endswith(f".{field}"))
+
+    def marginal(self, names: Iterable[str]) -> "Covariance":
+        """Covariance of some of the parameters alone."""
+        kept = tuple(names)
+        at = [self.parameters.index(name) for name in kept]
+        return Covariance(parameters=kept, matrix=self.matrix[np.ix_(at, at)])
 
     @property
     def correlation(self) -> Array:
@@ -80,7 +87,7 @@ class Rig:
         (['left', 'right'], 0.1)
     """
 
-    cameras: Mapping[str, FlatPortCamera]
+    cameras: Mapping[str, Camera]
     cam_from_rig: Mapping[str, RigidTransform]
     body_from_rig: RigidTransform
     """Pose of the reference camera's entrance pupil on the vehicle (the lever arm)."""
@@ -122,7 +129,7 @@ class Rig:
         The estimate of the old water's index does not apply to the new one: it leaves the
         covariance.
         """
-        cameras = {name: replace(c, n_water=n_water) for name, c in self.cameras.items()}
+        cameras = {name: camera.in_water(n_water) for name, camera in self.cameras.items()}
         covariance = None if self.covariance is None else self.covariance.without("n_water")
         return replace(self, cameras=cameras, covariance=covariance)
 
@@ -144,22 +151,15 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         846
     """
     focal_px = camera.focal_mm * 1e3 / camera.pixel_um
-    x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
-    one = FlatPortCamera(
+    middle = {"cx_px": camera.width_px / 2, "cy_px": camera.height_px / 2}
+    one = Camera(
         width_px=camera.width_px,
         height_px=camera.height_px,
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=camera.width_px / 2,
-        cy_px=camera.height_px / 2,
-        port_distance_m=camera.port_distance_m,
-        glass_thickness_m=camera.glass_thickness_m,
-        n_glass=camera.n_glass,
-        n_water=water.n_water,
-        normal=(x, y, float(np.sqrt(1.0 - x * x - y * y))),
+        lens=LENSES[camera.lens](fx_px=focal_px, fy_px=focal_px, **middle),
+        port=_design_port(camera, water),
     ).reduced(scale)
     ahead, right, down = camera.position_body_m
-    pupil = (ahead, right, down - camera.port_distance_m - camera.glass_thickness_m)
+    pupil = (ahead, right, down - float(one.front_cam[2]))
     return Rig(
         cameras={"left": one, "right": one},
         cam_from_rig={
@@ -169,6 +169,37 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         body_from_rig=RigidTransform.from_components(pupil, BODY_FROM_NADIR_CAM),
         source="design values",
     )
+
+
+def _design_port(camera: CameraConfig, water: WaterConfig) -> PortValues:
+    glass = {"glass_thickness_m": camera.glass_thickness_m, "n_glass": camera.n_glass}
+    if camera.port == "none":
+        return NO_PORT
+    if camera.port == "dome":
+        x, y, z = camera.dome_centre_m
+        return DomePort(
+            dome_x_m=x, dome_y_m=y, dome_z_m=z, outer_radius_m=camera.dome_radius_m,
+            n_water=water.n_water, **glass,
+        )  # fmt: skip
+    x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
+    return FlatPort(
+        port_distance_m=camera.port_distance_m,
+        n_water=water.n_water,
+        normal=(x, y, float(np.sqrt(1.0 - x * x - y * y))),
+        **glass,
+    )
+
+
+def port_settings(camera: Camera) -> dict[str, Any]:
+    """The settings of `CameraConfig` that design the port of a camera."""
+    settings: dict[str, Any] = {"lens": camera.lens.model, "port": camera.port.shape}
+    for name in ("port_distance_m", "glass_thickness_m", "n_glass"):
+        if name in camera.parameters:
+            settings[name] = camera.parameter(name)
+    if "outer_radius_m" in camera.parameters:
+        settings["dome_radius_m"] = camera.parameter("outer_radius_m")
+        settings["dome_centre_m"] = tuple(camera.parameter(f"dome_{axis}_m") for axis in "xyz")
+    return settings
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
@@ -218,7 +249,7 @@ class _StoredPose(_FilePart):
 
 class _StoredCamera(_FilePart):
     cam_from_rig: _StoredPose
-    """All other values are those of `FlatPortCamera`."""
+    """All other values are those of `Camera`."""
 
 
 class _StoredCovariance(_FilePart):
@@ -276,7 +307,7 @@ def read_rig(path: str | Path) -> Rig:
         raise CalibrationError(f"{path}: {one_line(error)}") from None
 
 
-def _camera(name: str, stored: _StoredCamera) -> FlatPortCamera:
+def _camera(name: str, stored: _StoredCamera) -> Camera:
     try:
         return camera_from_json(dict(stored.model_extra or {}))
     except CalibrationError as error:

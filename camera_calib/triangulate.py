@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 
 _STEPS = 200
 _SETTLED_PX = 1e-10
@@ -61,7 +61,7 @@ class Triangulation:
 
 
 def triangulate(
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     cam_from_world: Sequence[RigidTransform],
     pixels: Array,
     sigma_px: float | Sequence[float] = 1.0,
@@ -120,7 +120,7 @@ def triangulate(
 
 
 def reproject(
-    cameras: Sequence[FlatPortCamera], cam_from_world: Sequence[RigidTransform], points_world: Array
+    cameras: Sequence[Camera], cam_from_world: Sequence[RigidTransform], points_world: Array
 ) -> Array:
     """Pixels, (C, N, 2), of points (N, 3) in every camera; NaN where it cannot see them."""
     return np.stack(
@@ -153,7 +153,7 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
 
 
 def _rays_world(
-    cameras: Sequence[FlatPortCamera], cam_from_world: Sequence[RigidTransform], pixels: Array
+    cameras: Sequence[Camera], cam_from_world: Sequence[RigidTransform], pixels: Array
 ) -> tuple[Array, Array]:
     origins, directions = np.empty((2, *pixels.shape[:2], 3))
     for i, (camera, pose) in enumerate(zip(cameras, cam_from_world, strict=True)):
@@ -172,7 +172,7 @@ def _are_regular(matrices: Array) -> NDArray[np.bool_]:
 
 
 def _equations(
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     cam_from_world: Sequence[RigidTransform],
     pixels: Array,
     weights: Array,
@@ -198,7 +198,7 @@ def _equations(
 
 
 def _in_water(
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     cam_from_world: Sequence[RigidTransform],
     pixels: Array,
     points_world: Array,
@@ -209,18 +209,18 @@ def _in_water(
     for _ in range(20):
         before = points
         for camera, pose, sees in zip(cameras, cam_from_world, seen, strict=True):
-            cam, normal = pose.apply(points), np.array(camera.normal)
-            nearest = camera.port_distance_m + camera.glass_thickness_m
-            lacking = nearest + _INSIDE * np.linalg.norm(cam, axis=1) - cam @ normal
+            cam = pose.apply(points)
+            beyond, normals = camera.port.clearance(cam)
+            lacking = _INSIDE * np.linalg.norm(cam, axis=1) - beyond
             push = np.where(sees & (lacking > 0.0), 2.0 * lacking, 0.0)
-            points = points + push[:, None] * pose.rotation.inv().apply(normal)
+            points = points + push[:, None] * pose.rotation.inv().apply(normals)
         if np.array_equal(points, before, equal_nan=True):
             break
     return points
 
 
 def _search(
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     cam_from_world: Sequence[RigidTransform],
     pixels: Array,
     weights: Array,

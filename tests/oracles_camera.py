@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import bisect, minimize
 
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """In the order of OpenCV's vector."""
@@ -16,7 +16,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3"
 Array = NDArray[np.float64]
 
 
-def lens_pixel(camera: FlatPortCamera, ray_air: Array) -> Array:
+def lens_pixel(camera: Camera, ray_air: Array) -> Array:
     """Pixel of a ray in air, by OpenCV."""
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     distortion = np.array([camera.parameter(name) for name in COEFFICIENTS])
@@ -30,7 +30,7 @@ def lens_pixel(camera: FlatPortCamera, ray_air: Array) -> Array:
     return np.asarray(pixels, dtype=np.float64).reshape(2)
 
 
-def project_by_bisection(camera: FlatPortCamera, point_cam: Array) -> Array:
+def project_by_bisection(camera: Camera, point_cam: Array) -> Array:
     """Pixel of a point through a port square to the axis: Fermat's principle by bisection.
 
     The derivative of the optical path with respect to where the light meets the glass is the
@@ -39,14 +39,14 @@ def project_by_bisection(camera: FlatPortCamera, point_cam: Array) -> Array:
     """
     x, y, z = point_cam
     radius = math.hypot(x, y)
-    water_m = z - camera.port_distance_m - camera.glass_thickness_m
+    water_m = z - camera.port.port_distance_m - camera.port.glass_thickness_m
 
     def reaches(angle: float) -> float:
-        in_glass = math.asin(math.sin(angle) / camera.n_glass)
+        in_glass = math.asin(math.sin(angle) / camera.port.n_glass)
         in_water = math.asin(math.sin(angle) / camera.n_water)
         return (
-            camera.port_distance_m * math.tan(angle)
-            + camera.glass_thickness_m * math.tan(in_glass)
+            camera.port.port_distance_m * math.tan(angle)
+            + camera.port.glass_thickness_m * math.tan(in_glass)
             + water_m * math.tan(in_water)
             - radius
         )
@@ -58,24 +58,24 @@ def project_by_bisection(camera: FlatPortCamera, point_cam: Array) -> Array:
     return lens_pixel(camera, ray)
 
 
-def project_by_shortest_path(camera: FlatPortCamera, point_cam: Array) -> Array:
+def project_by_shortest_path(camera: Camera, point_cam: Array) -> Array:
     """Pixel of a point through any port: the optical path, minimised in space.
 
     Light crosses the inner glass at A and the outer glass at B, each free in two dimensions. The
     path |A| + n_glass |B - A| + n_water |P - B| is convex; its least value is found by Newton's
     method on all four unknowns, without any thought of a plane of refraction.
     """
-    normal = np.asarray(camera.normal) / np.linalg.norm(camera.normal)
+    normal = np.asarray(camera.port.normal) / np.linalg.norm(camera.port.normal)
     first = np.cross(normal, [0.3, -0.5, 0.8])
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)], axis=1)
-    inner = camera.port_distance_m * normal
-    outer = inner + camera.glass_thickness_m * normal
+    inner = camera.port.port_distance_m * normal
+    outer = inner + camera.port.glass_thickness_m * normal
     # Differences A - 0, B - A and P - B are linear in the unknowns: d = base + matrix @ unknowns.
     zeros = np.zeros((3, 2))
     spans = [
         (1.0, inner, np.hstack([axes, zeros])),
-        (camera.n_glass, outer - inner, np.hstack([-axes, axes])),
+        (camera.port.n_glass, outer - inner, np.hstack([-axes, axes])),
         (camera.n_water, np.asarray(point_cam) - outer, np.hstack([zeros, -axes])),
     ]
 
@@ -102,8 +102,8 @@ def project_by_shortest_path(camera: FlatPortCamera, point_cam: Array) -> Array:
     sideways = np.asarray(point_cam) @ axes
     start = np.concatenate(
         [
-            sideways * (camera.port_distance_m / along),
-            sideways * ((camera.port_distance_m + camera.glass_thickness_m) / along),
+            sideways * (camera.port.port_distance_m / along),
+            sideways * ((camera.port.port_distance_m + camera.port.glass_thickness_m) / along),
         ]
     )
     found = minimize(

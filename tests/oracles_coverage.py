@@ -14,7 +14,7 @@ from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import Certificate
 from missions.coverage.stations import Stations
 from missions.values.area import Area, multipolygon
-from missions.values.footprint import footprint_ne, glass_point_cam
+from missions.values.footprint import footprint_ne
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 from missions.values.plan_file import Dive, Plan
@@ -82,7 +82,7 @@ def stations_at(places_ne: Any, altitude_m: float = 1.0, **others: Any) -> Stati
 def footprint_polygons(rig: Rig, stations: Stations) -> dict[str, list[Polygon]]:
     """Each camera's footprint at each station, by poses and rays, one after the other."""
     reference = rig.cameras[rig.reference]
-    glass_body = rig.body_from_cam(rig.reference).apply(glass_point_cam(reference))
+    glass_body = rig.body_from_cam(rig.reference).apply(reference.front_cam)
     polygons: dict[str, list[Polygon]] = {name: [] for name in rig.cameras}
     for place, altitude_m, attitude in zip(
         stations.glass_ne, stations.altitude_m, stations.attitude_rad, strict=True

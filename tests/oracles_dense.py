@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -14,10 +14,12 @@ from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, best_warp
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import design_rig
 from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
 from reconstruct.views.range_shift import no_shift, range_shift
+from tests.cameras import changed
 
 DATUM = Datum(32.8236, 34.9553)
 FRAME = WorldFrame(
@@ -162,7 +164,7 @@ def port_view(centre: list[float], rpy_deg: list[float]) -> View:
     """A nadir camera 100 mm behind a port that is tilted by 2 degrees."""
     rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
     tilt = np.deg2rad(2.0)
-    camera = replace(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
+    camera = changed(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
     warp = best_warp(camera, 1.5, 2.5)
     turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
     return View(
@@ -261,8 +263,9 @@ def write_workspace(folder: Path, model: SparseModel, scene: Scene) -> Path:
 
 def _warp(view: View) -> dict[str, object]:
     pinhole = asdict(view.pinhole)
+    width, height = pinhole.pop("width_px"), pinhole.pop("height_px")
     warp = PinholeWarp(
-        camera=FlatPortCamera(**pinhole, **IN_AIR),
+        camera=Camera(width_px=width, height_px=height, lens=OpenCVLens(**pinhole)),
         pinhole=view.pinhole,
         centre_m=(0.0, 0.0, 0.0),
         working_range_m=1.0,

@@ -1,32 +1,32 @@
 """Slow, obvious twins for focus and stereo through a flat port."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.fov.focus import FocusedLens
 from camera_calib.rig import Rig
+from tests.cameras import changed
 from tests.oracles_camera import project_by_shortest_path
 
 Array = NDArray[np.float64]
 
 
-def air_slope(camera: FlatPortCamera, start: Array, point: Array) -> Array:
+def air_slope(camera: Camera, start: Array, point: Array) -> Array:
     """dx/dz and dy/dz, in air, of the ray from a point in water that ends at `start` near z = 0.
 
     It is the shortest optical path to a pupil that sits at `start`: the port is as much nearer to
     it as `start` lies along the normal.
     """
-    moved = replace(
-        camera, port_distance_m=camera.port_distance_m - float(start @ np.array(camera.normal))
+    moved = changed(
+        camera,
+        port_distance_m=camera.port.port_distance_m - float(start @ np.array(camera.port.normal)),
     )
     pixel = project_by_shortest_path(moved, point - start)
     return (pixel - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
 
 
-def traced_blur_px(camera: FlatPortCamera, lens: FocusedLens, point: Array, along: Array) -> float:
+def traced_blur_px(camera: Camera, lens: FocusedLens, point: Array, along: Array) -> float:
     """Extent of a point's blur on the sensor along a unit direction (2,), by its outermost rays.
 
     Rays to opposite edges of the aperture are traced through the port; where they meet the plane

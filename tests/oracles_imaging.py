@@ -7,27 +7,27 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import Polygon
 
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from tests.oracles_camera import project_by_bisection
 
 
-def traced_spot(camera: FlatPortCamera, x_px: float, y_px: float, altitude_m: float) -> Array:
+def traced_spot(camera: Camera, x_px: float, y_px: float, altitude_m: float) -> Array:
     """Where a pixel of a lens without distortion, square to its port, meets a level floor."""
     x, y = (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     out = math.hypot(x, y)
     sine = out / math.sqrt(1.0 + out * out)
     reach = 0.0
     for thickness, index in (
-        (camera.port_distance_m, 1.0),
-        (camera.glass_thickness_m, camera.n_glass),
+        (camera.port.port_distance_m, 1.0),
+        (camera.port.glass_thickness_m, camera.port.n_glass),
         (altitude_m, camera.n_water),
     ):
         reach += thickness * math.tan(math.asin(sine / index))
     return reach / max(out, 1e-12) * np.array([x, y])
 
 
-def traced_footprint(camera: FlatPortCamera, altitude_m: float, shift_across_m: float) -> Polygon:
+def traced_footprint(camera: Camera, altitude_m: float, shift_across_m: float) -> Polygon:
     """The footprint, x across and y along, of a camera moved across."""
     w, h = camera.width_px, camera.height_px
     t = np.linspace(0.0, 1.0, 40, endpoint=False)

@@ -1,19 +1,20 @@
 """Slow, obvious twins of triangulation, and a rig before two interfaces whose truth is known."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.triangulate import Triangulation, reproject, triangulate
+from tests.cameras import changed
 
 Array = NDArray[np.float64]
 
-LENS = FlatPortCamera(
+LENS = flat_port_camera(
     width_px=2704,
     height_px=1520,
     fx_px=1230.0,
@@ -31,7 +32,7 @@ SIZE_M = np.array([0.40, 0.21, 0.20])
 
 
 def triangulate_slowly(
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     poses: Sequence[RigidTransform],
     pixels: Array,
     start: Array,
@@ -58,7 +59,7 @@ def nearest_slowly(origins: Array, directions: Array) -> Array:
 class Tank:
     """Fixed cameras in air that look into one body of water."""
 
-    cameras: tuple[FlatPortCamera, ...]
+    cameras: tuple[Camera, ...]
     poses: tuple[RigidTransform, ...]
     """Camera from world."""
 
@@ -80,19 +81,19 @@ def looking(position: Array, target: Array, right: Array) -> RigidTransform:
 
 
 def behind_interface(
-    lens: FlatPortCamera,
+    lens: Camera,
     cam_from_world: RigidTransform,
     points_world: Array,
     *,
     n_water: float = 1.333,
     glass_m: float = 0.0,
-) -> FlatPortCamera:
+) -> Camera:
     """A camera in air with the plane of points of its interface, on the air's side, as its port."""
     points_cam = cam_from_world.apply(points_world)
     middle = points_cam.mean(axis=0)
     normal = np.linalg.svd(points_cam - middle)[2][2]
     normal *= np.sign(normal @ middle)
-    return replace(
+    return changed(
         lens,
         n_water=n_water,
         glass_thickness_m=glass_m,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.rig import Rig
 
 
@@ -49,7 +49,7 @@ def port_rig(port_distance_m: float = 0.03, glass_m: float = 0.01, n_water: floa
     normal = np.array([0.02, -0.015, 1.0])
     normal /= np.linalg.norm(normal)
     ported = port_distance_m > 0 or glass_m > 0
-    camera = FlatPortCamera(
+    camera = flat_port_camera(
         width_px=SIZE[0], height_px=SIZE[1], fx_px=320.0, fy_px=321.0, cx_px=161.0, cy_px=127.0,
         k1=-0.04, k2=0.02, port_distance_m=port_distance_m, glass_thickness_m=glass_m,
         n_water=n_water, normal=tuple(normal) if ported else (0.0, 0.0, 1.0),
@@ -71,7 +71,7 @@ def depth_of(x: Array, y: Array) -> Array:
     return 1.2 + 0.05 * x - 0.08 * y + 0.02 * np.sin(5 * x) * np.cos(4 * y)
 
 
-def surface_points(camera: FlatPortCamera, world_from_cam: RigidTransform, pixels: Array) -> Array:
+def surface_points(camera: Camera, world_from_cam: RigidTransform, pixels: Array) -> Array:
     """Where the rays of pixels (N, 2), through the port, meet `depth_of`; world of the left."""
     start, ray = camera.unproject(pixels)
     start, ray = world_from_cam.apply(start), world_from_cam.rotation.apply(ray)

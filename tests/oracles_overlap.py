@@ -11,10 +11,9 @@ import numpy as np
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array, rotation_from_attitude
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
-from missions.values.footprint import glass_point_cam
 
 _POINTS = 1001
 _PARALLEL = math.cos(math.radians(10.0))
@@ -116,7 +115,7 @@ def _nearest(stations: Stations, s: int, line: int) -> list[int]:
 def _pose(rig: Rig, name: str, stations: Stations, s: int) -> tuple[Array, Array, float]:
     """Rotation `ned_from_cam` (3, 3), the pupil about the glass (3,), and the altitude."""
     reference = rig.cameras[rig.reference]
-    glass_body = rig.body_from_cam(rig.reference).apply(glass_point_cam(reference))
+    glass_body = rig.body_from_cam(rig.reference).apply(reference.front_cam)
     body_from_cam = rig.body_from_cam(name)
     ned_from_body = rotation_from_attitude(*stations.attitude_rad[s])
     rotation: Array = (ned_from_body * body_from_cam.rotation).as_matrix()
@@ -141,7 +140,7 @@ def _middle_row(rig: Rig, name: str, stations: Stations, s: int) -> Array:
 
 def _sees(rig: Rig, name: str, stations: Stations, s: int, points: Array) -> Array:
     """Which points fall into a picture, (P,); they lie on the sea floor below it."""
-    camera: FlatPortCamera = rig.cameras[name]
+    camera: Camera = rig.cameras[name]
     rotation, pupil, altitude_m = _pose(rig, name, stations, s)
     below = np.column_stack(
         [points[:, :2] - stations.glass_ne[s], np.full(len(points), altitude_m)]

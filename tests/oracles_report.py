@@ -13,9 +13,10 @@ from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.freedom import PORT, POSE, Freedom, intrinsics, of_cameras, pose_names
+from camera_calib.camera import Camera
+from camera_calib.freedom import POSE, Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.validation import HeldOut, hold_out
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig, design_rig
 
 Array = NDArray[np.float64]
@@ -95,11 +96,12 @@ def adjusted(
         residuals_px=found.residuals_px,
         weights=found.weights,
         noise_px=found.noise_px,
+        freedom=freedom,
     )
 
 
 def all_free(rig: Rig) -> Freedom:
-    names = (*intrinsics("opencv5"), *PORT)
+    names = (*intrinsics("opencv5"), *FlatPort.estimated)
     return Freedom(free=(*of_cameras(rig, names), *pose_names(rig)))
 
 
@@ -171,9 +173,7 @@ def some_errors(rig: Rig, seed: int, share: float = 0.02) -> dict[str, float]:
     return dict(zip(covariance.parameters, share * draw, strict=True))
 
 
-def best_pose_by_search(
-    true: FlatPortCamera, wrong: FlatPortCamera, anchors_cam: Array
-) -> RigidTransform:
+def best_pose_by_search(true: Camera, wrong: Camera, anchors_cam: Array) -> RigidTransform:
     """The pose that makes a wrong camera see the anchors where the true one does."""
     wanted = true.project(anchors_cam)
 

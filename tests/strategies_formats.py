@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Covariance, Rig
 
@@ -33,7 +33,7 @@ def _number(low: float, high: float) -> st.SearchStrategy[float]:
 @st.composite
 def cameras(
     draw: st.DrawFn, terms: tuple[str, ...] = EVERY, *, port: bool = False, size: bool = True
-) -> FlatPortCamera:
+) -> Camera:
     """A camera with some of the distortion terms, behind a port when requested, else in air."""
     used = draw(st.sets(st.sampled_from(terms)))
     width, height = (
@@ -50,7 +50,7 @@ def cameras(
             "n_water": draw(_number(1.3, 1.36)),
             "normal": (x, y, (1.0 - x * x - y * y) ** 0.5),
         }
-    return FlatPortCamera(
+    return flat_port_camera(
         width_px=width,
         height_px=height,
         fx_px=draw(_number(500, 4000)),

@@ -8,11 +8,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.camera_pose import PUBLISHED, run_level, simulated
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
+from tests.cameras import changed
 
 Array = np.ndarray
 
-CAMERA = FlatPortCamera(
+CAMERA = flat_port_camera(
     width_px=1920,
     height_px=1080,
     fx_px=1297.0,
@@ -31,7 +32,7 @@ def sighting(
     rng: np.random.Generator,
     cam_from_world: RigidTransform,
     *,
-    camera: FlatPortCamera = CAMERA,
+    camera: Camera = CAMERA,
     count: int = 120,
     noise_px: float = 0.0,
 ) -> Sighting:
@@ -107,7 +108,7 @@ def test_a_port_without_depth_is_no_special_case(ports: tuple[float, float, floa
     rng = np.random.default_rng(4)
     truth = random_pose(rng)
     distance_m, glass_m, n_water = ports
-    camera = replace(CAMERA, port_distance_m=distance_m, glass_thickness_m=glass_m, n_water=n_water)
+    camera = changed(CAMERA, port_distance_m=distance_m, glass_thickness_m=glass_m, n_water=n_water)
 
     found = absolute_pose([sighting(rng, truth, camera=camera)], rng)
 
@@ -120,7 +121,7 @@ def test_two_cameras_of_a_rig_pose_it_together() -> None:
     right_from_rig = RigidTransform.from_components(
         [-0.1, 0.002, 0.001], Rotation.from_rotvec([0.01, -0.03, 0.005])
     )
-    right = replace(CAMERA, port_distance_m=0.012, fx_px=1400.0)
+    right = changed(CAMERA, port_distance_m=0.012, fx_px=1400.0)
     left_seen = sighting(rng, rig_from_world, noise_px=0.4)
     right_seen = replace(
         sighting(rng, right_from_rig * rig_from_world, camera=right, noise_px=0.4),

@@ -138,9 +138,13 @@ class CameraConfig(Config):
     focal_mm: float = Field(12.5, gt=0, le=500)
     f_number: float = Field(4.0, ge=0.7, le=64)
     baseline_m: float = Field(0.1, gt=0, le=2)
+    lens: Literal["opencv", "fisheye"] = "opencv"
+    port: Literal["flat", "dome", "none"] = "flat"
     port_distance_m: float = Field(0.02, ge=0, le=0.5)
-    glass_thickness_m: float = Field(0.01, ge=0, le=0.5)
     port_tilt_deg: tuple[PortTilt, PortTilt] = (0.0, 0.0)
+    dome_radius_m: float = Field(0.08, gt=0, le=1)
+    dome_centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    glass_thickness_m: float = Field(0.01, ge=0, le=0.5)
     n_glass: float = Field(1.52, ge=1, le=2)
     position_body_m: tuple[float, float, float] = (0.55, -0.05, 0.08)
     dvl_position_body_m: tuple[float, float, float] = (-0.4145, 0.0, 0.11)
@@ -178,7 +182,7 @@ class PlanConfig(Config):
     altitude_m: float = Field(2.0, ge=0.3, le=10)
     speed_mps: float = Field(0.2, gt=0, le=3)
     forward_overlap: float = Field(0.6, ge=0, le=0.95)
-    side_overlap: float = Field(0.29, ge=0, le=0.95)
+    side_overlap: float = Field(0.28, ge=0, le=0.95)
     line_spacing_m: float | None = Field(None, gt=0, le=20)
     line_heading_deg: float | None = Field(None, ge=0, lt=360)
     overlap_over_relief: bool = False

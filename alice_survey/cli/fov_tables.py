@@ -21,7 +21,7 @@ from camera_calib.fov.text import (
     validation_csv_rows,
     validation_tables,
 )
-from camera_calib.rig import Rig, read_rig
+from camera_calib.rig import Rig, port_settings, read_rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
 PAPER_EXPOSURE_MS = 3.0
@@ -190,9 +190,7 @@ def _sensor_of(rig: Rig, camera: CameraConfig, options: FovOptions) -> tuple[Cam
         "width_px": own.width_px,
         "height_px": own.height_px,
         "pixel_um": pixel_um,
-        "port_distance_m": own.port_distance_m,
-        "glass_thickness_m": own.glass_thickness_m,
-        "n_glass": own.n_glass,
+        **port_settings(own),
     }
     return camera.model_copy(update=update), own.n_water
 

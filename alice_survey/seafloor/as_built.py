@@ -3,13 +3,15 @@
 Pictures are taken with this rig. Calibration must estimate it; a reconstruction never reads it.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
+from camera_calib.ports.values import RANGES
 from camera_calib.rig import Rig, design_rig
 
 _SEED_STREAM = 3400
@@ -21,6 +23,13 @@ PORT_TOLERANCE_M = 0.001
 TURN_TOLERANCE_RAD = np.deg2rad(0.3)
 TILT_TOLERANCE = float(np.sin(np.deg2rad(0.3)))
 """Largest error of a port's normal, about each axis."""
+_PORT_PLACES = ("port_distance_m", "dome_x_m", "dome_y_m", "dome_z_m")
+_PORT_TURNS = ("normal_x", "normal_y")
+_DISTORTION = {
+    "opencv": {"k1": (-0.06, -0.04), "k2": (0.02, 0.05), "p1": (-3e-4, 3e-4), "p2": (-3e-4, 3e-4)},
+    "fisheye": {"k1": (-0.03, -0.01), "k2": (0.0, 0.01), "k3": (-1e-3, 1e-3)},
+}
+"""Least and largest terms of lenses as they are made, by lens model."""
 BASELINE_TOLERANCE_M = 0.0002
 
 
@@ -53,25 +62,34 @@ def true_rig(camera: CameraConfig, water: WaterConfig, *, scale: int, seed: int)
     )
 
 
-def _built(camera: FlatPortCamera, rng: np.random.Generator) -> FlatPortCamera:
+def _built(camera: Camera, rng: np.random.Generator) -> Camera:
     focal = 1.0 + rng.uniform(-FOCAL_TOLERANCE, FOCAL_TOLERANCE)
     skew = 1.0 + rng.uniform(-1e-4, 1e-4)
     centre = rng.uniform(-CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_PX, 2)
-    port_m = camera.port_distance_m + rng.uniform(-PORT_TOLERANCE_M, PORT_TOLERANCE_M)
-    return replace(
-        camera,
-        fx_px=camera.fx_px * focal,
-        fy_px=camera.fy_px * focal * skew,
-        cx_px=camera.cx_px + float(centre[0]),
-        cy_px=camera.cy_px + float(centre[1]),
-        k1=rng.uniform(-0.06, -0.04),
-        k2=rng.uniform(0.02, 0.05),
-        p1=rng.uniform(-3e-4, 3e-4),
-        p2=rng.uniform(-3e-4, 3e-4),
-        port_distance_m=max(port_m, 0.0),
+    port = _shifted(camera, _PORT_PLACES, PORT_TOLERANCE_M, rng)
+    port = {name: max(value, RANGES.get(name, (value,))[0]) for name, value in port.items()}
+    terms = {name: rng.uniform(*ends) for name, ends in _DISTORTION[camera.lens.model].items()}
+    return camera.with_parameters(
+        {
+            "fx_px": camera.fx_px * focal,
+            "fy_px": camera.fy_px * focal * skew,
+            "cx_px": camera.cx_px + float(centre[0]),
+            "cy_px": camera.cy_px + float(centre[1]),
+            **terms,
+            **port,
+        }
     )
 
 
-def _tilted(camera: FlatPortCamera, rng: np.random.Generator) -> FlatPortCamera:
-    x, y = camera.normal[:2] + rng.uniform(-TILT_TOLERANCE, TILT_TOLERANCE, 2)
-    return camera.with_parameters({"normal_x": float(x), "normal_y": float(y)})
+def _tilted(camera: Camera, rng: np.random.Generator) -> Camera:
+    return camera.with_parameters(_shifted(camera, _PORT_TURNS, TILT_TOLERANCE, rng))
+
+
+def _shifted(
+    camera: Camera, names: Sequence[str], tolerance: float, rng: np.random.Generator
+) -> dict[str, float]:
+    return {
+        name: camera.parameter(name) + rng.uniform(-tolerance, tolerance)
+        for name in names
+        if name in camera.parameters
+    }

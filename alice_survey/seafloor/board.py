@@ -14,7 +14,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from alice_survey.seafloor.noise import noise
 from alice_survey.seafloor.renderer import camera_rays, ray_bands
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 
 Floats = NDArray[np.float32]
@@ -115,7 +115,7 @@ def _in_frame(board: PoolBoard, rig: Rig, name: str, rig_from_board: RigidTransf
 
 
 def render_board(
-    board: PoolBoard, camera: FlatPortCamera, cam_from_board: RigidTransform, samples: int
+    board: PoolBoard, camera: Camera, cam_from_board: RigidTransform, samples: int
 ) -> Floats:
     """Reflected light of the board in front of a tiled wall, evenly lit, with the lens's fall-off.
 
@@ -141,7 +141,7 @@ def render_board(
     return picture
 
 
-def _uneven_light(camera: FlatPortCamera) -> Floats:
+def _uneven_light(camera: Camera) -> Floats:
     """Uneven light, a few percent over the frame, (H, W)."""
     y, x = np.mgrid[: camera.height_px, : camera.width_px] / camera.width_px
     total = np.zeros(x.size, dtype=np.float32)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.compiled import compiled
 from alice_survey.base.config import ImagingConfig
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.water import WaterOptics, phase_per_sr
 
 LUMENS_PER_WATT = 683.0 * 106.86 / 300.0
@@ -50,7 +50,7 @@ class CameraLight:
 
 
 def camera_light(
-    camera: FlatPortCamera,
+    camera: Camera,
     body_from_cam: RigidTransform,
     imaging: ImagingConfig,
     water: WaterOptics,

@@ -1,7 +1,7 @@
 """Render what a flat-port camera sees of a terrain, exactly: ray by ray through glass and water.
 
 Every pixel is a mean over its area (`samples` x `samples` rays) and over the exposure (every ray
-has its own moment, so that motion blurs). Rays come from `FlatPortCamera.unproject`, hits from
+has its own moment, so that motion blurs). Rays come from `Camera.unproject`, hits from
 Open3D's `RaycastingScene` on the part of the terrain in sight, about an origin close by.
 """
 
@@ -21,7 +21,7 @@ from alice_survey.seafloor.light import CameraLight, add_direct, backscatter_at
 from alice_survey.seafloor.noise import mix
 from alice_survey.seafloor.terrain import Patch, Terrain
 from alice_survey.seafloor.texture import Texture
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 
 Floats = NDArray[np.float32]
 
@@ -54,7 +54,7 @@ class Rays:
 
 def render(
     scene: Scene,
-    camera: FlatPortCamera,
+    camera: Camera,
     light: CameraLight,
     ned_from_cam: RigidTransform,
     samples: int,
@@ -78,7 +78,7 @@ def render(
     rotations = ned_from_cam.rotation.as_matrix().reshape(-1, 3, 3)
     places = ned_from_cam.translation.reshape(-1, 3) - patch.origin_ned
     picture = np.empty((camera.height_px, camera.width_px, 3), dtype=np.float32)
-    pixel_rad = 1.0 / (camera.n_water * math.sqrt(camera.fx_px * camera.fy_px))
+    pixel_rad = 1.0 / camera.focal_in_water_px
     table = (light.attenuation_per_m, light.backscatter, light.reach_m)
     for first, last in ray_bands(camera, samples):
         rays = camera_rays(camera, samples, first, last)
@@ -109,7 +109,7 @@ def render(
     return picture
 
 
-def range_map(scene: Scene, camera: FlatPortCamera, ned_from_cam: RigidTransform) -> Floats:
+def range_map(scene: Scene, camera: Camera, ned_from_cam: RigidTransform) -> Floats:
     """Distance to the sea floor along the axis from the entrance pupil, through pixel centres.
 
     Args:
@@ -135,7 +135,7 @@ def range_map(scene: Scene, camera: FlatPortCamera, ned_from_cam: RigidTransform
 
 
 def flat_floor_radiance(
-    camera: FlatPortCamera, light: CameraLight, range_m: float, albedo: Array, step_px: int
+    camera: Camera, light: CameraLight, range_m: float, albedo: Array, step_px: int
 ) -> Floats:
     """Radiance of every `step_px`-th pixel over a flat, even floor square to the camera's axis.
 
@@ -152,7 +152,7 @@ def flat_floor_radiance(
     pixels = camera.pixel_centres(step_px)
     origins, directions = camera.unproject(pixels)
     path = (range_m - origins[..., 2]) / directions[..., 2]
-    vignetting = _vignetting(camera, directions.reshape(-1, 3)).reshape(path.shape)
+    vignetting = _vignetting(camera, pixels)
     picture = np.zeros((*path.shape, 3), dtype=np.float32)
     normal, lit = np.array([0.0, 0.0, -1.0]), np.ones(len(light.positions_cam))
     last = np.array(light.backscatter.shape[1::-1]) - 1
@@ -170,7 +170,7 @@ def flat_floor_radiance(
 
 
 @lru_cache(maxsize=48)  # about 340 MB; both cameras at a quarter of the full resolution fit
-def camera_rays(camera: FlatPortCamera, samples: int, first_row: int, last_row: int) -> Rays:
+def camera_rays(camera: Camera, samples: int, first_row: int, last_row: int) -> Rays:
     """Rays of the pixels of some rows: `samples` x `samples` of each, evenly over its area.
 
     Raises:
@@ -193,27 +193,24 @@ def camera_rays(camera: FlatPortCamera, samples: int, first_row: int, last_row: 
     return Rays(
         origins=origins.astype(np.float32),
         directions=directions.astype(np.float32),
-        vignetting=_vignetting(camera, directions).astype(np.float32),
+        vignetting=_vignetting(camera, pixels).astype(np.float32),
     )
 
 
-def _vignetting(camera: FlatPortCamera, directions: Array) -> Array:
-    """cos^4 of the angle in air between the axis and rays of (N, 3) directions in water."""
-    # The part of a unit direction along the port's plane shrinks by n from air to water.
-    normal = np.asarray(camera.normal)
-    sideways = camera.n_water * (directions - (directions @ normal)[:, None] * normal)
-    in_air = sideways + np.sqrt(1.0 - (sideways**2).sum(axis=1))[:, None] * normal
-    fall: Array = in_air[:, 2] ** 4
+def _vignetting(camera: Camera, pixels: Array) -> Array:
+    """Fall of light off the axis, by a power of the cosine in air, for pixels (..., 2)."""
+    in_air = camera.in_air().unproject(pixels)[1]
+    fall: Array = in_air[..., 2] ** camera.lens.falloff
     return fall
 
 
-def ray_bands(camera: FlatPortCamera, samples: int) -> list[tuple[int, int]]:
+def ray_bands(camera: Camera, samples: int) -> list[tuple[int, int]]:
     """First and last (not included) rows of bands of a picture that hold about as many rays."""
     rows = max(_BAND_RAYS // (camera.width_px * samples**2), 1)
     return [(r, min(r + rows, camera.height_px)) for r in range(0, camera.height_px, rows)]
 
 
-def _patch_in_sight(terrain: Terrain, camera: FlatPortCamera, poses: RigidTransform) -> Patch:
+def _patch_in_sight(terrain: Terrain, camera: Camera, poses: RigidTransform) -> Patch:
     """The part of a terrain that the camera can see from any of the poses, and a bit around it."""
     origins, directions = camera.unproject(camera.border(8))
     deepest = float(terrain.depths.max()) + terrain.offset_ned[2] + _PAD_M

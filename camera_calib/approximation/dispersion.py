@@ -8,7 +8,7 @@ port and with other indices. At one working range the channels differ by a warp,
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import cv2
@@ -21,7 +21,7 @@ from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
 from alice_survey.base.frames import Array
 from alice_survey.base.seawater import n_water
 from alice_survey.base.text_table import text_table
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.water import CHANNELS, WAVELENGTH_NM
 
 _REFERENCE = "green"
@@ -60,14 +60,14 @@ GLASSES = tuple(_SELLMEIER)
 
 
 def channel_cameras(
-    camera: FlatPortCamera,
+    camera: Camera,
     *,
     temperature_c: float,
     salinity_psu: float,
     depth_m: float,
     glass: str = "bk7",
     wavelengths_nm: Sequence[float] | Array = WAVELENGTH_NM,
-) -> dict[str, FlatPortCamera]:
+) -> dict[str, Camera]:
     """The camera as its red, green and blue channels see.
 
     The camera's own indices, mostly calibrated, apply to green; for red and blue they change by as
@@ -91,20 +91,19 @@ def channel_cameras(
     port = n_glass(glass, nm)
     green = CHANNELS.index(_REFERENCE)
     return {
-        name: replace(
-            camera,
-            n_water=camera.n_water + float(water[i] - water[green]),
-            n_glass=camera.n_glass + float(port[i] - port[green]),
+        name: camera.with_parameters(
+            {
+                "n_water": camera.n_water + float(water[i] - water[green]),
+                "n_glass": camera.parameter("n_glass") + float(port[i] - port[green]),
+            }
         )
-        if i != green
+        if i != green and camera.port.parameters
         else camera
         for i, name in enumerate(CHANNELS)
     }
 
 
-def shift_px(
-    green: FlatPortCamera, channel: FlatPortCamera, pixels: Array, range_m: float
-) -> Array:
+def shift_px(green: Camera, channel: Camera, pixels: Array, range_m: float) -> Array:
     """Shift of a channel against green at each pixel.
 
     Args:
@@ -140,7 +139,7 @@ class ChannelShift:
     farther."""
 
 
-def frame_shifts(cameras: Mapping[str, FlatPortCamera], range_m: float) -> list[ChannelShift]:
+def frame_shifts(cameras: Mapping[str, Camera], range_m: float) -> list[ChannelShift]:
     """The size of dispersion over the frame, for red and blue.
 
     Args:
@@ -172,7 +171,7 @@ def frame_shifts(cameras: Mapping[str, FlatPortCamera], range_m: float) -> list[
             ChannelShift(
                 channel=name,
                 n_water=camera.n_water,
-                n_glass=camera.n_glass,
+                n_glass=camera.parameter("n_glass"),
                 shift_1000_px=outward[0] if inside else float("nan"),
                 corner_px=outward[1],
                 rms_px=float(np.sqrt(np.mean(length**2))),
@@ -183,7 +182,7 @@ def frame_shifts(cameras: Mapping[str, FlatPortCamera], range_m: float) -> list[
     return rows
 
 
-def channel_maps(cameras: Mapping[str, FlatPortCamera], range_m: float) -> Maps:
+def channel_maps(cameras: Mapping[str, Camera], range_m: float) -> Maps:
     """Position of each pixel of green in the red and the blue channel.
 
     Args:
@@ -263,7 +262,7 @@ def shifts_report(shifts: Sequence[ChannelShift], range_m: float) -> tuple[str, 
     return "\n".join([text_table(header, rows), note]), data
 
 
-def _others(cameras: Mapping[str, FlatPortCamera]) -> list[str]:
+def _others(cameras: Mapping[str, Camera]) -> list[str]:
     return [name for name in CHANNELS if name != _REFERENCE and name in cameras]
 
 
@@ -272,18 +271,16 @@ def _nodes(size_px: int) -> Array:
     return np.linspace(0.0, size_px, count)
 
 
-def _outward(
-    green: FlatPortCamera, channel: FlatPortCamera, pixels: Array, centre: Array, range_m: float
-) -> float:
+def _outward(green: Camera, channel: Camera, pixels: Array, centre: Array, range_m: float) -> float:
     away = pixels - centre
     away = away / np.linalg.norm(away, axis=-1, keepdims=True)
     return float(np.mean(np.sum(shift_px(green, channel, pixels, range_m) * away, axis=-1)))
 
 
 def _checked_shift(
-    green: FlatPortCamera, channel: FlatPortCamera, pixels: Array, range_m: float, name: str
+    green: Camera, channel: Camera, pixels: Array, range_m: float, name: str
 ) -> Array:
-    closest = green.port_distance_m + green.glass_thickness_m
+    closest = float(green.front_cam[2])
     if not range_m > closest:
         raise CalibrationError(
             f"range {range_m:g} m ends before the port's outer glass, {closest:g} m from the "

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera, camera_from_json
+from camera_calib.camera import Camera, camera_from_json
 
 _GRID = 15
 """Rays along each side of the frame."""
@@ -25,6 +25,8 @@ _LARGEST_GROWTH = 1.5
 """A pinhole's picture has at most this many times the width and height of the one taken: the edge
 of a lens of 120 degrees would take 1.65 times, its corners 3 times, most of it blur."""
 _HALVINGS = 40
+_ROUNDING_M = 1e-12
+"""Offsets below are those of rays that meet in one point."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +95,7 @@ class PinholeWarp:
     Axes of the pinhole are the camera's; its centre lies elsewhere.
     """
 
-    camera: FlatPortCamera
+    camera: Camera
     pinhole: Pinhole
     centre_m: tuple[float, float, float]
     """Centre of the pinhole in the camera's frame, whose origin is the entrance pupil."""
@@ -146,6 +148,13 @@ class PinholeWarp:
         return self.camera.project(points + np.array(self.centre_m))
 
     @cached_property
+    def largest_offset_m(self) -> float:
+        """Largest distance by which rays of the frame miss the centre; 0 where all meet there."""
+        _, offset = self.lines(self.camera.frame_grid(2 * _GRID, 2 * _GRID))
+        largest = float(np.nanmax(np.linalg.norm(offset, axis=-1)))
+        return largest if largest > _ROUNDING_M else 0.0
+
+    @cached_property
     def cut_share(self) -> float:
         """Share of the frame as taken that the pinhole's picture leaves out."""
         seen = self.to_pinhole(self.camera.frame_grid(4 * _GRID, 4 * _GRID))
@@ -183,7 +192,7 @@ def warp_from_json(data: dict[str, Any]) -> PinholeWarp:
 
 
 def best_warp(
-    camera: FlatPortCamera, near_m: float, far_m: float, working_range_m: float | None = None
+    camera: Camera, near_m: float, far_m: float, working_range_m: float | None = None
 ) -> PinholeWarp:
     """The pinhole whose centre the rays of the whole frame miss least, in the rms.
 
@@ -212,7 +221,7 @@ def best_warp(
     rows[:, :, 2] = -slope
     centre = np.linalg.lstsq(rows.reshape(-1, 3), offset.ravel(), rcond=None)[0]
     x_m, y_m, z_m = (float(one) for one in centre)
-    focal = camera.n_water * (camera.fx_px + camera.fy_px) / 2
+    focal = camera.focal_in_water_px
     one = PinholeWarp(
         camera=camera,
         pinhole=Pinhole(width_px=1, height_px=1, fx_px=focal, fy_px=focal, cx_px=0.0, cy_px=0.0),
@@ -243,7 +252,7 @@ def residual_px(warp: PinholeWarp, depths_m: Array) -> Array:
     return lengths
 
 
-def _lines(camera: FlatPortCamera, taken: Array, centre_m: Array) -> tuple[Array, Array]:
+def _lines(camera: Camera, taken: Array, centre_m: Array) -> tuple[Array, Array]:
     point, direction = camera.unproject(taken)
     point = point - centre_m
     forward = np.where(direction[..., 2:] > 0, direction[..., 2:], np.nan)

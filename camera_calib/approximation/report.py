@@ -18,7 +18,7 @@ from alice_survey.kit.figure import (
     save_figure,
 )
 from camera_calib.approximation.residual import Residual, approximations, residual
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import design_rig, read_rig
 
 _STYLES = ("-", "-", "--", "--", ":")
@@ -99,7 +99,7 @@ def residual_table(found: list[Residual]) -> str:
 
 
 @figure_style()
-def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, path: Path) -> None:
+def draw_residuals(camera: Camera, found: list[Residual], title: str, path: Path) -> None:
     """Maps over the frame on one scale, and the rms against distance.
 
     Raises:
@@ -142,9 +142,6 @@ def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, pa
     save_figure(figure, path)
 
 
-def _port(camera: FlatPortCamera) -> str:
-    tilt = np.rad2deg(np.arccos(min(1.0, camera.normal[2])))
-    return (
-        f"port {camera.port_distance_m * 1e3:.3g} mm + glass {camera.glass_thickness_m * 1e3:.3g} "
-        f"mm, tilt {tilt:.2f} deg, n_water {camera.n_water:.4f}"
-    )
+def _port(camera: Camera) -> str:
+    tilt = np.rad2deg(np.arccos(min(1.0, camera.port.axis_cam[2])))
+    return f"{camera.port.words}, tilt {tilt:.2f} deg, n_water {camera.n_water:.4f}"

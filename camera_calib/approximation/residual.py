@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import CalibrationError, ConfigError
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 
 COLMAP_PARAMETERS = {
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -123,7 +123,7 @@ class Residual:
 
 
 def approximations(
-    camera: FlatPortCamera,
+    camera: Camera,
     near_m: float,
     far_m: float,
     *,
@@ -168,9 +168,7 @@ def approximations(
     return [residual(camera, one, distances) for one in stand_ins]
 
 
-def residual(
-    camera: FlatPortCamera, stand_in: StandIn, distances_m: Array, grid: int = _GRID
-) -> Residual:
+def residual(camera: Camera, stand_in: StandIn, distances_m: Array, grid: int = _GRID) -> Residual:
     """Errors of a stand-in against the flat-port camera.
 
     Args:
@@ -229,18 +227,16 @@ def _warped(name: str, warp: PinholeWarp) -> StandIn:
     )
 
 
-def _fitted(
-    model: str, camera: FlatPortCamera, pixels: Array, points: Array, turned: bool
-) -> StandIn:
-    """Least squares over shift along the normal (m), turn (rotation vector) and intrinsics."""
-    normal = np.asarray(camera.normal)
+def _fitted(model: str, camera: Camera, pixels: Array, points: Array, turned: bool) -> StandIn:
+    """Least squares over shift along the port's axis (m), turn (rotation vector) and intrinsics."""
+    axis = np.array(camera.port.axis_cam)
     names = COLMAP_PARAMETERS[model]
     is_distortion = np.array([name[0] in "kp" for name in names])
     weights = _area_weights(*pixels.shape[:2]) / len(points)
     scale = np.sqrt(weights)[None, :, :, None]
 
     def stand_in(unknowns: Array) -> StandIn:
-        x_m, y_m, z_m = (unknowns[0] * normal).tolist()
+        x_m, y_m, z_m = (unknowns[0] * axis).tolist()
         return StandIn(
             name=f"{model}, fitted",
             model=model,
@@ -257,9 +253,9 @@ def _fitted(
         return np.concatenate([misses.ravel(), _CANCELLING_PX * coefficients])
 
     start = {
-        "f": camera.n_water * (camera.fx_px + camera.fy_px) / 2,
-        "fx": camera.n_water * camera.fx_px,
-        "fy": camera.n_water * camera.fy_px,
+        "f": camera.focal_in_water_px,
+        "fx": camera.port.magnification * camera.fx_px,
+        "fy": camera.port.magnification * camera.fy_px,
         "cx": camera.cx_px,
         "cy": camera.cy_px,
     }
@@ -267,7 +263,7 @@ def _fitted(
     return stand_in(least_squares(cost, first, x_scale="jac", max_nfev=200).x)
 
 
-def _seen(camera: FlatPortCamera, distances: Array, grid: int) -> tuple[Array, Array]:
+def _seen(camera: Camera, distances: Array, grid: int) -> tuple[Array, Array]:
     """Places in the frame, (grid, grid, 2), and what they see at each distance, (D, ..., 3)."""
     pixels = camera.frame_grid(grid, grid)
     points = np.stack([camera.at_depth(pixels, float(z)) for z in distances])
@@ -290,8 +286,7 @@ def _area_weights(rows: int, columns: int) -> Array:
     return weights
 
 
-def _outer_glass_m(camera: FlatPortCamera) -> float:
+def _outer_glass_m(camera: Camera) -> float:
     """Farthest along the axis that the outer glass is from the entrance pupil, over the frame."""
     points, _ = camera.unproject(camera.border(8))
-    nearest = camera.port_distance_m + camera.glass_thickness_m
-    return max(nearest, float(np.nanmax(points[:, 2], initial=0.0)))
+    return max(float(camera.front_cam[2]), float(np.nanmax(points[:, 2], initial=0.0)))

@@ -21,13 +21,13 @@ from camera_calib.approximation.dispersion import (
     shifts_report,
     undisperse,
 )
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.rig import read_rig
 from camera_calib.water import WAVELENGTH_NM
 
 _JPEG_QUALITY = 95
-_Cameras = tuple[tuple[str, FlatPortCamera], ...]
+_Cameras = tuple[tuple[str, Camera], ...]
 _Job = tuple[Path, Path, _Cameras, float]
 
 

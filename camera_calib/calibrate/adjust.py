@@ -1,4 +1,4 @@
-"""Joint least-squares adjustment of cameras, ports, rig and target poses.
+"""Joint least-squares adjustment of cameras, ports, rig, target poses and the target's shape.
 
 Poses of the target are eliminated view by view, so that each step solves for the rig's parameters
 alone; slopes are analytic. The loss is Huber's on the length of a residual, its scale taken from
@@ -20,7 +20,8 @@ from alice_survey.base.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem, Equations, Flags, State
 from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom
-from camera_calib.rig import Rig
+from camera_calib.rig import Covariance, Rig
+from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 HUBER = 3.0
 """Length, in sigmas of a coordinate, beyond which a residual's influence is constant."""
@@ -41,7 +42,12 @@ class Adjustment:
     """The most likely rig and poses, with the residuals."""
 
     rig: Rig
-    """The rig with the covariance of all adjusted parameters, target poses marginalised."""
+    """The rig with the covariance of its adjusted parameters; the target's poses and shape are
+    marginalised."""
+    shape: TargetShape
+    """The target's shape with its covariance."""
+    covariance: Covariance
+    """Covariance of rig and shape together."""
     rig_from_target: RigidTransform
     """(V,)."""
     residuals_px: Array
@@ -53,7 +59,7 @@ class Adjustment:
     blur: Array
     """(V, cameras) noise of each picture over that."""
     is_settled: bool
-    """Whether the last step was as short as requested."""
+    """Whether an undamped step would be as short as requested."""
 
 
 def adjust(
@@ -66,12 +72,13 @@ def adjust(
     *,
     at_most: int | None = None,
     blur: Array | None = None,
+    shape: TargetShape = AS_DRAWN,
 ) -> Adjustment:
     """Adjust a rig and all poses of the target together.
 
     Args:
         views: what the cameras saw.
-        points: (N, 3) the target's points in its own frame, metres.
+        points: (N, 3) the target's points as drawn, in its own frame, metres.
         start: a rig near the truth; what is not adjusted is taken from it.
         rig_from_target: (V,) poses near the truth.
         freedom: what of the rig is adjusted.
@@ -79,12 +86,13 @@ def adjust(
         at_most: it may also end, not settled, after this many steps: views that do not fit at all
             creep for long, and can be left out once the others fit.
         blur: (V, cameras) noise of each picture over that of all; None if all are equal.
+        shape: how the target may differ from its drawing, with first values.
 
     Raises:
         CalibrationError: there are fewer measurements than unknowns, the views do not determine
             a parameter, or the adjustment does not settle though it must.
     """
-    problem = _Solver(stack_views(views, start, len(points)), points, start, freedom)
+    problem = _Solver(stack_views(views, start, len(points)), points, start, freedom, shape)
     if blur is not None:
         problem.blur = blur[..., None]
     return problem.solve(problem.state(start, rig_from_target), settled, at_most)
@@ -136,7 +144,7 @@ class _Solver(CalibrationProblem):
             self.seen = self.seen & ~lost
             first = self.solve(state, settled, at_most)
             self.seen = self.seen | lost
-            state = self.state(first.rig, first.rig_from_target)
+            state = self.state(first.rig, first.rig_from_target, first.shape.values)
             residuals = self.residuals(state)
             if not np.isfinite(residuals[self.seen]).all():
                 raise CalibrationError(
@@ -165,12 +173,22 @@ class _Solver(CalibrationProblem):
             noise_before, noise_px = noise_px, self.spread(residuals)
             same_noise = abs(noise_px / noise_before - 1) < settled or noise_px == _LEAST_NOISE_PX
             if gain < settled**2 and same_noise and (damping <= least or drop < 0):
-                return self.result(state, residuals, noise_px, is_settled=True)
+                # Damping shortens any step: at the edge of what the model sees only it is short.
+                gain = _damped_step(equations, least, pinned)[2]
+                if drop >= 0 or gain < settled**2:
+                    return self.result(state, residuals, noise_px, is_settled=True)
+                break
             good = drop > 0.25 * gain or gain < settled**2
             damping = max(damping * (0.01 if good else 0.5), 0.1 * _LEAST_DAMPING)
         if at_most is not None:
             return self.result(state, residuals, noise_px, is_settled=False)
         self.covariance(equations)  # names what the views leave open, if that is the reason
+        if drop < 0:
+            raise CalibrationError(
+                f"the adjustment is stuck {math.sqrt(gain):.2g} sigmas from its end, where measured "
+                "points leave what the camera model sees: start from values nearer to the truth, "
+                "such as another port distance"
+            )
         raise CalibrationError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
             f"{math.sqrt(gain):.2g} sigmas): take views at more angles and distances"
@@ -191,16 +209,21 @@ class _Solver(CalibrationProblem):
         covariance = self.covariance(
             self.equations(state, np.where(self.seen, (noise_px * self.blur) ** -2.0, 0.0))
         )
+        of_shape = covariance.marginal(self.shape.parameters)
         names = list(self.rig.cameras)
         poses = RigidTransform.from_components(state.shifts, Rotation.from_matrix(state.rotations))
         rig = replace(
             self.rig,
             cameras=dict(zip(names, state.cameras, strict=True)),
             cam_from_rig={name: poses[i] for i, name in enumerate(names)},
-            covariance=covariance,
+            covariance=covariance.marginal(
+                self.names[: len(self.names) - len(of_shape.parameters)]
+            ),
         )
         return Adjustment(
             rig=rig,
+            shape=self.shape.found(state.bend, of_shape.matrix),
+            covariance=covariance,
             rig_from_target=RigidTransform.from_components(
                 state.places, Rotation.from_matrix(state.turns)
             ),

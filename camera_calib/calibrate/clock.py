@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.triangulate import Triangulation
 
 _WIDEST_FRAMES = 4
@@ -36,7 +36,7 @@ class Lag:
 
 
 def estimate_lags(
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     cam_from_world: Sequence[RigidTransform],
     speeds_px: Array,
     found: Triangulation,

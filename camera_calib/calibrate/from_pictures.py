@@ -29,9 +29,11 @@ from camera_calib.calibrate.solve import (
 )
 from camera_calib.calibrate.start import same_numbering
 from camera_calib.calibration import Calibration
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
+from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
 
@@ -168,7 +170,10 @@ def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
             f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
         )
     if settings.glass_mm is None:
-        thin = start is None or all(c.glass_thickness_m == 0.0 for c in start.cameras.values())
+        thin = start is None or not any(
+            "glass_thickness_m" in c.parameters and c.parameter("glass_thickness_m") > 0.0
+            for c in start.cameras.values()
+        )
         if thin:
             raise CalibrationError(
                 "--water needs --glass, the thickness of the port in mm (0 for a thin film)"
@@ -208,45 +213,39 @@ def _calibrated(
 
 def _first(
     settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None
-) -> dict[str, FlatPortCamera]:
+) -> dict[str, Camera]:
     """Cameras of the start, or blank ones, in air or behind the port that the user names."""
     if start is not None:
         return {
-            name: _behind_port(camera, settings) if settings.water else replace(camera, **IN_AIR)
+            name: _behind_port(camera, settings) if settings.water else camera.in_air()
             for name, camera in _matching(start, sizes).cameras.items()
         }
     if not settings.water:
-        return {name: blank_camera(size, **IN_AIR) for name, size in sizes.items()}
-    port_m, thickness_m = _metres(settings.port_distance_mm), _metres(settings.glass_mm)
-    return {
-        name: blank_camera(
-            size,
-            n_water=_FRESH_WATER if settings.n_water is None else settings.n_water,
-            n_glass=_GLASS if settings.n_glass is None else settings.n_glass,
-            port_distance_m=_GUESSED_PORT_M if port_m is None else port_m,
-            glass_thickness_m=0.0 if thickness_m is None else thickness_m,
-        )
-        for name, size in sizes.items()
-    }
+        return {name: blank_camera(size, settings.lens) for name, size in sizes.items()}
+    port = _named_port(FlatPort(port_distance_m=_GUESSED_PORT_M, n_water=_FRESH_WATER), settings)
+    return {name: blank_camera(size, settings.lens, port) for name, size in sizes.items()}
 
 
 def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
 
 
-def _behind_port(camera: FlatPortCamera, settings: CalibrateOptions) -> FlatPortCamera:
+def _behind_port(camera: Camera, settings: CalibrateOptions) -> Camera:
     """A camera of the start behind the port and in the water that the user names."""
+    port = camera.port
+    if not port.parameters:
+        port = FlatPort(port_distance_m=_GUESSED_PORT_M, n_water=_FRESH_WATER)
+    return replace(camera, port=_named_port(port, settings))
+
+
+def _named_port(port: PortValues, settings: CalibrateOptions) -> PortValues:
     given = {
         "glass_thickness_m": _metres(settings.glass_mm),
         "n_glass": settings.n_glass,
         "n_water": settings.n_water,
         "port_distance_m": _metres(settings.port_distance_mm),
     }
-    if settings.n_water is None and camera.n_water == 1.0:
-        given["n_water"] = _FRESH_WATER
-    if settings.port_distance_mm is None and camera.port_distance_m == 0.0:
-        given["port_distance_m"] = _GUESSED_PORT_M
-    return camera.with_parameters({k: v for k, v in given.items() if v is not None})
+    return port.with_parameters({k: v for k, v in given.items() if v is not None})
 
 
 def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
@@ -386,7 +385,7 @@ def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
         return f"{with_sigma(number, scale * sigma)}{unit}"
 
     yield f"{name}: focal lengths {stated('fx_px', ' px')}, {stated('fy_px', ' px')}"
-    if camera.n_water == 1.0 and camera.port_distance_m == camera.glass_thickness_m == 0.0:
+    if not camera.port.parameters:
         return
     tilt_deg, sigma_deg = port_tilt_deg(rig, name)
     tilt = f"{tilt_deg:.3g} deg (held)" if sigma_deg is None else with_sigma(tilt_deg, sigma_deg)
@@ -403,7 +402,7 @@ def port_tilt_deg(rig: Rig, name: str) -> tuple[float, float | None]:
 
     For a port without tilt the direction of an error is open; its sigma is the larger of the two.
     """
-    x, y, z = rig.cameras[name].normal
+    x, y, z = rig.cameras[name].port.axis_cam
     sine = math.hypot(x, y)
     fields = [f"{name}.normal_x", f"{name}.normal_y"]
     tilt_deg = math.degrees(math.atan2(sine, z))

@@ -1,11 +1,12 @@
 """Normal equations of a calibration: observations of rig, ports and target poses.
 
-The unknowns are a few parameters of the rig and six of every view's target pose. A view's pose
-meets only its own pixels, so that the equations have a small dense part of the rig, a 6 x 6 block
-for every view, and what couples the two. Poses are eliminated block by block (Schur complement).
+The unknowns are a few parameters of the rig, those of the target's shape, and six of every view's
+target pose. A view's pose meets only its own pixels, so that the equations have a small dense part
+of rig and shape, a 6 x 6 block for every view, and what couples the two. Poses are eliminated block
+by block (Schur complement).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +15,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, Freedom
+from camera_calib.ports.values import lowest
 from camera_calib.rig import Covariance, Rig
+from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
@@ -24,25 +27,26 @@ Indices = NDArray[np.intp]
 _SINGULAR = 1e-13
 """Least eigenvalue of the rig's information, scaled to 1 if all else were known."""
 _TURNS = len(POSE) // 2
-_LOW = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_glass": 1.0, "n_water": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
     """One guess of all unknowns."""
 
-    cameras: tuple[FlatPortCamera, ...]
+    cameras: tuple[Camera, ...]
     rotations: Array
     """(C, 3, 3) cam_from_rig, and (C, 3) its translation."""
     shifts: Array
     turns: Array
     """(V, 3, 3) rig_from_target, and (V, 3) its translation."""
     places: Array
+    bend: Array
+    """(K,) values of the target's shape."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Equations:
-    """Normal equations: of the rig's parameters, of each view's pose, and between them."""
+    """Normal equations: of rig and shape (P), of each view's pose, and between them."""
 
     rig: Array
     """(P, P)."""
@@ -56,35 +60,61 @@ class Equations:
     """(V, 6)."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Slopes:
+    """Derivatives of the pixels of one camera in the views it took part in."""
+
+    camera: int
+    views: Indices
+    """(v,)."""
+    at: Indices
+    """(p,) the parameters on which these pixels depend."""
+    rows: Array
+    """(v, N, 2, p + 6 + 1) by these, by the view's pose; last the residual."""
+    by_place: Array
+    """(v, N, 2, 3) by the point in the target's frame."""
+
+
 class CalibrationProblem:
     """Measured pixels, and the parameters that explain them."""
 
-    def __init__(self, pixels: Array, points: Array, rig: Rig, freedom: Freedom) -> None:
+    def __init__(
+        self,
+        pixels: Array,
+        points: Array,
+        rig: Rig,
+        freedom: Freedom,
+        shape: TargetShape = AS_DRAWN,
+    ) -> None:
         self.pixels, self.points, self.rig = pixels, np.asarray(points, dtype=np.float64), rig
         self.seen: Flags = np.asarray(np.isfinite(pixels).all(axis=-1))
-        self.names = freedom.names(rig)
-        self.prior = freedom.prior
+        self.names = (*freedom.names(rig), *shape.parameters)
+        self.shape = shape
+        self.shape_at = np.arange(len(self.names) - len(shape.parameters), len(self.names))
+        self.prior = freedom.prior.and_also(shape.prior)
         self.prior_information = self.prior.information
         self.prior_at = np.array(
             [self.names.index(n) for n in self.prior.parameters], dtype=np.intp
         )
-        self.lens_columns, self.lens_at = self._columns(PARAMETERS)
-        self.pose_columns, self.pose_at = self._columns(POSE)
+        self.lens_columns, self.lens_at = self._columns(
+            [camera.parameters for camera in rig.cameras.values()]
+        )
+        self.pose_columns, self.pose_at = self._columns([POSE] * len(rig.cameras))
         self.views = [np.flatnonzero(self.seen[:, c].any(axis=1)) for c in range(len(rig.cameras))]
-        self.low = np.array([_LOW.get(name.split(".")[1], -np.inf) for name in self.names])
+        self.low = np.array([lowest(name.split(".")[1]) for name in self.names])
 
-    def _columns(self, fields: Sequence[str]) -> tuple[list[Indices], list[Indices]]:
-        """For each camera: which of the fields are adjusted, and where they stand in the vector."""
+    def _columns(self, of: Sequence[Sequence[str]]) -> tuple[list[Indices], list[Indices]]:
+        """For each camera: which of its fields are adjusted, and where they stand in the vector."""
         columns, places = [], []
-        for camera in self.rig.cameras:
+        for camera, fields in zip(self.rig.cameras, of, strict=True):
             mine = [f for f in fields if f"{camera}.{f}" in self.names]
             columns.append(np.array([fields.index(f) for f in mine], dtype=np.intp))
             at = [self.names.index(f"{camera}.{f}") for f in mine]
             places.append(np.array(at, dtype=np.intp))
         return columns, places
 
-    def state(self, rig: Rig, poses: RigidTransform) -> State:
-        """A rig and poses of the target as a guess."""
+    def state(self, rig: Rig, poses: RigidTransform, bend: Array | None = None) -> State:
+        """A rig, poses of the target and values of its shape as a guess."""
         cams = [rig.cam_from_rig[name] for name in rig.cameras]
         return State(
             cameras=tuple(rig.cameras.values()),
@@ -92,13 +122,19 @@ class CalibrationProblem:
             shifts=np.stack([c.translation for c in cams]),
             turns=poses.rotation.as_matrix().reshape(-1, 3, 3),
             places=np.asarray(poses.translation).reshape(-1, 3),
+            bend=self.shape.values if bend is None else bend,
         )
 
+    def target_points(self, state: State) -> Array:
+        """(N, 3) points of the target in the guessed shape."""
+        return self.points + self.shape.found(state.bend).offsets_m
+
     def values(self, state: State) -> Array:
-        """Adjusted parameters of the cameras; 0 for those of poses."""
+        """Adjusted parameters of cameras and shape; 0 for those of poses."""
         vector = np.zeros(len(self.names))
+        vector[self.shape_at] = state.bend
         for c, camera in enumerate(state.cameras):
-            fields = [PARAMETERS[i] for i in self.lens_columns[c]]
+            fields = [camera.parameters[i] for i in self.lens_columns[c]]
             vector[self.lens_at[c]] = [camera.parameter(field) for field in fields]
         return vector
 
@@ -112,7 +148,7 @@ class CalibrationProblem:
         cameras, rotations, shifts = [], state.rotations.copy(), state.shifts.copy()
         for c, camera in enumerate(state.cameras):
             changed = {
-                PARAMETERS[i]: float(values[at])
+                camera.parameters[i]: float(values[at])
                 for i, at in zip(self.lens_columns[c], self.lens_at[c], strict=True)
             }
             cameras.append(camera.with_parameters(changed) if changed else camera)
@@ -127,12 +163,13 @@ class CalibrationProblem:
             shifts=shifts,
             turns=turn @ state.turns,
             places=state.places + view_step[:, _TURNS:],
+            bend=values[self.shape_at],
         )
 
     def residuals(self, state: State) -> Array:
         """(V, C, N, 2) projected minus measured; NaN where unseen or where nothing is projected."""
         out = np.full(self.pixels.shape, np.nan)
-        turned = self.points @ state.turns.transpose(0, 2, 1)
+        turned = self.target_points(state) @ state.turns.transpose(0, 2, 1)
         for c, camera in enumerate(state.cameras):
             at = self.views[c]
             rig = turned[at] + state.places[at, None]
@@ -146,25 +183,13 @@ class CalibrationProblem:
         rig, rig_slope = np.zeros((count, count)), np.zeros(count)
         between, view_slope = np.zeros((views, count, 6)), np.zeros((views, 6))
         view = np.zeros((views, 6, 6))
-        turned = self.points @ state.turns.transpose(0, 2, 1)
-        for c, camera in enumerate(state.cameras):
-            v = self.views[c]
-            by_turn = turned[v] @ state.rotations[c].T
-            by_rig = by_turn + state.places[v, None] @ state.rotations[c].T
-            cam = by_rig + state.shifts[c]
-            pixels, by_point, by_parameter = camera.project_jacobian(cam)
-            blocks = [by_parameter[..., self.lens_columns[c]]]
-            if self.pose_columns[c].size:
-                blocks.append(pose_jacobian(by_point, by_rig)[..., self.pose_columns[c]])
-            blocks.append(pose_jacobian(by_point @ state.rotations[c], turned[v]))
-            blocks.append((pixels - self.pixels[v, c])[..., None])
-            rows = np.concatenate(blocks, axis=-1)
+        for slopes in self.slopes(state):
+            c, v, at, rows = slopes.camera, slopes.views, slopes.at, slopes.rows
             use = self.seen[v, c] & (weights[v, c] > 0)
             rows *= np.sqrt(weights[v, c])[..., None, None]
             rows[~use] = 0.0
             rows = rows.reshape(len(v), 2 * len(self.points), rows.shape[-1])
             square = rows.transpose(0, 2, 1) @ rows
-            at = np.concatenate([self.lens_at[c], self.pose_at[c]])
             p = len(at)
             total = square.sum(axis=0)
             rig[np.ix_(at, at)] += total[:p, :p]
@@ -178,6 +203,32 @@ class CalibrationProblem:
         return Equations(
             rig=rig, between=between, view=view, rig_slope=rig_slope, view_slope=view_slope
         )
+
+    def slopes(self, state: State) -> Iterator[Slopes]:
+        """Derivatives of all pixels, camera by camera."""
+        turned = self.target_points(state) @ state.turns.transpose(0, 2, 1)
+        for c, camera in enumerate(state.cameras):
+            v = self.views[c]
+            by_turn = turned[v] @ state.rotations[c].T
+            by_rig = by_turn + state.places[v, None] @ state.rotations[c].T
+            cam = by_rig + state.shifts[c]
+            pixels, by_point, by_parameter = camera.project_jacobian(cam)
+            blocks = [by_parameter[..., self.lens_columns[c]]]
+            if self.pose_columns[c].size:
+                blocks.append(pose_jacobian(by_point, by_rig)[..., self.pose_columns[c]])
+            by_turned = by_point @ state.rotations[c]
+            by_place = by_turned @ state.turns[v, None]
+            if self.shape_at.size:
+                blocks.append(by_place @ self.shape.modes.transpose(1, 2, 0))
+            blocks.append(pose_jacobian(by_turned, turned[v]))
+            blocks.append((pixels - self.pixels[v, c])[..., None])
+            yield Slopes(
+                camera=c,
+                views=v,
+                at=np.concatenate([self.lens_at[c], self.pose_at[c], self.shape_at]),
+                rows=np.concatenate(blocks, axis=-1),
+                by_place=by_place,
+            )
 
     def prior_residuals(self, state: State) -> Array:
         """(K,) parameters minus the prior's mean; a turn counts from the mean's rotation."""

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibration import Calibration, stack_views
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.freedom import Freedom, of_cameras, value
 from camera_calib.rig import Covariance, Rig
 
@@ -79,7 +79,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
 
     Args:
         calibration: through ports.
-        name: one of `flat_port.PARAMETERS` that was held in all cameras.
+        name: a parameter that was held in all cameras.
     """
     rig, freedom = calibration.rig, calibration.freedom
     held = of_cameras(rig, [name])
@@ -129,12 +129,12 @@ def _line(calibration: Calibration, name: str, error: float) -> str | None:
     )
 
 
-def _matters(camera: FlatPortCamera, name: str) -> bool:
+def _matters(camera: Camera, name: str) -> bool:
     """Whether light meets what the parameter describes."""
     if name == "n_glass":
-        return camera.glass_thickness_m > 0.0
+        return camera.parameter("glass_thickness_m") > 0.0
     if name == "glass_thickness_m":
-        return camera.n_glass != camera.n_water
+        return camera.parameter("n_glass") != camera.n_water
     return True
 
 
@@ -227,7 +227,8 @@ def _loose(rig: Rig, covariance: Covariance) -> list[str]:
         if size > limit:
             lines.append(f"{name} is known to {size:.2g} {unit} only (sigma): take {more}")
     for camera, model in rig.cameras.items():
-        if f"{camera}.port_distance_m" in covariance.parameters and model.port_distance_m == 0.0:
+        name = f"{camera}.port_distance_m"
+        if name in covariance.parameters and model.parameter("port_distance_m") == 0.0:
             lines.append(
                 f"{camera}.port_distance_m ended at 0, its least: hold it, or hold the intrinsics "
                 "of a calibration in air"

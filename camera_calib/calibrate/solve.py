@@ -7,7 +7,7 @@ multiple of the noise are then left out, and named.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -16,7 +16,8 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibrate.adjust import Adjustment, adjust
-from camera_calib.calibrate.normal_equations import Flags
+from camera_calib.calibrate.corner_noise import spread_of
+from camera_calib.calibrate.normal_equations import CalibrationProblem, Flags
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
 from camera_calib.calibration import (
@@ -26,17 +27,21 @@ from camera_calib.calibration import (
     residuals_px,
     stack_views,
 )
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.freedom import (
     PINHOLE,
-    PORT,
     Freedom,
     Prior,
     intrinsics,
+    lens_kind,
     of_cameras,
+    of_ports,
     pose_names,
 )
+from camera_calib.ports.none import NO_PORT
+from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
+from camera_calib.target_shape import TargetShape, bends
 
 Intrinsics = Literal["held", "prior", "free"]
 
@@ -70,22 +75,26 @@ def calibrate(
     freedom: Freedom,
     *,
     source: str = "calibration",
+    shape: TargetShape | None = None,
 ) -> Calibration:
     """Adjust a rig over all views, from a rig near the truth.
 
     Args:
         views: where the cameras saw the target.
-        points: (N, 3) the target's points in its own frame, metres.
+        points: (N, 3) the target's points as drawn, in its own frame, metres.
         start: near the truth, such as the design; what is not adjusted is taken from it.
         freedom: what is adjusted.
         source: how, for the rig's `source`.
+        shape: how the target may differ from its drawing; None for bends of a flat one, and
+            `AS_DRAWN` for points that are known better.
 
     Raises:
         CalibrationError: too few views, or they do not determine what is free.
     """
     usable, rejections = _usable(views, points)
     _check_served(usable, start)
-    found = locate_all(start, usable, points)
+    shape = bends(points) if shape is None else shape
+    found = locate_all(start, usable, points + shape.offsets_m)
     for view, pose in zip(usable, found, strict=True):
         if pose is None:
             reason = "no pose of the target was found"
@@ -96,7 +105,7 @@ def calibrate(
     pixels = stack_views(usable, start, len(points))
     poses = RigidTransform.concatenate([pose for pose in found if pose is not None])
     adjusted, kept, alive_views = _adjust_without_outliers(
-        usable, pixels, points, start, poses, freedom
+        usable, pixels, points, start, poses, freedom, shape
     )
     rejections += _rejected(usable, pixels, kept, start, adjusted)
     _check_focal(adjusted.rig, adjusted.rig_from_target)
@@ -112,10 +121,18 @@ def calibrate(
         )
         for i, v in enumerate(np.flatnonzero(alive_views))
     )
-    rig = replace(adjusted.rig, source=f"{source} from {len(final)} views")
+    problem = CalibrationProblem(used, points, start, freedom, shape)
+    spread = spread_of(problem, adjusted)
+    rig = replace(
+        adjusted.rig,
+        source=f"{source} from {len(final)} views",
+        covariance=spread.covariance.marginal(freedom.names(start)),
+    )
+    of_shape = spread.covariance.marginal(shape.parameters).matrix
+    found_shape = adjusted.shape.found(adjusted.shape.values, of_shape)
     return Calibration(
         rig=rig,
-        target_points=points,
+        target_points=points + found_shape.offsets_m,
         views=final,
         rig_from_target=adjusted.rig_from_target,
         residuals_px=adjusted.residuals_px,
@@ -133,13 +150,15 @@ def calibrate(
         freedom=freedom,
         rejected=left_out,
         blur=adjusted.blur,
+        shape=found_shape,
+        spread=spread,
     )
 
 
 def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibration:
     """The same calibration from other views, such as a part of those it used."""
-    freedom, source = calibration.freedom, "calibration"
-    return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
+    found = calibration
+    return calibrate(views, found.drawn_points, found.rig, found.freedom, shape=found.shape)
 
 
 @progress.step("find cameras")
@@ -164,7 +183,7 @@ def calibrate_in_air(
     """
     names = intrinsics(lens)
     if start is None:
-        blank = {name: blank_camera(size, **IN_AIR) for name, size in sizes.items()}
+        blank = {name: blank_camera(size, lens) for name, size in sizes.items()}
         start = first_rig(views, points, blank, lens)
     free = (*of_cameras(start, names), *pose_names(start))
     return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
@@ -196,7 +215,7 @@ def calibrate_through_ports(
             covariance to serve as a prior.
     """
     extra = Prior.around(start, sigmas or {})
-    free = [*of_cameras(start, PORT), *pose_names(start)]
+    free = [*of_ports(start), *pose_names(start)]
     if known == "free":
         free += of_cameras(start, intrinsics(lens))
     if known == "prior":
@@ -211,7 +230,7 @@ def calibrate_through_ports(
 def calibrate_in_water_alone(
     views: Sequence[TargetView],
     points: Array,
-    cameras: Mapping[str, FlatPortCamera],
+    cameras: Mapping[str, Camera],
     lens: str = "opencv5",
     sigmas: Mapping[str, float] | None = None,
 ) -> Calibration:
@@ -232,27 +251,22 @@ def calibrate_in_water_alone(
     return replace(found, warnings=(*found.warnings, *unobservable(found)))
 
 
-def blank_camera(size: tuple[int, int], **port: Any) -> FlatPortCamera:
+def blank_camera(size: tuple[int, int], lens: str, port: PortValues = NO_PORT) -> Camera:
     """A camera of which only its port and the size of its pictures are known.
 
     Args:
         size: width and height of its pictures.
-        **port: fields of `FlatPortCamera`; `IN_AIR` without a port.
+        lens: name of a lens model (`freedom.LENSES`).
+        port: as far as it is known.
     """
     width, height = size
-    return FlatPortCamera(
-        width_px=width,
-        height_px=height,
-        fx_px=float(width),
-        fy_px=float(width),
-        cx_px=width / 2.0,
-        cy_px=height / 2.0,
-        **port,
-    )
+    middle = {"cx_px": width / 2.0, "cy_px": height / 2.0}
+    first = lens_kind(lens)(fx_px=float(width), fy_px=float(width), **middle)
+    return Camera(width_px=width, height_px=height, lens=first, port=port)
 
 
 def first_rig(
-    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: str
 ) -> Rig:
     """A rig near the truth from views alone: each camera, then their relative poses.
 
@@ -270,8 +284,8 @@ def first_rig(
 
 
 def first_cameras(
-    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
-) -> dict[str, FlatPortCamera]:
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: str
+) -> dict[str, Camera]:
     """Each camera near the truth from its own views, its port held.
 
     Raises:
@@ -289,16 +303,18 @@ def first_cameras(
 
 
 def _alone(
-    name: str, blank: FlatPortCamera, views: Sequence[TargetView], points: Array, lens: str
-) -> FlatPortCamera:
+    name: str, blank: Camera, views: Sequence[TargetView], points: Array, lens: str
+) -> Camera:
     """One camera's intrinsics, its port held: first its focal length and k1, then all."""
     mine = [
         TargetView(name=v.name, pixels={name: v.pixels[name]}) for v in views if name in v.pixels
     ]
     size = (blank.width_px, blank.height_px)
-    focal_px = first_focal_px([v.pixels[name] for v in mine], points, size) / blank.n_water
+    focal_px = (
+        first_focal_px([v.pixels[name] for v in mine], points, size) / blank.port.magnification
+    )
     rig = Rig(
-        cameras={name: replace(blank, fx_px=focal_px, fy_px=focal_px)},
+        cameras={name: blank.with_parameters({"fx_px": focal_px, "fy_px": focal_px})},
         cam_from_rig={name: RigidTransform.identity()},
         body_from_rig=RigidTransform.identity(),
         source="first values",
@@ -359,6 +375,7 @@ def _adjust_without_outliers(
     rig: Rig,
     poses: RigidTransform,
     freedom: Freedom,
+    shape: TargetShape,
 ) -> tuple[Adjustment, Flags, Flags]:
     """Adjust and leave out gross outliers, until that set stays the same.
 
@@ -370,9 +387,11 @@ def _adjust_without_outliers(
     blur = np.ones(measured.shape[:2])
     for _ in range(_ROUNDS):
         trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-        adjusted = adjust(trimmed, points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive])
+        adjusted = adjust(
+            trimmed, points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive], shape=shape
+        )
         lengths = np.full(measured.shape, np.inf)
-        lengths[alive] = _lengths(adjusted, pixels[alive], points)
+        lengths[alive] = _lengths(adjusted, pixels[alive], points + adjusted.shape.offsets_m)
         found = np.ones_like(blur)
         found[alive] = _blur(adjusted)
         limits = np.maximum(_OUTLIER * adjusted.noise_px * found, _LEAST_LIMIT_PX)
@@ -383,9 +402,10 @@ def _adjust_without_outliers(
         still = alive & fitting.any(axis=(1, 2))
         _check_enough(int(still.sum()), len(views))
         poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
-        rig, kept, alive, blur = adjusted.rig, fitting, still, found
+        rig, kept, alive, blur, shape = adjusted.rig, fitting, still, found, adjusted.shape
     trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-    return adjust(trimmed, points, rig, poses, freedom, blur=blur[alive]), kept, alive
+    last = adjust(trimmed, points, rig, poses, freedom, blur=blur[alive], shape=shape)
+    return last, kept, alive
 
 
 def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:

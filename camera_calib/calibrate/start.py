@@ -21,9 +21,10 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibration import TargetView
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.freedom import HELD
 from camera_calib.rig import Rig
+from camera_calib.target_shape import is_sheet
 
 Indices = NDArray[np.intp]
 
@@ -122,7 +123,7 @@ def spans(pixels: Array, points: Array) -> bool:
     return bool(width[1] > _THINNEST * width[0])
 
 
-def _poses(camera: FlatPortCamera, pixels: Array, points: Array) -> list[RigidTransform]:
+def _poses(camera: Camera, pixels: Array, points: Array) -> list[RigidTransform]:
     """Poses `cam_from_target`: rays are taken to start at the point that is nearest to all."""
     origins, directions = camera.unproject(pixels)
     known = np.asarray(np.isfinite(np.hstack([directions, pixels])).all(axis=1))
@@ -136,7 +137,8 @@ def _poses(camera: FlatPortCamera, pixels: Array, points: Array) -> list[RigidTr
 
 
 def _pinhole_poses(tangents: Array, points: Array, centre: Array) -> list[RigidTransform]:
-    planar = float(np.ptp(points[:, 2])) == 0.0
+    planar = is_sheet(points)
+    points = points * [1.0, 1.0, 0.0] if planar else points
     flag = cv2.SOLVEPNP_IPPE if planar else cv2.SOLVEPNP_SQPNP
     try:
         _, turns, shifts, misses = cv2.solvePnPGeneric(
@@ -191,7 +193,7 @@ def _homography_miss(centred: Array, points: Array, focal_px: float) -> float:
 
 
 def first_cam_from_rig(
-    cameras: Mapping[str, FlatPortCamera], views: Sequence[TargetView], points: Array
+    cameras: Mapping[str, Camera], views: Sequence[TargetView], points: Array
 ) -> dict[str, RigidTransform]:
     """Poses of the cameras relative to the first, from the target's poses in each.
 
@@ -226,7 +228,7 @@ def first_cam_from_rig(
 
 
 def poses_alone(
-    name: str, camera: FlatPortCamera, views: Sequence[TargetView], points: Array
+    name: str, camera: Camera, views: Sequence[TargetView], points: Array
 ) -> dict[int, RigidTransform]:
     """Poses of the target in the frame of one camera, by the number of the view."""
     alone = Rig(
@@ -257,7 +259,7 @@ def _apart(poses: RigidTransform, scale: float) -> Array:
 
 
 def same_numbering(
-    cameras: Mapping[str, FlatPortCamera],
+    cameras: Mapping[str, Camera],
     views: Sequence[TargetView],
     points: Array,
     symmetries: Sequence[Indices],

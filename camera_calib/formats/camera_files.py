@@ -17,7 +17,7 @@ import pycolmap
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_bytes, read_text
 from camera_calib.formats.opencv_model import camera_in_air, distorts
 
@@ -61,7 +61,7 @@ class CameraRecord:
         return Fields(path=path, values=values, prefix=f"camera {self.camera_id}: ")
 
 
-def record_of(camera_id: int, camera: FlatPortCamera, *, port: bool) -> CameraRecord:
+def record_of(camera_id: int, camera: Camera, *, port: bool) -> CameraRecord:
     """The record of a camera, of the smallest model that holds its distortion.
 
     Args:
@@ -74,25 +74,21 @@ def record_of(camera_id: int, camera: FlatPortCamera, *, port: bool) -> CameraRe
     else:
         model = "OPENCV" if distorts(camera, "k1", "k2", "p1", "p2") else "PINHOLE"
     ours = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
-    housing = (
-        *camera.normal,
-        camera.port_distance_m,
-        camera.glass_thickness_m,
-        1.0,
-        camera.n_glass,
-        camera.n_water,
-    )
+    housing = None
+    if port and camera.port.parameters:
+        distance, thickness, n_glass, n_water, *normal = camera.port.values.tolist()
+        housing = (*normal, distance, thickness, 1.0, n_glass, n_water)
     return CameraRecord(
         camera_id=camera_id,
         model=model,
         width_px=camera.width_px,
         height_px=camera.height_px,
-        params=tuple(getattr(camera, ours.get(name, name)) for name in MODELS[model][1]),
-        port=housing if port else None,
+        params=tuple(camera.parameter(ours.get(name, name)) for name in MODELS[model][1]),
+        port=housing,
     )
 
 
-def camera_of(path: Path, record: CameraRecord) -> FlatPortCamera:
+def camera_of(path: Path, record: CameraRecord) -> Camera:
     """The camera of a record, without its port.
 
     Raises:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import CalibrationError, warn
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.camera_files import (
     MODELS,
     CameraRecord,
@@ -171,7 +171,7 @@ def _camera_file(path: Path) -> Path | None:
     return path
 
 
-def _camera(path: Path, record: CameraRecord) -> FlatPortCamera:
+def _camera(path: Path, record: CameraRecord) -> Camera:
     camera = camera_of(path, record)
     if record.port is None:
         return camera

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import camera_name
 from camera_calib.formats.opencv_model import distorts
 from camera_calib.formats.registry import (
@@ -27,11 +27,14 @@ from camera_calib.formats.registry import (
 from camera_calib.formats.rigs import (
     UNKNOWN_MOUNT,
     ReadOptions,
+    in_air,
     only,
     referenced,
     renamed,
     with_port,
 )
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
 
 _TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
@@ -65,7 +68,7 @@ class Conversion:
 
     @property
     def port(self) -> dict[str, float]:
-        """Fields of `FlatPortCamera` to set for the port."""
+        """Fields of `FlatPort` to set for the port."""
         given = {
             "port_distance_m": None
             if self.port_distance_mm is None
@@ -181,7 +184,7 @@ def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, 
                 f"{task.target}: left out the port of {', '.join(behind)} "
                 f"({_port_words(rig.cameras[behind[0]])}): these cameras are in air"
             )
-        rig = with_port(rig, IN_AIR)
+        rig = in_air(rig)
     if rig.covariance is not None and (task.drop_covariance or COVARIANCE not in target.holds):
         _may_lose_covariance(rig, task, where)
         notes.append(f"{task.target}: left out {_covariance_words(rig)}")
@@ -206,16 +209,13 @@ def _covariance_words(rig: Rig) -> str:
     return f"the covariance of {count} parameters"
 
 
-def has_port(camera: FlatPortCamera) -> bool:
+def has_port(camera: Camera) -> bool:
     """Whether a camera differs from one in air."""
-    return any(getattr(camera, name) != value for name, value in IN_AIR.items())
+    return bool(camera.port.parameters)
 
 
-def _port_words(camera: FlatPortCamera) -> str:
-    return (
-        f"{camera.port_distance_m * 1e3:g} mm, glass {camera.glass_thickness_m * 1e3:g} mm, "
-        f"water {camera.n_water:g}"
-    )
+def _port_words(camera: Camera) -> str:
+    return f"{camera.port.words}, water {camera.n_water:g}"
 
 
 def _summary(
@@ -227,7 +227,7 @@ def _summary(
 ) -> tuple[str, dict[str, Any]]:
     lines = [f"{source.title} -> {target.title}: {', '.join(str(path) for path in written)}"]
     for name, c in rig.cameras.items():
-        place = f"port {_port_words(c)}" if has_port(c) else "in water" if prices else "in air"
+        place = _port_words(c) if has_port(c) else "in water" if prices else "in air"
         lines.append(
             f"{name}: {c.width_px} x {c.height_px} px, f {c.fx_px:.3f} {c.fy_px:.3f}, "
             f"c {c.cx_px:.3f} {c.cy_px:.3f} px, {place}"
@@ -290,19 +290,12 @@ def _of_model(every: list[Residual], model: str) -> Residual:
     return next(fit for fit in unwarped if fit.stand_in.model == model)
 
 
-def _stand_in(camera: FlatPortCamera, fit: Residual) -> FlatPortCamera:
+def _stand_in(camera: Camera, fit: Residual) -> Camera:
     stand_in = fit.stand_in
     values = dict(zip(COLMAP_PARAMETERS[stand_in.model], stand_in.params, strict=True))
     fx, fy, cx, cy = (values.pop(name) for name in ("fx", "fy", "cx", "cy"))
-    return FlatPortCamera(
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        fx_px=fx,
-        fy_px=fy,
-        cx_px=cx,
-        cy_px=cy,
-        **{**values, **IN_AIR},
-    )
+    lens = OpenCVLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, **values)
+    return replace(camera, lens=lens, port=NO_PORT)
 
 
 def _from_cam(fit: Residual) -> RigidTransform:

@@ -12,7 +12,7 @@ from typing import Any
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError, warn
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml, write_yaml
 from camera_calib.formats.opencv_model import HALF_PIXEL, camera_in_air
 from camera_calib.formats.rigs import ReadOptions, assemble
@@ -56,7 +56,7 @@ def write_kalibr(path: Path, rig: Rig) -> list[Path]:
             entry["T_cn_cnm1"] = (rig.cam_from_rig[name] * before.inv()).as_matrix().tolist()
         entry["cam_overlaps"] = [other for other in range(len(names)) if other != i]
         entry["camera_model"] = "pinhole"
-        entry["distortion_coeffs"] = [camera.k1, camera.k2, camera.p1, camera.p2]
+        entry["distortion_coeffs"] = [camera.parameter(name) for name in ("k1", "k2", "p1", "p2")]
         entry["distortion_model"] = "radtan"
         centre = [camera.cx_px - HALF_PIXEL, camera.cy_px - HALF_PIXEL]
         entry["intrinsics"] = [camera.fx_px, camera.fy_px, *centre]
@@ -67,7 +67,7 @@ def write_kalibr(path: Path, rig: Rig) -> list[Path]:
     return [path]
 
 
-def _camera(fields: Fields) -> FlatPortCamera:
+def _camera(fields: Fields) -> Camera:
     if fields.text("camera_model") != "pinhole":
         raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole expected")
     model = fields.text("distortion_model")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_storage
 from camera_calib.formats.opencv_model import behind_port, camera_matrix, distortion, read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble, default_names, own_keys
@@ -94,11 +94,13 @@ def write_opencv(path: Path, rig: Rig) -> list[Path]:
     return [path]
 
 
-def _write_port(storage: Any, key: str, camera: FlatPortCamera) -> None:
+def _write_port(storage: Any, key: str, camera: Camera) -> None:
+    if not camera.port.parameters:
+        return
     storage.startWriteStruct(key, cv2.FileNode_MAP)
     for name in _PORT_LENGTHS:
-        storage.write(name, getattr(camera, name))
-    storage.write("normal", np.array(camera.normal)[None])
+        storage.write(name, camera.parameter(name))
+    storage.write("normal", np.array([camera.port.axis_cam]))
     storage.endWriteStruct()
 
 
@@ -109,7 +111,7 @@ def _write_texts(storage: Any, key: str, texts: list[str]) -> None:
     storage.endWriteStruct()
 
 
-def _numbered(fields: Fields, number: str, reading: ReadOptions) -> FlatPortCamera:
+def _numbered(fields: Fields, number: str, reading: ReadOptions) -> Camera:
     matrix = fields.first(*(key.format(number) for key in (_PAIR if number else _MATRIX)))
     if matrix is None:
         wanted = f"camera_matrix, or M{number} of a stereo pair"

@@ -11,34 +11,35 @@ import numpy as np
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields
-from camera_calib.lens import COEFFICIENTS
+from camera_calib.lenses.opencv import COEFFICIENTS, OpenCVLens
+from camera_calib.ports.flat import FlatPort
 
 HALF_PIXEL = 0.5
 
 
-def camera_matrix(camera: FlatPortCamera) -> Array:
+def camera_matrix(camera: Camera) -> Array:
     """OpenCV's camera matrix, (3, 3), pixels counted from the first one's centre."""
     cx, cy = camera.cx_px - HALF_PIXEL, camera.cy_px - HALF_PIXEL
     return np.array([[camera.fx_px, 0.0, cx], [0.0, camera.fy_px, cy], [0.0, 0.0, 1.0]])
 
 
-def distortion(camera: FlatPortCamera) -> Array:
+def distortion(camera: Camera) -> Array:
     """OpenCV's distortion coefficients: 5, 8 or 12, as few as hold the camera's."""
-    every = np.array([getattr(camera, name) for name in COEFFICIENTS])
+    every = np.array([camera.parameter(name) for name in COEFFICIENTS])
     count = 12 if np.any(every[8:]) else 8 if np.any(every[5:]) else 5
     return every[:count]
 
 
-def distorts(camera: FlatPortCamera, *names: str) -> bool:
+def distorts(camera: Camera, *names: str) -> bool:
     """Whether any of these coefficients is not zero."""
-    return any(getattr(camera, name) != 0.0 for name in names)
+    return any(name in camera.parameters and camera.parameter(name) != 0.0 for name in names)
 
 
 def read_camera(
     fields: Fields, matrix_key: str, distortion_key: str | None, size: tuple[int, int]
-) -> FlatPortCamera:
+) -> Camera:
     """A camera in air from a camera matrix and a vector of distortion coefficients.
 
     Args:
@@ -74,7 +75,7 @@ def camera_in_air(
     *,
     lens: tuple[float, float, float, float],
     coefficients: dict[str, float],
-) -> FlatPortCamera:
+) -> Camera:
     """A camera without a port.
 
     Args:
@@ -88,32 +89,28 @@ def camera_in_air(
     if min(fx, fy) <= 0:
         raise fields.fault(key, f"has focal lengths of {fx:g} and {fy:g} px")
     try:
-        return FlatPortCamera(
+        return Camera(
             width_px=size[0],
             height_px=size[1],
-            fx_px=fx,
-            fy_px=fy,
-            cx_px=cx,
-            cy_px=cy,
-            **{**coefficients, **IN_AIR},
+            lens=OpenCVLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, **coefficients),
         )
     except CalibrationError as error:
         raise fields.fault(key, f"is of no camera: {error}") from None
 
 
-def behind_port(fields: Fields, key: str, camera: FlatPortCamera, **port: Any) -> FlatPortCamera:
+def behind_port(fields: Fields, key: str, camera: Camera, **port: Any) -> Camera:
     """A camera with the port of a file.
 
     Args:
         fields: where the port is.
         key: key of the port.
         camera: in air.
-        **port: fields of `FlatPortCamera`.
+        **port: fields of `FlatPort`.
 
     Raises:
         CalibrationError: a value is out of range; the message names file and key.
     """
     try:
-        return replace(camera, **port)
+        return replace(camera, port=FlatPort(**port))
     except CalibrationError as error:
         raise fields.fault(key, f"is not a port: {error}") from None

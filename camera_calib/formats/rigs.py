@@ -10,9 +10,10 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, camera_name
 from camera_calib.freedom import POSE
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig
 
 UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
@@ -48,7 +49,7 @@ def assemble(
     reading: ReadOptions,
     tool: str,
     names: Sequence[str],
-    cameras: Sequence[FlatPortCamera],
+    cameras: Sequence[Camera],
     cam_from_rig: Sequence[RigidTransform],
 ) -> Rig:
     """A rig of cameras and poses in the units of a file; the first camera becomes the reference.
@@ -149,18 +150,34 @@ def own_keys(fields: Fields, rig: Rig) -> Rig:
 
 
 def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
-    """Every camera of a rig behind a port; the covariance of replaced numbers is dropped.
+    """Every camera of a rig behind a flat port; the covariance of replaced numbers is dropped.
 
     Args:
         rig: cameras in air, or behind ports some of whose numbers change.
-        port: by field of `FlatPortCamera`: lengths in metres, indices, `normal`.
+        port: by field of `FlatPort`: lengths in metres, indices, `normal`.
     """
     changed = {"normal_x", "normal_y"} if "normal" in port else set()
     changed |= set(port)
     kept = [name for name in _parameters(rig) if name.rsplit(".", 1)[1] not in changed]
     return replace(
         rig,
-        cameras={name: replace(camera, **dict(port)) for name, camera in rig.cameras.items()},
+        cameras={name: _with_port(camera, port) for name, camera in rig.cameras.items()},
+        covariance=_part(rig.covariance, kept),
+    )
+
+
+def _with_port(camera: Camera, port: Mapping[str, Any]) -> Camera:
+    old = camera.port if camera.port.parameters else FlatPort(n_water=1.0)
+    return replace(camera, port=replace(old, **dict(port)))
+
+
+def in_air(rig: Rig) -> Rig:
+    """The cameras of a rig without their ports; the covariance of these is dropped."""
+    ports = {f"{name}.{p}" for name, camera in rig.cameras.items() for p in camera.port.parameters}
+    kept = [name for name in _parameters(rig) if name not in ports]
+    return replace(
+        rig,
+        cameras={name: camera.in_air() for name, camera in rig.cameras.items()},
         covariance=_part(rig.covariance, kept),
     )
 

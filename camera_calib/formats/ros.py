@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml, write_yaml
 from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble
@@ -113,7 +113,7 @@ def ros_files(path: Path, rig: Rig) -> list[Path]:
 _ONE = (RigidTransform.identity(),)
 
 
-def _camera(fields: Fields) -> FlatPortCamera:
+def _camera(fields: Fields) -> Camera:
     model = fields.text("distortion_model") if "distortion_model" in fields else "plumb_bob"
     if model not in _MODELS:
         raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} expected")
@@ -170,7 +170,7 @@ def _rectified(second_from_first: RigidTransform, axis: int) -> tuple[Array, Arr
     return first.as_matrix(), second.as_matrix(), line * length
 
 
-def _document(name: str, camera: FlatPortCamera, rotation: Array, projection: Array) -> Any:
+def _document(name: str, camera: Camera, rotation: Array, projection: Array) -> Any:
     k = distortion(camera)
     return {
         "image_width": camera.width_px,

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.seawater import n_water as n_water_of_colour
 from camera_calib.approximation.pinhole_warp import best_warp, residual_px
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.fov.table import check_range
 from camera_calib.rig import design_rig
@@ -32,8 +32,7 @@ class AngleRow:
     """Full angle of the diagonal; half of it is the incidence on the port in the corner."""
     altitude_m: float
     n_water: float
-    port_distance_m: float
-    glass_thickness_m: float
+    port: str
     lens_mm: float
     fov_water_deg: float
     """Full angle of the diagonal after the port."""
@@ -84,16 +83,16 @@ def _blue_red(n_green: float) -> tuple[float, float]:
     return float(n_green + blue - green), float(n_green + red - green)
 
 
-def _camera(config: CameraConfig, n_water: float, angle_deg: float) -> FlatPortCamera:
+def _camera(config: CameraConfig, n_water: float, angle_deg: float) -> Camera:
     diagonal_mm = math.hypot(config.width_px, config.height_px) * config.pixel_um * 1e-3
     focal_mm = diagonal_mm / 2 / math.tan(math.radians(angle_deg) / 2)
     lens = config.model_copy(update={"focal_mm": focal_mm})
     return design_rig(lens, WaterConfig(n_water=n_water)).cameras["left"]
 
 
-def _displacement(camera: FlatPortCamera, altitude_m: float) -> tuple[float, float]:
+def _displacement(camera: Camera, altitude_m: float) -> tuple[float, float]:
     """Distortion of the corner, in px and percent."""
-    floor_z = camera.port_distance_m + camera.glass_thickness_m + altitude_m
+    floor_z = float(camera.front_cam[2]) + altitude_m
     radius_px = math.hypot(camera.cx_px, camera.cy_px)
     spot = camera.at_depth(np.zeros((1, 2)), floor_z)[0]
     ideal_px = camera.fx_px * math.hypot(spot[0], spot[1]) / apparent_distance_m(camera, altitude_m)
@@ -107,19 +106,20 @@ def _angle_row(
     angle_deg: float,
 ) -> AngleRow:
     camera = _camera(config, n_water, angle_deg)
-    glass_z = camera.port_distance_m + camera.glass_thickness_m
+    glass_z = float(camera.front_cam[2])
     corner = np.zeros((1, 2))
     outer, direction = camera.unproject(corner)
     tangent = float(np.linalg.norm(direction[0, :2]) / direction[0, 2])
     meets_axis = glass_z - float(np.linalg.norm(outer[0, :2])) / tangent
-    # Near the axis every ray in water comes from a pinhole n_water times as far as it seems in air.
-    paraxial = glass_z - n_water * apparent_distance_m(camera, 0.0)
+    # Near the axis every ray in water comes from a pinhole as many times as far as the port
+    # magnifies.
+    paraxial = glass_z - camera.port.magnification * apparent_distance_m(camera, 0.0)
 
     near, far = glass_z + altitude_m * (1 - RELIEF), glass_z + altitude_m * (1 + RELIEF)
     residual = residual_px(best_warp(camera, near, far), np.linspace(near, far, 11))
 
     spot = camera.at_depth(corner, glass_z + altitude_m)
-    colours = [replace(camera, n_water=n).project(spot)[0] for n in _blue_red(n_water)]
+    colours = [camera.in_water(n).project(spot)[0] for n in _blue_red(n_water)]
     centre_to_corner = corner[0] - np.array([camera.cx_px, camera.cy_px])
     outward = centre_to_corner / np.linalg.norm(centre_to_corner)
 
@@ -134,8 +134,7 @@ def _angle_row(
         fov_air_deg=angle_deg,
         altitude_m=altitude_m,
         n_water=n_water,
-        port_distance_m=camera.port_distance_m,
-        glass_thickness_m=camera.glass_thickness_m,
+        port=camera.port.words,
         lens_mm=camera.fx_px * config.pixel_um * 1e-3,
         fov_water_deg=2 * math.degrees(math.atan(tangent)),
         displacement_px=displacement[0],

@@ -1,16 +1,11 @@
-"""Focus and depth of field through a flat port, on the axis and towards the corners.
+"""Focus and depth of field through any port, on the axis and towards the corners.
 
-A plane surface forms two line images in air of a point in water, one for the rays in the plane of
-incidence (tangential) and one for those across it (sagittal); on the axis they coincide. Along a
-ray that meets the port at the angle a in air, and b in the glass and c in the water, of path
-lengths A, G and W, the images appear at the distances from the entrance pupil
-
-    sagittal    A + G / n_glass + W / n_water
-    tangential  A + G cos^2 a / (n_glass cos^2 b) + W cos^2 a / (n_water cos^2 c)
-
-(Coddington's equations at a plane: n / s is kept, and n cos^2 / t; Born & Wolf, Principles of
-Optics, section 4.6). Both are linear in the altitude. The lens itself is thin, perfect and of a
-flat field, with its stop at the entrance pupil.
+Seen from a pupil that is moved sideways by e, the ray in air of a point in water turns by J e, with
+J from the analytic slopes of the camera. A point at the depth z in air would turn it by -e / z: the
+two eigenvalues of -J are one over the depths of the two line images of the point, tangential and
+sagittal, which coincide on the axis. By Coddington's equations (Born & Wolf, Principles of Optics,
+section 4.6) each is a homographic function of the distance in water, of any number of surfaces.
+The lens itself is thin, perfect and of a flat field, with its stop at the entrance pupil.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +14,11 @@ import numpy as np
 
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
+
+_ROUNDING = 1e-9
+_TANGENTS = OpenCVLens(fx_px=1.0, fy_px=1.0, cx_px=0.0, cy_px=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,19 +71,28 @@ class FocusedLens:
 class ApparentDepths:
     """Apparent depth of a sea floor along the camera's axis, for some pixels.
 
-    Apparent depth in air is `offset_m + slope * altitude_m`; the last axis holds tangential and
-    sagittal.
+    One over the apparent depth in air is (1 + far * altitude) / (offset_m + slope * altitude); the
+    last axis holds tangential and sagittal.
     """
 
     offset_m: Array
-    """(N, 2): contribution of the port."""
+    """(N, 2): apparent depth of the outer surface."""
     slope: Array
-    """(N, 2): 1 / n_water on the axis."""
+    """(N, 2): 1 / n_water on the axis of a flat port."""
+    far: Array
+    """(N, 2), 1/m: 0 for a flat port; behind a dome even the farthest seems near."""
 
     def at(self, altitude_m: float) -> Array:
         """Apparent depths, (N, 2), of a sea floor at an altitude of the outer glass."""
-        depths: Array = self.offset_m + self.slope * altitude_m
+        depths: Array = (self.offset_m + self.slope * altitude_m) / (1.0 + self.far * altitude_m)
         return depths
+
+    def altitudes_m(self, depth_m: float) -> Array:
+        """The inverse of `at`, (N, 2): altitudes that appear at a depth; inf beyond all."""
+        steep = self.slope / depth_m - self.far
+        beyond = np.where(steep > 0.0, steep, np.nan)
+        found: Array = (1.0 - self.offset_m / depth_m) / beyond
+        return np.where(np.isnan(found), np.inf, found)
 
     def sharp_altitudes_m(self, lens: FocusedLens, coc_px: float) -> tuple[float, float]:
         """Nearest and farthest altitude that is sharp in all these pixels and both directions.
@@ -93,47 +101,62 @@ class ApparentDepths:
             NaN twice where no altitude is sharp in all of them; far may be inf.
         """
         near_m, far_m = lens.sharp_depths_m(coc_px)
-        near = max(0.0, float(np.max((near_m - self.offset_m) / self.slope)))
-        far = float(np.min((far_m - self.offset_m) / self.slope))
-        return (near, far) if far >= near else (np.nan, np.nan)
+        near = max(0.0, float(np.max(self.altitudes_m(near_m))))
+        far = float(np.min(self.altitudes_m(far_m)))
+        return (near, far) if far >= near and near < np.inf else (np.nan, np.nan)
 
 
-def apparent_distance_m(camera: FlatPortCamera, altitude_m: float) -> float:
+def apparent_distance_m(camera: Camera, altitude_m: float) -> float:
     """Apparent depth of the sea floor from the entrance pupil, near the axis of the port."""
-    air = camera.port_distance_m + camera.glass_thickness_m / camera.n_glass
-    return air + altitude_m / camera.n_water
+    return float(_on_axis(camera).at(altitude_m)[0].mean())
 
 
-def glass_z_m(camera: FlatPortCamera) -> float:
-    """Depth along the camera's axis of the outer glass, where the normal of the pupil meets it."""
-    return (camera.port_distance_m + camera.glass_thickness_m) * camera.normal[2]
+def altitude_of_apparent_m(camera: Camera, apparent_m: float) -> float:
+    """Altitude of ground at an apparent distance: the inverse of `apparent_distance_m`."""
+    return float(_on_axis(camera).altitudes_m(apparent_m)[0].mean())
 
 
-def air_rays(camera: FlatPortCamera, pixels: Array) -> Array:
+def air_rays(camera: Camera, pixels: Array) -> Array:
     """Unit directions in air, (..., 3), of pixels: before the port bends them."""
-    bare = replace(camera, port_distance_m=0.0, glass_thickness_m=0.0, n_glass=1.0, n_water=1.0)
-    return bare.unproject(pixels)[1]
+    return camera.in_air().unproject(pixels)[1]
 
 
-def apparent_depths(camera: FlatPortCamera, pixels: Array) -> ApparentDepths:
+def apparent_depths(camera: Camera, pixels: Array) -> ApparentDepths:
     """Apparent depths of sea floors square to the camera's axis, for pixels (N, 2).
 
-    Altitude is that of the outer glass (`glass_z_m`). Rows are NaN where no light comes through.
+    Altitude is that of `Camera.front_cam`. Rows are NaN where no light comes through.
     """
-    in_air = air_rays(camera, pixels)
-    outer, in_water = camera.unproject(pixels)
-    cos_air = in_air @ np.asarray(camera.normal)
-    sin2 = 1.0 - cos_air**2
-    cos2_glass = 1.0 - sin2 / camera.n_glass**2
-    cos2_water = 1.0 - sin2 / camera.n_water**2
-    air = camera.port_distance_m / cos_air
-    glass = camera.glass_thickness_m / np.sqrt(cos2_glass) / camera.n_glass
-    # From the outer glass to a sea floor at altitude 0: not zero where the port is tilted.
-    water = (glass_z_m(camera) - outer[:, 2]) / in_water[:, 2] / camera.n_water
-    per_m = 1.0 / in_water[:, 2] / camera.n_water
-    squeeze = np.stack([cos_air**2, np.ones_like(cos_air)])
-    squeeze_glass = squeeze / np.stack([cos2_glass, np.ones_like(cos_air)])
-    squeeze_water = squeeze / np.stack([cos2_water, np.ones_like(cos_air)])
-    along_axis = in_air[:, 2]
-    offset = (air + glass * squeeze_glass + water * squeeze_water) * along_axis
-    return ApparentDepths(offset_m=offset.T, slope=(per_m * squeeze_water * along_axis).T)
+    return _depths(camera, *camera.unproject(pixels))
+
+
+def _on_axis(camera: Camera) -> ApparentDepths:
+    """Apparent depths where the axis of the port meets the sea floor."""
+    axis = np.array([camera.port.axis_cam])
+    return _depths(camera, camera.front_cam[None], axis)
+
+
+def _depths(camera: Camera, starts: Array, directions: Array) -> ApparentDepths:
+    """Apparent depths along rays in water: three altitudes give the homographic function."""
+    bare = replace(camera, lens=_TANGENTS)
+    reach = (camera.front_cam[2] - starts[:, 2]) / directions[:, 2]
+    by_motion = camera.port.by_motion[:, :2]
+    heights = np.array([1.0, 2.0, 4.0])
+    vergences = []
+    for height_m in heights:
+        along = reach + height_m / directions[:, 2]
+        points = starts + along[:, None] * directions
+        _, by_point, by_parameter = bare.project_jacobian(points)
+        moved = by_point[..., :2] + by_parameter[..., len(_TANGENTS.parameters) :] @ by_motion
+        vergences.append(np.linalg.eigvalsh((moved + moved.transpose(0, 2, 1)) / 2)[:, ::-1])
+    depths = 1.0 / np.stack(vergences)
+    # z (1 + f h) = o + s h: linear in o, s and f.
+    rows = np.stack(
+        [np.ones_like(depths), np.broadcast_to(heights[:, None, None], depths.shape),
+         -depths * heights[:, None, None]], axis=-1,
+    )  # fmt: skip
+    known = np.isfinite(rows).all(axis=(0, 3))
+    found = np.full((*known.shape, 3), np.nan)
+    matrices, right = rows.transpose(1, 2, 0, 3)[known], depths.transpose(1, 2, 0)[known]
+    found[known] = np.linalg.solve(matrices, right[..., None])[..., 0]
+    far = np.where(np.abs(found[..., 2]) < _ROUNDING, 0.0, found[..., 2])
+    return ApparentDepths(offset_m=found[..., 0], slope=found[..., 1], far=far)

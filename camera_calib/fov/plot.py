@@ -81,14 +81,10 @@ def draw_fov(
     _distortion(panels[1, 2], angles, marked)
     first = next(iter(marked.values()))[0]
     figure.suptitle(
-        f"Through a flat port: n {first.n_water:.4g}, {_port(first)} before the pupil",
+        f"Through a flat port: n {first.n_water:.4g}, {first.port} before the pupil",
         fontsize=13,
     )
     save_figure(figure, path, dpi=120)
-
-
-def _port(row: FovRow | AngleRow) -> str:
-    return f"port {row.port_distance_m * 1e3:.4g} + {row.glass_thickness_m * 1e3:.4g} mm"
 
 
 def _by_lens(rows: Sequence[FovRow]) -> dict[float, list[FovRow]]:
@@ -265,7 +261,7 @@ def _distortion(axes: Axes, angles: Sequence[AngleRow], marked: dict[float, list
     axes.yaxis.set_major_formatter("{x:g}")
     first = angles[0]
     axes.set_title(
-        f"Against the field of view: n {first.n_water:.4g}, {_port(first)},\n"
+        f"Against the field of view: n {first.n_water:.4g}, {first.port},\n"
         f"{first.altitude_m:g} m altitude, relief +/-{RELIEF:.0%}",
         fontsize=11,
     )

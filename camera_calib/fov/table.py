@@ -17,17 +17,23 @@ from shapely import Polygon
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.fov.focus import (
     FocusedLens,
     air_rays,
     apparent_depths,
-    glass_z_m,
 )
 from camera_calib.rig import Rig, design_rig
 
 MATCH_SIGMA_PX = 0.3
 """Disparity noise for which the depth precision is stated."""
+
+FISHEYE_FOV_DEG = 100.0
+"""Full angle in air beyond which lenses are made as fisheyes: a straight picture of it is drawn
+out at its edges, 1 / cos^2 of the half angle in the corner's radius, 2.4 times at 100 degrees."""
+
+_POINTS_PER_SIDE = 16
+"""Points of a frame's border on each side."""
 
 TRUSTED_FOV_DEG = 70.0
 """Full angle in air up to which the paper trusts a flat port (its section III.B)."""
@@ -62,12 +68,17 @@ class FovRow:
     lens_mm: float
     altitude_m: float
     n_water: float
-    port_distance_m: float
-    glass_thickness_m: float
+    port: str
+    """What it is, in words."""
     horizontal_m: float
     """Width of the footprint along the middle row."""
     vertical_m: float
     """Height of the footprint along the middle column."""
+    sure_horizontal_m: float
+    """Width of the upright rectangle that is surely seen: between the footprint's corners, where
+    its sides bulge, as they do through a flat port."""
+    sure_vertical_m: float
+    """Its height."""
     pixel_centre_mm: float
     """Root of the area on the sea floor of the central pixel."""
     pixel_mean_mm: float
@@ -249,7 +260,7 @@ def _row(
     lens_mm = (focal_m or image_m) * 1e3
     w, h = float(camera.width_px), float(camera.height_px)
     corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
-    floor_z = glass_z_m(camera) + altitude_m
+    floor_z = float(camera.front_cam[2]) + altitude_m
     edges = camera.at_depth(np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]), floor_z)
     horizontal = float(np.linalg.norm(edges[1] - edges[0]))
     corner_pixels = np.clip(corners, 0.5, [w - 0.5, h - 0.5])
@@ -271,14 +282,16 @@ def _row(
     hyperfocal = lens.hyperfocal_m(choices.coc_px)
     blur = lens.blur_px(depths)
     air_deg = _widest_deg(air_rays(camera, corners))
+    sure_m = sure_size_m(camera, floor_z)
     return FovRow(
         lens_mm=lens_mm,
         altitude_m=altitude_m,
         n_water=camera.n_water,
-        port_distance_m=camera.port_distance_m,
-        glass_thickness_m=camera.glass_thickness_m,
+        port=camera.port.words,
         horizontal_m=horizontal,
         vertical_m=float(np.linalg.norm(edges[3] - edges[2])),
+        sure_horizontal_m=sure_m[0],
+        sure_vertical_m=sure_m[1],
         pixel_centre_mm=float(pixel_mm[0]),
         pixel_mean_mm=horizontal / w * 1e3,
         pixel_corner_mm=float(pixel_mm[1:].max()),
@@ -294,7 +307,7 @@ def _row(
         focus_set_m=focus_m,
         hyperfocal_air_m=hyperfocal,
         hyperfocal_altitude_m=float(
-            np.mean((hyperfocal - at_centre.offset_m) / at_centre.slope),
+            np.mean(at_centre.altitudes_m(hyperfocal)),
         ),
         near_altitude_m=near,
         far_altitude_m=far,
@@ -307,7 +320,32 @@ def _row(
     )
 
 
-def _pixel_sizes_mm(camera: FlatPortCamera, pixels: Array, floor_z: float) -> Array:
+def sure_size_m(camera: Camera, floor_z_m: float) -> tuple[float, float]:
+    """Width and height of the largest upright rectangle about the axis that is seen.
+
+    It lies between the footprint's corners where the sides bulge, as they do through a flat port,
+    and between the middles of the sides where a lens makes them hollow.
+
+    Args:
+        camera: the camera.
+        floor_z_m: where a sea floor square to its axis is, in its frame.
+
+    Returns:
+        NaN where rays of the border never reach the sea floor.
+    """
+    border = camera.at_depth(camera.border(_POINTS_PER_SIDE), floor_z_m)
+    top, right, bottom, left = sides_of(border)
+    across_m, along_m = right[:, 0].min() - left[:, 0].max(), bottom[:, 1].min() - top[:, 1].max()
+    return float(across_m), float(along_m)
+
+
+def sides_of(border: Array) -> list[Array]:
+    """The four sides of a frame's border, each with both its corners: top, right, bottom, left."""
+    closed, n = np.vstack([border, border[:1]]), len(border) // 4
+    return [closed[k * n : (k + 1) * n + 1] for k in range(4)]
+
+
+def _pixel_sizes_mm(camera: Camera, pixels: Array, floor_z: float) -> Array:
     """Root of the area of unit squares around pixels (N, 2), on the sea floor."""
     square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     x, y = np.moveaxis(camera.at_depth(pixels[:, None] + square, floor_z)[..., :2], -1, 0)
@@ -323,7 +361,7 @@ def _widest_deg(corner_rays: Array) -> float:
     return float(np.degrees(np.arctan2(sines, (a * b).sum(axis=1))).max())
 
 
-def _pair(rig: Rig) -> tuple[FlatPortCamera, FlatPortCamera, RigidTransform] | None:
+def _pair(rig: Rig) -> tuple[Camera, Camera, RigidTransform] | None:
     """Left, right and `right_from_left`; None for a single camera."""
     if len(rig.cameras) < 2:
         return None
@@ -371,7 +409,7 @@ def disparity_per_m(rig: Rig, floor_z_m: float) -> float:
     left, right, right_from_left = pair
     middle = right_from_left.inv().translation / 2
     pixel = left.project(np.array([middle[0], middle[1], floor_z_m]))
-    step = 1e-4 * (floor_z_m - glass_z_m(left))
+    step = 1e-4 * (floor_z_m - float(left.front_cam[2]))
     along_ray = left.at_depth(
         np.stack([pixel, pixel]), np.array([floor_z_m - step, floor_z_m + step])
     )

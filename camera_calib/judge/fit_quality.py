@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from camera_calib.calibration import Calibration, stack_views
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 
 GATE_SIGMAS = 5.0
@@ -125,13 +125,13 @@ def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
     )
 
 
-def radius_px(camera: FlatPortCamera, pixels: Array) -> Array:
+def radius_px(camera: Camera, pixels: Array) -> Array:
     """(...,) distances of pixels (..., 2) from the principal point."""
     distances: Array = np.linalg.norm(pixels - [camera.cx_px, camera.cy_px], axis=-1)
     return distances
 
 
-def outward(camera: FlatPortCamera, pixels: Array) -> Array:
+def outward(camera: Camera, pixels: Array) -> Array:
     """Unit vectors (..., 2) from the principal point to pixels (..., 2); 0 at that point."""
     away = pixels - np.array([camera.cx_px, camera.cy_px])
     length = np.linalg.norm(away, axis=-1, keepdims=True)
@@ -139,10 +139,11 @@ def outward(camera: FlatPortCamera, pixels: Array) -> Array:
     return unit
 
 
-def incidence_deg(camera: FlatPortCamera, pixels: Array) -> Array:
+def incidence_deg(camera: Camera, pixels: Array) -> Array:
     """(...,) angles between the rays in water and the port's normal, degrees."""
-    _, directions = camera.unproject(pixels)
-    angles: Array = np.degrees(np.arccos(np.clip(directions @ np.array(camera.normal), -1, 1)))
+    points, directions = camera.unproject(pixels)
+    normals = camera.port.clearance(points.reshape(-1, 3))[1].reshape(points.shape)
+    angles: Array = np.degrees(np.arccos(np.clip((directions * normals).sum(axis=-1), -1, 1)))
     return angles
 
 
@@ -200,12 +201,12 @@ def profile(
     )
 
 
-def largest_radius_px(camera: FlatPortCamera) -> float:
+def largest_radius_px(camera: Camera) -> float:
     """Distance from the principal point to the farthest corner of the frame."""
     return float(radius_px(camera, camera.border(1)).max())
 
 
-def residual_profiles(camera: FlatPortCamera, seen: CameraResiduals) -> tuple[Profile, Profile]:
+def residual_profiles(camera: Camera, seen: CameraResiduals) -> tuple[Profile, Profile]:
     """Residuals against the radius and against the angle at the port."""
     corner_deg = incidence_deg(camera, camera.border(1))
     steepest = float(np.nanmax(np.append(corner_deg, seen.incidence_deg)))
@@ -236,7 +237,7 @@ class Coverage:
         return float((self.counts == 0).mean())
 
 
-def coverage(camera: FlatPortCamera, pixels: Array) -> Coverage:
+def coverage(camera: Camera, pixels: Array) -> Coverage:
     """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
     columns, rows = 10, 8
     size = np.array([camera.width_px, camera.height_px])

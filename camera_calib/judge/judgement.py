@@ -9,7 +9,6 @@ import numpy as np
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibration import Calibration
-from camera_calib.flat_port import PARAMETERS
 from camera_calib.freedom import POSE, value
 from camera_calib.judge.fit_quality import (
     CameraResiduals,
@@ -240,8 +239,7 @@ def _camera(
     pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
     halves = None
     if held is not None and held.halves is not None:
-        prior = held.used.freedom.prior
-        halves = halves_difference(held.halves, name, pixels, range_m, anchors, prior)
+        halves = halves_difference(held.halves, name, pixels, range_m, anchors)
     coarse, compensating = pixels[::2, ::2], compensation(rig, name, anchors)
     return CameraJudgement(
         seen=seen,
@@ -284,7 +282,7 @@ def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Paramete
         with_prior: names of those that had a prior.
     """
     covariance = covariance_of(rig)
-    names = [f"{c}.{p}" for c in rig.cameras for p in PARAMETERS]
+    names = [f"{c}.{p}" for c, camera in rig.cameras.items() for p in camera.parameters]
     names += [f"{c}.{p}" for c in rig.cameras if c != rig.reference for p in POSE]
     off_diagonal = covariance.correlation - np.eye(len(covariance.parameters))
     rows = []

@@ -1,7 +1,7 @@
 """Effect of a calibrated rig's covariance on pixels, points and lengths.
 
 Everything here is first order: a parameter error d moves a pixel by J d and has the covariance S,
-so the pixel's is J S J^T. The derivatives J are the analytic ones of `FlatPortCamera`.
+so the pixel's is J S J^T. The derivatives J are the analytic ones of `Camera`.
 """
 
 import math
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig
 
@@ -35,7 +35,7 @@ def covariance_of(rig: Rig) -> Covariance:
     for name in rig.covariance.parameters:
         camera, _, field = name.rpartition(".")
         known = camera in rig.cameras and (
-            field in PARAMETERS or (field in POSE and camera != rig.reference)
+            field in rig.cameras[camera].parameters or (field in POSE and camera != rig.reference)
         )
         if not known:
             raise CalibrationError(f"the rig's covariance has {name}, which the rig has not")
@@ -55,12 +55,12 @@ def camera_slopes(rig: Rig, camera: str, points_cam: Array) -> tuple[Array, Arra
         (N, 2, P), those of poses and of other cameras being 0. NaN where nothing is projected.
     """
     pixels, by_point, by_own = rig.cameras[camera].project_jacobian(points_cam)
-    names = covariance_of(rig).parameters
+    names, own = covariance_of(rig).parameters, rig.cameras[camera].parameters
     by_parameter = np.zeros((*pixels.shape, len(names)))
     for column, name in enumerate(names):
         owner, _, field = name.rpartition(".")
-        if owner == camera and field in PARAMETERS:
-            by_parameter[..., column] = by_own[..., PARAMETERS.index(field)]
+        if owner == camera and field in own:
+            by_parameter[..., column] = by_own[..., own.index(field)]
     return pixels, by_point, by_parameter
 
 
@@ -107,7 +107,7 @@ def taken_up(slopes: Array, moved: Array) -> Array:
     return found
 
 
-def frame_points(camera: FlatPortCamera, ranges_m: tuple[float, ...]) -> Array:
+def frame_points(camera: Camera, ranges_m: tuple[float, ...]) -> Array:
     """Points over the frame at some distances, (N, 3) in the camera's frame."""
     pixels = camera.frame_grid(9, 9).reshape(-1, 2)
     points = np.concatenate([camera.at_depth(pixels, r) for r in ranges_m])
@@ -243,7 +243,7 @@ def overlap_points(rig: Rig, range_m: float) -> Array:
     return kept
 
 
-def _in_frame(camera: FlatPortCamera, pixels: Array) -> NDArray[np.bool_]:
+def _in_frame(camera: Camera, pixels: Array) -> NDArray[np.bool_]:
     x, y = pixels[:, 0], pixels[:, 1]
     right, bottom = camera.width_px + _EDGE_PX, camera.height_px + _EDGE_PX
     inside: NDArray[np.bool_] = (x >= -_EDGE_PX) & (x <= right) & (y >= -_EDGE_PX) & (y <= bottom)

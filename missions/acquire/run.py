@@ -31,7 +31,7 @@ from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, range_map
 from alice_survey.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
 from alice_survey.seafloor.terrain import read_terrain, survey_terrain
 from alice_survey.seafloor.texture import SAND_ALBEDO, survey_texture
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.water import water_optics
 from missions.logs.navigation_csv import read_navigation
@@ -100,7 +100,7 @@ def run_pool(
     )
 
 
-def _take_board(job: tuple[_Shoot, PoolBoard, int, str, FlatPortCamera, Array]) -> ImageRecord:
+def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Camera, Array]) -> ImageRecord:
     shoot, board, view, camera, one, matrix = job
     imaging = shoot.imaging
     image = f"{camera}/{view:02d}.{imaging.image_format}"
@@ -280,7 +280,7 @@ def _studio(shoot: _Shoot) -> tuple[Scene, Rig, dict[str, CameraLight], Sensor, 
     }
     left = rig.cameras["left"]
     sensor = make_sensor(shoot.camera, left.n_water, shoot.exposure_s, imaging.scale)
-    pupil_m = shoot.altitude_m + left.port_distance_m + left.glass_thickness_m
+    pupil_m = shoot.altitude_m + float(left.front_cam[2])
     nominal = flat_floor_radiance(
         left, lights["left"], pupil_m, SAND_ALBEDO, max(left.width_px // 24, 1)
     )

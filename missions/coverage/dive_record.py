@@ -21,7 +21,6 @@ from alice_survey.base.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.stations import MOST_ALTITUDES, Stations
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation, utc_date
-from missions.values.footprint import glass_point_cam
 from missions.values.plan_file import Plan
 
 _ALIKE_RAD = math.radians(45.0)
@@ -244,7 +243,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     geodetic = np.column_stack([at["latitude_deg"], at["longitude_deg"], at["depth_m"]])
     body_ned = plan.datum.ned_from_geodetic(geodetic)
     attitude = _attitude(nav, at, time_s, plan, notes)
-    lever = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
+    lever = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
     glass_ned = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
     glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
     altitude = at.get("altitude_m", np.full(len(kept), np.nan)).copy()

@@ -18,7 +18,6 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.values.area import Area
-from missions.values.footprint import glass_point_cam
 
 _POINTS_PER_SIDE = 16
 """Points on each side of a footprint's border. Chords this short leave out less than 1e-4 of its
@@ -119,7 +118,7 @@ def border_rays_body(rig: Rig) -> tuple[Array, Array]:
         Points about the left port's outer glass, (cameras, points, 3) metres, and unit rays of the
         same shape, both in the vehicle's axes.
     """
-    glass = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
+    glass = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
     points, rays = [], []
     for name, camera in rig.cameras.items():
         body_from_cam = rig.body_from_cam(name)

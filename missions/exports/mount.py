@@ -12,7 +12,6 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from missions.values.footprint import glass_point_cam
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +68,7 @@ def mount_of(rig: Rig, altimeter_body_m: tuple[float, float, float]) -> CameraMo
         rig: its reference camera's glass is what plans are of.
         altimeter_body_m: forward, right and down; the setting `camera.dvl_position_body_m`.
     """
-    glass_cam = glass_point_cam(rig.cameras[rig.reference])
+    glass_cam = rig.cameras[rig.reference].front_cam
     glass_body = rig.body_from_cam(rig.reference).apply(glass_cam)
     forward_m, right_m, down_m = (float(value) for value in glass_body)
     return CameraMount(glass_body_m=(forward_m, right_m, down_m), altimeter_body_m=altimeter_body_m)

@@ -13,8 +13,13 @@ import numpy as np
 
 from alice_survey.base.config import CameraConfig, PlanConfig
 from alice_survey.base.errors import PlanError
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
+from camera_calib.camera import Camera
+from camera_calib.fov.focus import (
+    FocusedLens,
+    altitude_of_apparent_m,
+    apparent_depths,
+    apparent_distance_m,
+)
 from camera_calib.water import WAVELENGTH_NM
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import HIGHEST_ALTITUDE_M, Way, conflict, least_that_fits
@@ -53,7 +58,7 @@ class Focus:
     """Circle of confusion for which the depth of field is 2 m, as the paper states it."""
 
 
-def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -> Focus:
+def plan_focus(camera: Camera, limits: CameraConfig, plan: PlanConfig) -> Focus:
     """Focus and aperture over the relief.
 
     Args:
@@ -110,7 +115,7 @@ def too_open(focus: Focus, limits: CameraConfig, plan: PlanConfig) -> str:
     )
 
 
-def needed_f_number(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -> float:
+def needed_f_number(camera: Camera, limits: CameraConfig, plan: PlanConfig) -> float:
     """Smallest f-number that keeps the relief within `sharp_px`; inf where the lens cannot focus.
 
     The relief must lie below the glass.
@@ -129,18 +134,12 @@ def largest_f_number(limits: CameraConfig, sharp_px: float) -> float:
     return sharp_px * limits.pixel_um * 1e-6 / (_AIRY * _GREEN_M)
 
 
-def _top_and_focus_m(camera: FlatPortCamera, plan: PlanConfig) -> tuple[float, float]:
+def _top_and_focus_m(camera: Camera, plan: PlanConfig) -> tuple[float, float]:
     """Apparent distance of the relief's top, and the dioptric middle of top and bottom."""
     top, bottom = (
         apparent_distance_m(camera, plan.altitude_m + sign * plan.relief_m) for sign in (-1, 1)
     )
     return top, 2.0 / (1.0 / top + 1.0 / bottom)
-
-
-def altitude_of_apparent_m(camera: FlatPortCamera, apparent_m: float) -> float:
-    """Altitude of ground at an apparent distance: the inverse of `apparent_distance_m`."""
-    air_m = camera.port_distance_m + camera.glass_thickness_m / camera.n_glass
-    return (apparent_m - air_m) * camera.n_water
 
 
 def _coc_for_depth_px(lens: FocusedLens, span_m: float) -> float:
@@ -157,7 +156,7 @@ def _up(f_number: float) -> float:
 
 
 def _cannot_focus(
-    camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig, needed: float, largest: float
+    camera: Camera, limits: CameraConfig, plan: PlanConfig, needed: float, largest: float
 ) -> PlanError:
     """The depth of field cannot hold the relief at any aperture."""
 
@@ -209,7 +208,7 @@ def _cannot_focus(
 
 
 def focus_rows(
-    focus: Focus, camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig
+    focus: Focus, camera: Camera, limits: CameraConfig, plan: PlanConfig
 ) -> list[Setting]:
     """Focus, depth of field, aperture and diffraction."""
     n = camera.n_water

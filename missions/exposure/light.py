@@ -25,7 +25,6 @@ from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from camera_calib.water import WAVELENGTH_NM, WaterOptics, phase_per_sr
 from missions.exposure.settings_table import Setting, settings_of
-from missions.values.footprint import glass_point_cam
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
 """Red, green and blue of bare sand, as `alice_survey.seafloor.texture.SAND_ALBEDO`."""
@@ -136,7 +135,7 @@ def floor_radiance(
         (..., 3) red, green and blue, without the lens's fall-off and the water's own light.
     """
     camera = rig.cameras[rig.reference]
-    floor_z = float(glass_point_cam(camera)[2]) + altitude_m
+    floor_z = float(camera.front_cam[2]) + altitude_m
     outer, directions = camera.unproject(pixels)
     path = (floor_z - outer[..., 2]) / directions[..., 2]
     spots = outer + path[..., None] * directions
@@ -319,7 +318,7 @@ def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: fl
     camera = rig.cameras[rig.reference]
     strobes = _strobes_cam(rig, imaging)
     half_beam = math.radians(imaging.strobe_beam_deg) / 2
-    glass_z = float(glass_point_cam(camera)[2])
+    glass_z = float(camera.front_cam[2])
     path = altitude_m * (np.arange(_STEPS + 1) / _STEPS) ** 2
     points = np.stack([0 * path, 0 * path, glass_z + path], axis=1)
     power = imaging.strobe_lumens * watts_per_lumen("planck")
@@ -353,7 +352,7 @@ def _field_lit_from_m(rig: Rig, strobes: Array, half_beam: float, altitude_m: fl
     """First distance below the glass at which a cone of light meets the field of view."""
     camera = rig.cameras[rig.reference]
     outer, directions = camera.unproject(camera.border(16))
-    glass_z = float(glass_point_cam(camera)[2])
+    glass_z = float(camera.front_cam[2])
     for below_m in np.linspace(0.0, altitude_m, 801):
         z = glass_z + below_m
         spots = outer + ((z - outer[:, 2]) / directions[:, 2])[:, None] * directions
@@ -382,7 +381,7 @@ def shadows(rig: Rig, imaging: ImagingConfig, altitude_m: float, height_m: float
         height_m: of the object.
     """
     camera = rig.cameras[rig.reference]
-    floor_z = float(glass_point_cam(camera)[2]) + altitude_m
+    floor_z = float(camera.front_cam[2]) + altitude_m
     strobes = _strobes_cam(rig, imaging)
     lengths = [
         height_m * _reach(s) / (floor_z - s[2] - height_m)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from alice_survey.base.config import CameraConfig
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from missions.exposure.settings_table import Setting, settings_of
 
 LINK_BYTES_PER_S = 124e6
@@ -32,12 +32,12 @@ class Storage:
     """Most triggers a second that the disk takes."""
 
 
-def raw_bytes(camera: FlatPortCamera, cameras: int, stations: int) -> int:
+def raw_bytes(camera: Camera, cameras: int, stations: int) -> int:
     """Size of all pictures as the sensor gives them, one byte a pixel."""
     return camera.width_px * camera.height_px * cameras * stations
 
 
-def storage_load(camera: FlatPortCamera, cameras: int, interval_s: float) -> Storage:
+def storage_load(camera: Camera, cameras: int, interval_s: float) -> Storage:
     """Data of a rig.
 
     Args:

@@ -19,7 +19,7 @@ import numpy as np
 from alice_survey.base.config import CameraConfig, PlanConfig
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import (
@@ -32,7 +32,6 @@ from missions.exposure.ways_out import (
 )
 from missions.values.footprint import (
     footprint_size_m,
-    glass_point_cam,
     overlap,
     step_for_overlap,
 )
@@ -40,7 +39,7 @@ from missions.values.footprint import (
 EXPOSURE_STEP_S = 1e-5
 PAPER_EXPOSURE_S = 3e-3
 PAPER_SPEEDS_MPS = (0.2, 0.5)
-_MODEL = "rigid-body motion through camera_calib.flat_port's slopes"
+_MODEL = "rigid-body motion through camera_calib.camera's slopes"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +77,7 @@ def floor_to(value: float, step: float) -> float:
     return round(math.floor(value / step + 1e-6) * step, 9)
 
 
-def too_fast(
-    camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig, along_m: float
-) -> PlanError:
+def too_fast(camera: Camera, limits: CameraConfig, plan: PlanConfig, along_m: float) -> PlanError:
     """The camera cannot take pictures as fast as overlap, speed and altitude need."""
     shortest_s = limits.shortest_interval_s
     needed_s = step_for_overlap(along_m, plan.forward_overlap) / plan.speed_mps
@@ -174,7 +171,7 @@ def blur_rates(rig: Rig, plan: PlanConfig, altitude_m: float) -> BlurRates:
     corners = [[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]
     sides = [[w / 2, 0.0], [w, h / 2], [w / 2, h], [0.0, h / 2]]
     pixels = np.array([centre, *corners, *sides])
-    points_cam = camera.at_depth(pixels, glass_point_cam(camera)[2] + altitude_m)
+    points_cam = camera.at_depth(pixels, camera.front_cam[2] + altitude_m)
     body_from_cam = rig.body_from_cam(rig.reference)
     points_body = body_from_cam.apply(points_cam)
     slopes = camera.project_jacobian(points_cam)[1]

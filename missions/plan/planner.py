@@ -17,7 +17,7 @@ from shapely.geometry import Point
 from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.base.errors import PlanError, heard, warn
 from alice_survey.vehicle.hull import Hull
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
@@ -271,7 +271,7 @@ def _terrain(
     wanted: PlanConfig,
     reach: Reach,
     pattern: Pattern,
-    camera: FlatPortCamera,
+    camera: Camera,
     bathymetry: Bathymetry | None,
 ) -> tuple[tuple[tuple[float, ...], ...], str, dict[str, Any] | None]:
     """How lines follow a bathymetry: depths of the glass at each station, in words, in figures."""

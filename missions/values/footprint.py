@@ -8,7 +8,8 @@ from shapely.geometry import Polygon
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
+from camera_calib.fov.table import sides_of, sure_size_m
 from camera_calib.rig import Rig
 
 _POINTS_PER_SIDE = 16
@@ -46,14 +47,8 @@ class Swath:
         return min(self.port_m, self.starboard_m)
 
 
-def glass_point_cam(camera: FlatPortCamera) -> Array:
-    """The point of the outer glass before the entrance pupil, (3,), in the camera's frame."""
-    reach = camera.port_distance_m + camera.glass_thickness_m
-    return reach * np.asarray(camera.normal, dtype=np.float64)
-
-
 def level_pose(
-    camera: FlatPortCamera, glass_ne: Array, altitude_m: float, depth_m: float, heading_rad: float
+    camera: Camera, glass_ne: Array, altitude_m: float, depth_m: float, heading_rad: float
 ) -> RigidTransform:
     """Pose `ned_from_cam` of a nadir camera on a level vehicle.
 
@@ -66,12 +61,12 @@ def level_pose(
     """
     rotation = rotation_from_attitude(0.0, 0.0, heading_rad) * BODY_FROM_NADIR_CAM
     glass_ned = np.array([glass_ne[0], glass_ne[1], depth_m - altitude_m])
-    pupil_ned = glass_ned - rotation.apply(glass_point_cam(camera))
+    pupil_ned = glass_ned - rotation.apply(camera.front_cam)
     return RigidTransform.from_components(pupil_ned, rotation)
 
 
 def footprint_ne(
-    camera: FlatPortCamera,
+    camera: Camera,
     ned_from_cam: RigidTransform,
     seafloor_depth_m: float,
     points_per_side: int = _POINTS_PER_SIDE,
@@ -98,7 +93,7 @@ def footprint_ne(
 
 
 def footprint_polygon(
-    camera: FlatPortCamera, ned_from_cam: RigidTransform, seafloor_depth_m: float
+    camera: Camera, ned_from_cam: RigidTransform, seafloor_depth_m: float
 ) -> Polygon:
     """The footprint as a polygon with x = north and y = east.
 
@@ -114,8 +109,10 @@ def footprint_polygon(
     return Polygon(border)
 
 
-def footprint_size_m(camera: FlatPortCamera, altitude_m: float) -> tuple[float, float]:
-    """Across and along size of a level camera's footprint, on the middle row and column.
+def footprint_size_m(camera: Camera, altitude_m: float) -> tuple[float, float]:
+    """Across and along size of the upright rectangle that a level camera surely sees.
+
+    See `camera_calib.fov.table.sure_size_m`.
 
     Args:
         camera: the camera.
@@ -124,12 +121,10 @@ def footprint_size_m(camera: FlatPortCamera, altitude_m: float) -> tuple[float, 
     Raises:
         PlanError: part of the picture looks past the sea floor.
     """
-    w, h = float(camera.width_px), float(camera.height_px)
-    middles = np.array([[0.0, h / 2], [w, h / 2], [w / 2, 0.0], [w / 2, h]])
-    hits = camera.at_depth(middles, glass_point_cam(camera)[2] + altitude_m)
-    if not np.all(np.isfinite(hits)):
+    size_m = sure_size_m(camera, camera.front_cam[2] + altitude_m)
+    if not np.all(np.isfinite(size_m)):
         raise PlanError("the camera does not see the sea floor with its whole frame")
-    return float(hits[1, 0] - hits[0, 0]), float(hits[3, 1] - hits[2, 1])
+    return size_m
 
 
 def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath:
@@ -144,7 +139,7 @@ def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath
     Raises:
         PlanError: part of the picture looks past the sea floor.
     """
-    glass_rig = glass_point_cam(rig.cameras[rig.reference])
+    glass_rig = rig.cameras[rig.reference].front_cam
     glass_rig = rig.cam_from_rig[rig.reference].inv().apply(glass_rig)
     glass_body = rig.body_from_rig.apply(glass_rig)
     body_from_cam = rig.body_from_cam(name)
@@ -154,9 +149,7 @@ def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath
         raise PlanError(
             f"camera {name} does not see the sea floor {altitude_m:g} m below with its whole frame"
         )
-    closed = np.vstack([border, border[:1]])
-    n = len(border) // 4
-    top, starboard, bottom, port = (closed[k * n : (k + 1) * n + 1] for k in range(4))
+    top, starboard, bottom, port = sides_of(border)
     middle = (top[:, 0].min() + bottom[:, 0].max()) / 2
     return Swath(
         port_m=_least_reach(port[:, 0] - middle, -port[:, 1], step_m),

@@ -15,7 +15,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from alice_survey.base.trajectory import read_columns
 from alice_survey.seafloor.terrain import Floats, Terrain
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 
 _ABOVE_M = 8.0
@@ -97,12 +97,8 @@ def ground_pixel_m(rig: Rig, cameras: Mapping[str, str], poses: Mapping[str, Rig
     names = [name for name in poses if name in cameras]
     pupils = np.array([poses[name].translation for name in names])
     below = surface_depth(terrain, pupils[:, :2]) - pupils[:, 2]
-    focal = np.array([_focal_in_water_px(rig.cameras[cameras[name]]) for name in names])
+    focal = np.array([rig.cameras[cameras[name]].focal_in_water_px for name in names])
     return float(np.nanmedian(below / focal))
-
-
-def _focal_in_water_px(camera: FlatPortCamera) -> float:
-    return 0.5 * (camera.fx_px + camera.fy_px) * camera.n_water
 
 
 def count_stations(
@@ -167,7 +163,7 @@ def count_stations(
     return count
 
 
-def _near(points_ned: Array, camera: FlatPortCamera, pose: RigidTransform) -> NDArray[np.bool_]:
+def _near(points_ned: Array, camera: Camera, pose: RigidTransform) -> NDArray[np.bool_]:
     """Whether points lie in a cone about the axis that is wider than the frame."""
     half_px = np.hypot(
         max(camera.cx_px, camera.width_px - camera.cx_px),

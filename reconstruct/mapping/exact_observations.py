@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
@@ -20,8 +20,6 @@ from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import LinearObservations
 
-_SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
-"""What a camera's pixels depend on: itself, and its place on the rig."""
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
 _MOST_OBSERVATIONS = 500_000
@@ -53,7 +51,7 @@ class Pixels:
 class RigState:
     """One guess of all unknowns."""
 
-    cameras: tuple[FlatPortCamera, ...]
+    cameras: tuple[Camera, ...]
     cam_from_rig: tuple[RigidTransform, ...]
     turns: Array
     """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
@@ -142,11 +140,13 @@ def exact_observations(
     for c, name in enumerate(names):
         pose, turn = state.cam_from_rig[c], state.cam_from_rig[c].rotation.as_matrix()
         mine = [(g, f.split(".")[1]) for g, f in enumerate(fields) if f.split(".")[0] == name]
-        source = np.array([_SLOPES.index(parameter) for _, parameter in mine], dtype=np.int64)
+        # A camera's pixels depend on itself, and on its place on the rig.
+        every = (*state.cameras[c].parameters, *TURN_AND_SHIFT)
+        source = np.array([every.index(parameter) for _, parameter in mine], dtype=np.int64)
         target = np.array([g for g, _ in mine], dtype=np.int64)
-        every = np.flatnonzero(pixels.camera == c)
-        for first in range(0, len(every), _BLOCK):
-            rows = every[first : first + _BLOCK]
+        seen = np.flatnonzero(pixels.camera == c)
+        for first in range(0, len(seen), _BLOCK):
+            rows = seen[first : first + _BLOCK]
             turned = _in_rig(arm, rows, pixels.station, state.turns) @ turn.T
             at, by_cam, by_camera = state.cameras[c].project_jacobian(turned + pose.translation)
             _put(

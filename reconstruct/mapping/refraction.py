@@ -98,7 +98,7 @@ class Keypoints:
     @property
     def shifted(self) -> bool:
         """Whether distance moves any keypoint; not so for a pinhole calibrated in water."""
-        return any(np.nan_to_num(p.offset).any() for p in self._pictures.values())
+        return any(p.warp.largest_offset_m > 0 for p in self._pictures.values())
 
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""

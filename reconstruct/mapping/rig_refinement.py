@@ -25,9 +25,9 @@ from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PortRecord
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.flat_port import PARAMETERS
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, pose_names, value
+from camera_calib.ports.values import lowest
 from camera_calib.rig import Covariance, Rig, write_rig
 from reconstruct.mapping.arrays import Indices, first_pictures, frames_of
 from reconstruct.mapping.bundle import move_points
@@ -56,7 +56,10 @@ from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.pairs import positions_ned
 
-_PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
+_PORT_SIGMAS = {
+    "port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005,
+    "dome_x_m": 0.005, "dome_y_m": 0.005, "dome_z_m": 0.02,
+}  # fmt: skip
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 """Prior sigmas of parameters that no calibration determines: very wide."""
 _LEVER = ("lever.x_m", "lever.y_m", "lever.z_m")
@@ -226,8 +229,9 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
     if port:
         for name in names:
             camera = rig.cameras[name]
-            if camera.port_distance_m + camera.glass_thickness_m > 0:
-                wide |= {f"{name}.{field}": sigma for field, sigma in _PORT_SIGMAS.items()}
+            if camera.refracts:
+                found = (*camera.port.estimated, "n_water")
+                wide |= {f"{name}.{field}": _PORT_SIGMAS[field] for field in found}
     if pose:
         wide |= {
             name: _RIG_SIGMAS[name.split(".")[1]]
@@ -349,9 +353,10 @@ def _moved(
             camera, parameter = field.split(".")
             if camera != name:
                 continue
-            if parameter in PARAMETERS:
-                low = {"port_distance_m": 0.0, "n_water": 1.0}.get(parameter, -np.inf)
-                changes[parameter] = max(low, cameras[c].parameter(parameter) + step.shared[g])
+            if parameter in cameras[c].parameters:
+                changes[parameter] = max(
+                    lowest(parameter), cameras[c].parameter(parameter) + step.shared[g]
+                )
             else:
                 motion[TURN_AND_SHIFT.index(parameter)] = step.shared[g]
         cameras[c] = cameras[c].with_parameters(changes)

@@ -13,7 +13,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import WarpRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import match_descriptors
@@ -27,8 +27,6 @@ _LARGEST_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
 """Nearest and farthest distances over the working range, when only the range is known."""
-_GRID = 33
-"""Rays along each side of the frame that a pinhole is judged by."""
 _LARGEST_CONTRACTION = 0.5
 """At which warped pictures are stretched by half, or twice as dense; at 1 they fold."""
 _LARGEST_CUT = 0.05
@@ -48,7 +46,7 @@ class WorkingDistances:
 class _StereoTask:
     first: Path
     second: Path
-    cameras: tuple[FlatPortCamera, FlatPortCamera]
+    cameras: tuple[Camera, Camera]
     second_from_first: RigidTransform
     ratio: float
 
@@ -91,7 +89,7 @@ def find_distances(
     altitudes = np.array([r.altitude_m for r in records])
     if np.isfinite(altitudes).any():
         reference = rig.cameras[rig.reference]
-        glass = reference.port_distance_m + reference.glass_thickness_m
+        glass = float(reference.front_cam[2])
         middle = float(np.nanmedian(altitudes)) + glass
         if tasks:
             warn(f"{len(depths)} points in stereo matches: the altitude sets the working range")
@@ -104,13 +102,12 @@ def find_distances(
 
 def warp_record(warp: PinholeWarp, distances: WorkingDistances | None) -> WarpRecord:
     """How well a pinhole stands in for a camera over distances; None: it has one centre."""
-    _, offset = warp.lines(warp.camera.frame_grid(_GRID, _GRID))
     contraction = np.zeros(1)
     if distances is not None:
         ends = np.array([distances.near_m, distances.far_m])
         contraction = range_shift(warp).contraction(ends - warp.centre_m[2])
     return WarpRecord(
-        offset_m=float(np.nanmax(np.linalg.norm(offset, axis=-1))),
+        offset_m=warp.largest_offset_m,
         contraction=float(contraction.max()),
         cut_share=warp.cut_share,
     )
@@ -145,7 +142,7 @@ def stereo_depths(task: _StereoTask) -> Array:
     start_b, ray_b = first_from_second.apply(start_b), first_from_second.rotation.apply(ray_b)
     along_a, gap = ray_passes(start_a, ray_a, start_b, ray_b)
     depth: Array = start_a[:, 2] + along_a * ray_a[:, 2]
-    focal = first.n_water * first.fx_px
+    focal = first.focal_in_water_px
     with np.errstate(invalid="ignore"):
         good = (along_a > 0) & (gap * focal < _LARGEST_GAP_PX * depth)
     return depth[good]

@@ -135,12 +135,11 @@ def footprints(records: Sequence[ImageRecord], rig: Rig, datum: Datum) -> list[P
     borders = {name: camera.unproject(camera.border(8)) for name, camera in rig.cameras.items()}
     positions = positions_ned(records, datum)
     reference = rig.cameras[rig.reference]
-    glass = reference.port_distance_m + reference.glass_thickness_m
     polygons = []
     for record, position in zip(records, positions, strict=True):
         attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
         ned_from_body = RigidTransform.from_components(position, rotation_from_attitude(*attitude))
-        outer_glass = (ned_from_body * rig.body_from_rig).apply([0.0, 0.0, glass])
+        outer_glass = (ned_from_body * rig.body_from_rig).apply(reference.front_cam)
         floor = outer_glass[2] + record.altitude_m
         ned_from_cam = ned_from_body * rig.body_from_cam(record.camera)
         points, directions = borders[record.camera]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.freedom import POSE
 from camera_calib.rig import Rig
 from camera_calib.triangulate import triangulate
@@ -31,7 +31,7 @@ class StereoRig:
     """Two cameras; the world is the frame of the first (right, down, forward, at its pupil)."""
 
     names: tuple[str, str]
-    cameras: tuple[FlatPortCamera, FlatPortCamera]
+    cameras: tuple[Camera, Camera]
     second_from_first: RigidTransform
 
     @property
@@ -116,7 +116,7 @@ def matched_points(rig: StereoRig, pixels: tuple[Array, Array]) -> Array:
     back = rig.second_from_first.inv()
     start_b, ray_b = back.apply(start_b), back.rotation.apply(ray_b)
     along, gap = ray_passes(start_a, ray_a, start_b, ray_b)
-    focal = rig.cameras[0].n_water * rig.cameras[0].fx_px
+    focal = rig.cameras[0].focal_in_water_px
     with np.errstate(invalid="ignore"):
         meet = gap * focal < _LARGEST_GAP_PX * np.abs(along)
         before, behind = meet & (along > 0), meet & (along < 0)
@@ -164,7 +164,7 @@ def calibration_slopes(
 
 def _changed(rig: Rig, camera: str, field: str, step: float) -> Rig:
     """The rig with one parameter moved by a step; see `camera_calib.freedom`."""
-    if field in PARAMETERS:
+    if field in rig.cameras[camera].parameters:
         old = rig.cameras[camera]
         new = old.with_parameters({field: old.parameter(field) + step})
         return replace(rig, cameras={**rig.cameras, camera: new})

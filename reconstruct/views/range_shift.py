@@ -104,12 +104,12 @@ def as_nodes(values: NDArray[np.float64], width_px: float, height_px: float) -> 
 
 def range_shift(warp: PinholeWarp) -> RangeShift:
     """The field of a warp, lengths in metres."""
-    width, height = warp.pinhole.width_px, warp.pinhole.height_px
+    width, height = warp.pinhole.size_px
+    if warp.largest_offset_m == 0.0:
+        return no_shift(width, height)
     rows = max(2, round((_COLUMNS - 1) * height / width) + 1)
     x, y = np.linspace(0.0, width, _COLUMNS), np.linspace(0.0, height, rows)
     _, offset = warp.lines(warp.from_pinhole(np.stack(np.meshgrid(x, y), axis=-1)))
-    if not np.nan_to_num(offset).any():
-        return no_shift(width, height)
     return RangeShift(
         nodes=_without_holes(offset * warp.pinhole.numbers[:2]),
         width_px=float(width),

@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.calibration import TargetView
-from camera_calib.flat_port import IN_AIR
 from camera_calib.rig import Rig, design_rig
+from tests.cameras import changed
 
 Array = NDArray[np.float64]
 
@@ -36,11 +36,11 @@ def tilted(x_deg: float, y_deg: float) -> tuple[float, float, float]:
 def built_rig() -> Rig:
     """Near the design, not equal to it: lenses, ports with tilt, pose of the right camera."""
     lens = {"k1": -0.05, "k2": 0.03, "p1": 2e-4, "p2": -2e-4, "k3": 0.004}
-    left = replace(
+    left = changed(
         DESIGN.cameras["left"], fx_px=3395.0, fy_px=3396.0, cx_px=1698.0, cy_px=1350.0,
         port_distance_m=0.0212, normal=tilted(0.6, -0.4), **lens,
     )  # fmt: skip
-    right = replace(
+    right = changed(
         DESIGN.cameras["right"], fx_px=3380.0, fy_px=3381.0, cx_px=1685.0, cy_px=1361.0,
         port_distance_m=0.0191, normal=tilted(-0.5, 0.7), **lens,
     )  # fmt: skip
@@ -56,7 +56,7 @@ def built_rig() -> Rig:
 
 
 def in_air(rig: Rig) -> Rig:
-    cameras = {name: replace(camera, **IN_AIR) for name, camera in rig.cameras.items()}
+    cameras = {name: camera.in_air() for name, camera in rig.cameras.items()}
     return replace(rig, cameras=cameras)
 
 

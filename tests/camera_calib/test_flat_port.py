@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +8,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import (
-    PARAMETERS,
-    FlatPortCamera,
+from camera_calib.camera import (
+    Camera,
     camera_from_json,
+    flat_port_camera,
     pose_jacobian,
 )
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.ports.flat import FlatPort
+from tests.cameras import changed
 from tests.oracles_camera import (
     lens_pixel,
     numeric_slope,
@@ -22,9 +24,11 @@ from tests.oracles_camera import (
     project_by_shortest_path,
 )
 
+PARAMETERS = (*OpenCVLens.parameters, *FlatPort.parameters)
+
 Array = NDArray[np.float64]
 
-MANTA = FlatPortCamera(
+MANTA = flat_port_camera(
     width_px=3384,
     height_px=2710,
     fx_px=3387.5,
@@ -46,9 +50,9 @@ def tilted(angle_deg: float, azimuth_deg: float) -> tuple[float, float, float]:
 
 
 @st.composite
-def cameras(draw: st.DrawFn) -> FlatPortCamera:
+def cameras(draw: st.DrawFn) -> Camera:
     """Cameras over the ranges in which the model is to be exact."""
-    return replace(
+    return changed(
         MANTA,
         fx_px=draw(st.floats(2500.0, 8000.0)),
         fy_px=draw(st.floats(2500.0, 8000.0)),
@@ -76,7 +80,7 @@ def cameras(draw: st.DrawFn) -> FlatPortCamera:
 
 @settings(deadline=None, max_examples=150)
 @given(camera=cameras(), distance_m=st.floats(0.3, 20.0))
-def test_a_pixel_comes_back_within_a_billionth(camera: FlatPortCamera, distance_m: float) -> None:
+def test_a_pixel_comes_back_within_a_billionth(camera: Camera, distance_m: float) -> None:
     pixels = camera.pixel_centres(step=241).reshape(-1, 2)
     glass, directions = camera.unproject(pixels)
 
@@ -93,14 +97,14 @@ def test_a_pixel_comes_back_within_a_billionth(camera: FlatPortCamera, distance_
     water_m=st.floats(0.3, 20.0),
 )
 def test_project_agrees_with_the_shortest_optical_path(
-    camera: FlatPortCamera, x: float, y: float, water_m: float
+    camera: Camera, x: float, y: float, water_m: float
 ) -> None:
-    glass_m = camera.port_distance_m + camera.glass_thickness_m
-    point = (glass_m + water_m) * np.array(camera.normal) + water_m * np.array([x, y, 0.0])
-    if camera.port_distance_m < 1e-6:
-        camera = replace(camera, port_distance_m=1e-6)
-    if camera.glass_thickness_m < 1e-6:
-        camera = replace(camera, glass_thickness_m=1e-6)
+    glass_m = camera.port.port_distance_m + camera.port.glass_thickness_m
+    point = (glass_m + water_m) * np.array(camera.port.normal) + water_m * np.array([x, y, 0.0])
+    if camera.port.port_distance_m < 1e-6:
+        camera = changed(camera, port_distance_m=1e-6)
+    if camera.port.glass_thickness_m < 1e-6:
+        camera = changed(camera, glass_thickness_m=1e-6)
 
     np.testing.assert_allclose(
         camera.project(point), project_by_shortest_path(camera, point), atol=1e-8
@@ -115,10 +119,10 @@ def test_project_agrees_with_the_shortest_optical_path(
     water_m=st.floats(0.3, 20.0),
 )
 def test_project_agrees_with_bisection(
-    camera: FlatPortCamera, slope: float, azimuth: float, water_m: float
+    camera: Camera, slope: float, azimuth: float, water_m: float
 ) -> None:
-    camera = replace(camera, normal=(0.0, 0.0, 1.0))
-    z = camera.port_distance_m + camera.glass_thickness_m + water_m
+    camera = changed(camera, normal=(0.0, 0.0, 1.0))
+    z = camera.port.port_distance_m + camera.port.glass_thickness_m + water_m
     point = np.array([slope * z * math.cos(azimuth), slope * z * math.sin(azimuth), z])
     if not np.all(np.isfinite(camera.project(point))):
         assert slope > 0.4  # only far outside of the frame may a lens have no image
@@ -139,8 +143,8 @@ def points_in_water(draw: st.DrawFn) -> Array:
 
 @settings(deadline=None, max_examples=60)
 @given(camera=cameras(), points=points_in_water())
-def test_slopes_by_the_point_are_those_of_project(camera: FlatPortCamera, points: Array) -> None:
-    points = np.vstack([points, 1.5 * np.array(camera.normal)])
+def test_slopes_by_the_point_are_those_of_project(camera: Camera, points: Array) -> None:
+    points = np.vstack([points, 1.5 * np.array(camera.port.normal)])
     pixels, by_point, _ = camera.project_jacobian(points)
 
     np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
@@ -156,16 +160,14 @@ STEPS = dict.fromkeys(PARAMETERS, 0.0001) | {
 
 @settings(deadline=None, max_examples=40)
 @given(camera=cameras(), points=points_in_water())
-def test_slopes_by_each_parameter_are_those_of_project(
-    camera: FlatPortCamera, points: Array
-) -> None:
-    camera = replace(
+def test_slopes_by_each_parameter_are_those_of_project(camera: Camera, points: Array) -> None:
+    camera = changed(
         camera,
-        port_distance_m=camera.port_distance_m + 1e-3,
-        glass_thickness_m=camera.glass_thickness_m + 1e-3,
+        port_distance_m=camera.port.port_distance_m + 1e-3,
+        glass_thickness_m=camera.port.glass_thickness_m + 1e-3,
         n_water=camera.n_water + 4e-3,
     )
-    points = np.vstack([points, 1.5 * np.array(camera.normal)])
+    points = np.vstack([points, 1.5 * np.array(camera.port.normal)])
     _, _, by_parameter = camera.project_jacobian(points)
 
     for i, name in enumerate(PARAMETERS):
@@ -179,7 +181,7 @@ def test_slopes_by_each_parameter_are_those_of_project(
 
 def test_slopes_by_a_pose_are_those_of_moved_points() -> None:
     rng = np.random.default_rng(5)
-    camera = replace(MANTA, normal=tilted(4.0, 70.0), k1=-0.1)
+    camera = changed(MANTA, normal=tilted(4.0, 70.0), k1=-0.1)
     points = rng.uniform([-0.5, -0.4, 1.5], [0.5, 0.4, 2.5], (30, 3))
     _, by_point, _ = camera.project_jacobian(points)
     slopes = pose_jacobian(by_point, points)
@@ -212,7 +214,7 @@ def test_parameters_go_by_name() -> None:
     camera = MANTA.with_parameters(values)
 
     assert {name: camera.parameter(name) for name in PARAMETERS} == pytest.approx(values)
-    assert math.hypot(*camera.normal) == pytest.approx(1.0, abs=1e-15)
+    assert math.hypot(*camera.port.normal) == pytest.approx(1.0, abs=1e-15)
     with pytest.raises(CalibrationError, match="k9"):
         MANTA.with_parameters({"k9": 0.1})
     with pytest.raises(CalibrationError, match="normal_x"):
@@ -235,7 +237,7 @@ def test_a_ray_obeys_snells_law_in_closed_form(angle_deg: float) -> None:
 
 def test_without_port_and_water_it_is_opencvs_camera() -> None:
     rng = np.random.default_rng(1)
-    camera = replace(MANTA, k1=-0.1, k2=0.05, p1=1e-3, p2=-2e-3, k3=0.01, n_glass=1.0, n_water=1.0)
+    camera = changed(MANTA, k1=-0.1, k2=0.05, p1=1e-3, p2=-2e-3, k3=0.01, n_glass=1.0, n_water=1.0)
     points = rng.uniform([-1, -1, 2], [1, 1, 4], (200, 3))
 
     expected = [lens_pixel(camera, point) for point in points]
@@ -244,7 +246,7 @@ def test_without_port_and_water_it_is_opencvs_camera() -> None:
 
 
 def test_near_the_axis_water_magnifies_by_its_index() -> None:
-    camera = replace(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
+    camera = changed(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
     point = np.array([1e-5, -2e-5, 2.0])
 
     offset = camera.project(point) - [camera.cx_px, camera.cy_px]
@@ -255,8 +257,8 @@ def test_near_the_axis_water_magnifies_by_its_index() -> None:
 @given(factor=st.floats(0.1, 10.0), x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
 def test_pixels_do_not_know_the_unit_of_length(factor: float, x: float, y: float) -> None:
     point = np.array([x, y, 1.5])
-    camera = replace(MANTA, normal=tilted(4.0, 70.0))
-    larger = replace(camera, port_distance_m=0.02 * factor, glass_thickness_m=0.01 * factor)
+    camera = changed(MANTA, normal=tilted(4.0, 70.0))
+    larger = changed(camera, port_distance_m=0.02 * factor, glass_thickness_m=0.01 * factor)
 
     np.testing.assert_allclose(larger.project(factor * point), camera.project(point), atol=1e-8)
 
@@ -274,11 +276,11 @@ def test_a_square_port_is_symmetric_about_its_axis(angle: float, x: float, y: fl
 
 def test_two_tilts_that_agree_give_one_pixel() -> None:
     point = np.array([0.3, -0.2, 2.0])
-    exact = replace(MANTA, normal=tilted(3.0, 30.0)).project(point)
+    exact = changed(MANTA, normal=tilted(3.0, 30.0)).project(point)
 
     rounded = tuple(value * (1 + 4e-7) for value in tilted(3.0, 30.0))
 
-    np.testing.assert_allclose(replace(MANTA, normal=rounded).project(point), exact, atol=1e-9)
+    np.testing.assert_allclose(changed(MANTA, normal=rounded).project(point), exact, atol=1e-9)
 
 
 def test_points_outside_of_the_water_have_no_pixel() -> None:
@@ -290,7 +292,7 @@ def test_points_outside_of_the_water_have_no_pixel() -> None:
 
 
 def test_light_beyond_the_critical_angle_never_reaches_a_pupil_on_the_glass() -> None:
-    camera = replace(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
+    camera = changed(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
     critical = math.tan(math.asin(1 / 1.34))
     points = np.array([[critical * f, 0.0, 1.0] for f in (0.9, 0.9999, 1.0001, 1.5)])
 
@@ -302,7 +304,7 @@ def test_light_beyond_the_critical_angle_never_reaches_a_pupil_on_the_glass() ->
 def test_a_lens_that_folds_gives_no_pixel_beyond_its_fold() -> None:
     # Barrel distortion r (1 - 0.3 r^2) turns back at r = 1.054 in air: what lies beyond would be
     # drawn over the frame a second time.
-    camera = replace(MANTA, k1=-0.3, port_distance_m=0.0, glass_thickness_m=0.0)
+    camera = changed(MANTA, k1=-0.3, port_distance_m=0.0, glass_thickness_m=0.0)
     for tangent, seen in ((1.0, True), (1.05, True), (1.06, False), (1.7, False)):
         angle = math.asin(math.sin(math.atan(tangent)) / 1.34)
         point = np.array([2.0 * math.tan(angle), 0.0, 2.0])
@@ -310,7 +312,7 @@ def test_a_lens_that_folds_gives_no_pixel_beyond_its_fold() -> None:
 
 
 def test_a_pixel_that_no_ray_reaches_has_none() -> None:
-    camera = replace(MANTA, k1=-0.3)  # distorted radii end at 0.703
+    camera = changed(MANTA, k1=-0.3)  # distorted radii end at 0.703
     reach = camera.fx_px * np.array([0.69, 0.71])
     pixels = np.stack([camera.cx_px + reach, np.full(2, camera.cy_px)], axis=1)
 
@@ -360,7 +362,7 @@ def test_the_border_goes_round_the_frame_once() -> None:
 
 
 def test_json_keeps_every_parameter() -> None:
-    camera = replace(MANTA, k1=0.1, p2=1e-4, normal=tilted(2.0, 40.0))
+    camera = changed(MANTA, k1=0.1, p2=1e-4, normal=tilted(2.0, 40.0))
     assert camera_from_json(camera.to_json()) == camera
 
 
@@ -374,7 +376,7 @@ def test_json_keeps_every_parameter() -> None:
 )  # fmt: skip
 def test_a_camera_that_cannot_be_is_refused(name: str, value: object) -> None:
     with pytest.raises(CalibrationError, match=name):
-        replace(MANTA, **{name: value})
+        changed(MANTA, **{name: value})
 
 
 def test_json_with_an_unknown_or_a_missing_key_is_refused() -> None:

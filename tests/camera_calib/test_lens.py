@@ -7,7 +7,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from camera_calib.lens import COEFFICIENTS, distort, distort_slopes, fold, radial, undistort
+from camera_calib.lenses.opencv import (
+    COEFFICIENTS,
+    distort,
+    distort_slopes,
+    fold,
+    radial,
+    undistort,
+)
 
 Array = NDArray[np.float64]
 

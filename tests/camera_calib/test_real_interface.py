@@ -15,11 +15,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.calibrate.clock import Lag, estimate_lags, pixel_speeds
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.lens import COEFFICIENTS
+from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.lenses.opencv import COEFFICIENTS
 from camera_calib.targets.detect import detect
 from camera_calib.targets.target import parse_target
 from camera_calib.triangulate import Triangulation
+from tests.cameras import changed
 from tests.oracles_interface import Tank, behind_interface
 
 Array = NDArray[np.float64]
@@ -46,7 +47,7 @@ def corners(path: Path) -> tuple[Array, Array]:
     return pixels + HALF_PX, points / 100.0
 
 
-def lens_in_air(folder: Path) -> FlatPortCamera:
+def lens_in_air(folder: Path) -> Camera:
     """OpenCV's rational model from the product's corners of a chessboard in air."""
     target = parse_target("chessboard 9x6 9.35mm")
     pictures = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.iterdir())]
@@ -70,7 +71,7 @@ def lens_in_air(folder: Path) -> FlatPortCamera:
         )
         if sharp.all():
             sharp = rms_px.ravel() < 3.0 * np.median(rms_px)
-    return FlatPortCamera(
+    return flat_port_camera(
         width_px=width,
         height_px=height,
         fx_px=matrix[0, 0],
@@ -90,7 +91,7 @@ def pose_of(turn_and_shift: Array) -> RigidTransform:
 class Aquarium:
     """The lens, the corners of the tank seen by each camera, and pairs of detections."""
 
-    lens: FlatPortCamera
+    lens: Camera
     corners: tuple[tuple[Array, Array], ...]
     published: dict[str, Array]
 
@@ -171,7 +172,7 @@ def test_cameras_stand_above_and_before_the_tank(tank: Tank) -> None:
     top, front = (pose.inv().translation for pose in tank.poses)
     np.testing.assert_allclose(top, [0.18, 0.075, -0.198], atol=0.012)
     np.testing.assert_allclose(front, [0.17, 0.371, 0.073], atol=0.012)
-    assert all(0.15 < camera.port_distance_m < 0.21 for camera in tank.cameras)
+    assert all(0.15 < camera.port.port_distance_m < 0.21 for camera in tank.cameras)
 
 
 def test_reprojection_error_is_below_the_published(aquarium: Aquarium, tank: Tank) -> None:
@@ -186,7 +187,7 @@ def test_reprojection_error_is_below_the_published(aquarium: Aquarium, tank: Tan
 
 
 def test_without_refraction_the_rays_miss_each_other(aquarium: Aquarium, tank: Tank) -> None:
-    in_air = replace(tank, cameras=tuple(replace(c, n_water=1.0) for c in tank.cameras))
+    in_air = replace(tank, cameras=tuple(changed(c, n_water=1.0) for c in tank.cameras))
 
     assert median_px(in_air.triangulate(aquarium.pixels)) > 10.0
 

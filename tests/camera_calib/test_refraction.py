@@ -1,15 +1,15 @@
 """Blocks of the kernels: a row's result is its own, whatever the other rows hold."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.refraction import air_tangent
+from camera_calib.camera import flat_port_camera
+from camera_calib.ports.flat import air_tangent
+from tests.cameras import changed
 
-CAMERA = FlatPortCamera(
+CAMERA = flat_port_camera(
     width_px=1600, height_px=1200, fx_px=1200.0, fy_px=1190.0, cx_px=790.0, cy_px=610.0,
     k1=-0.2, k2=0.1, p1=0.001, k3=-0.02, port_distance_m=0.02, glass_thickness_m=0.01,
     normal=(0.1, 0.0, math.sqrt(0.99)),
@@ -19,7 +19,7 @@ PORTS = [(0.0, 0.0), (0.0, 0.01), (1e-6, 0.005), (0.02, 0.01), (0.2, 0.2)]
 
 @pytest.mark.parametrize(("air_m", "glass_m"), PORTS)
 def test_projection_does_not_depend_on_the_neighbours(air_m: float, glass_m: float) -> None:
-    camera = replace(CAMERA, port_distance_m=air_m, glass_thickness_m=glass_m)
+    camera = changed(CAMERA, port_distance_m=air_m, glass_thickness_m=glass_m)
     rng = np.random.default_rng(1)
     points = rng.normal(size=(300, 3)) * 10.0 ** rng.uniform(-2, 2, (300, 1))
     points[[0, 140, 299]] = [[0.0, 0.0, 1.0], [np.nan, 0.0, 1.0], [0.0, 0.0, -1.0]]

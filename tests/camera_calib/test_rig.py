@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, CalibrationError
 from camera_calib.rig import Covariance, Rig, design_rig, read_rig, write_rig
+from tests.cameras import changed
 
 CONFIG = CameraConfig(position_body_m=(0.5, -0.06, 0.09))
 COVARIANCE = np.array([[0.09, 0.001], [0.001, 0.0001]])
@@ -25,7 +26,7 @@ def calibrated(rig: Rig) -> Rig:
     right = RigidTransform.from_components(
         [-0.1003, 0.0004, -0.0002], Rotation.from_rotvec(rng.normal(0, 0.01, 3))
     )
-    left = replace(rig.cameras["left"], k1=-0.05, p1=1e-4, normal=(0.01, 0.0, (1 - 1e-4) ** 0.5))
+    left = changed(rig.cameras["left"], k1=-0.05, p1=1e-4, normal=(0.01, 0.0, (1 - 1e-4) ** 0.5))
     return replace(
         rig,
         cameras={"left": left, "right": rig.cameras["right"]},
@@ -85,7 +86,7 @@ def test_a_rig_in_other_water_forgets_only_how_well_the_index_was_known(rig: Rig
 def test_a_rig_in_other_water_keeps_all_else(rig: Rig) -> None:
     pool = rig.in_water(1.333)
     assert {c.n_water for c in pool.cameras.values()} == {1.333}
-    assert replace(pool.cameras["left"], n_water=1.34) == rig.cameras["left"]
+    assert changed(pool.cameras["left"], n_water=1.34) == rig.cameras["left"]
     assert pool.baseline_m == rig.baseline_m
 
 

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,8 +6,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 from camera_calib.triangulate import nearest_to_rays, reproject, triangulate
+from tests.cameras import changed
 from tests.oracles_interface import (
     LENS,
     nearest_slowly,
@@ -20,7 +19,7 @@ from tests.oracles_interface import (
 
 Array = NDArray[np.float64]
 
-UNDERWATER = FlatPortCamera(
+UNDERWATER = flat_port_camera(
     width_px=3384,
     height_px=2710,
     fx_px=3388.0,
@@ -85,7 +84,7 @@ def test_exact_through_two_interfaces_at_right_angles(
 def test_agrees_with_the_slow_twin() -> None:
     rng = np.random.default_rng(2)
     points, poses = seafloor(rng, 12), stereo(3)
-    cameras = [UNDERWATER, replace(UNDERWATER, n_water=1.35), UNDERWATER]
+    cameras = [UNDERWATER, changed(UNDERWATER, n_water=1.35), UNDERWATER]
     pixels = reproject(cameras, poses, points) + rng.normal(0.0, 3.0, (3, 12, 2))
 
     found = triangulate(cameras, poses, pixels)

@@ -21,12 +21,13 @@ from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import vehicle_from_file
 from alice_survey.vehicle.log import write_vehicle_log
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig, design_rig, write_rig
 from camera_calib.targets.sheet import black_rectangles
 from camera_calib.targets.target import Target, parse_target
 from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
+from tests.cameras import changed
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
 from tests.oracles_targets import BLACK, WALL, WHITE, to_srgb
 
@@ -143,10 +144,10 @@ def calibrated_in_air(path: Path, kind: str) -> None:
 def smaller_rig(rig: Rig, width_px: int) -> Rig:
     """The rig of pictures that were shrunk to a width."""
 
-    def smaller_camera(camera: FlatPortCamera) -> FlatPortCamera:
+    def smaller_camera(camera: Camera) -> Camera:
         height = round(camera.height_px * width_px / camera.width_px)
         x, y = width_px / camera.width_px, height / camera.height_px
-        return replace(
+        return changed(
             camera, width_px=width_px, height_px=height, fx_px=camera.fx_px * x,
             fy_px=camera.fy_px * y, cx_px=camera.cx_px * x, cy_px=camera.cy_px * y,
         )  # fmt: skip

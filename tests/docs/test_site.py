@@ -104,7 +104,7 @@ def test_the_api_page_shows_each_public_name_with_all_its_fields(site: Path) -> 
         for name in names:
             assert f'id="{home}.{name}"' in page, name
     for field in ("fx_px", "k6", "port_distance_m", "n_water"):
-        assert f'id="camera_calib.flat_port.FlatPortCamera.{field}"' in page, field
+        assert f'id="camera_calib.camera.Camera.{field}"' in page, field
 
 
 def test_modules_that_the_theory_names_exist() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.executor import SERIAL
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 from camera_calib.rig import Rig, design_rig
 from tests.fuzz.target import Target
 
@@ -26,7 +26,7 @@ def _in_air() -> Rig:
     """Two cameras that formats without ports can hold."""
     from dataclasses import replace
 
-    lens = FlatPortCamera(
+    lens = flat_port_camera(
         width_px=640, height_px=480, fx_px=500.0, fy_px=501.0, cx_px=320.0, cy_px=240.0,
         k1=-0.1, k2=0.01, p1=1e-3, p2=-1e-3, n_water=1.0,
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """An independent check of the renderer: OpenCV finds corners where Fermat's principle puts them."""
 
-from dataclasses import asdict
-
 import cv2
 import numpy as np
 import pytest
@@ -64,7 +62,7 @@ def test_corners_are_where_fermat_puts_them(
     slope = (aim_px - [camera.cx_px, camera.cy_px]) / (1.34 * camera.fx_px)
     centre = turn.apply(board.outline.mean(axis=0))
     pose = RigidTransform.from_components(np.append(slope, 1.0) * distance_m - centre, turn)
-    truth = fermat_pixels(asdict(camera), pose.apply(board.corners))
+    truth = fermat_pixels(camera.to_json(), pose.apply(board.corners))
 
     by_opencv, by_fit = find(render_board(board, camera, pose, 12), board)
 
@@ -83,7 +81,7 @@ def _rms(misses: np.ndarray) -> float:
 
 def test_fermats_twin_magnifies_by_the_index_of_water() -> None:
     """Small angles, no port: focal length n f (Snell), to third order."""
-    camera = asdict(design_rig(CONFIG.camera, CONFIG.water, 4).cameras["left"])
+    camera = design_rig(CONFIG.camera, CONFIG.water, 4).cameras["left"].to_json()
     camera |= {"port_distance_m": 1e-6, "glass_thickness_m": 1e-9}
     point = np.array([[0.002, -0.001, 2.0]])
     pixel = fermat_pixels(camera, point)[0] - [camera["cx_px"], camera["cy_px"]]
@@ -97,7 +95,7 @@ def test_pool_views_fit_both_frames_and_vary(rig: Rig) -> None:
     for pose in poses:
         for name, camera in rig.cameras.items():
             cam_from_board = rig.cam_from_rig[name] * pose
-            pixels = fermat_pixels(asdict(camera), cam_from_board.apply(board.corners))
+            pixels = fermat_pixels(camera.to_json(), cam_from_board.apply(board.corners))
             assert np.all(pixels > 5)
             assert np.all(pixels < [camera.width_px - 5, camera.height_px - 5])
             grid = pixels.reshape(board.rows, board.columns, 2)
@@ -126,9 +124,11 @@ def test_the_rig_as_built_is_near_its_drawing_but_not_on_it() -> None:
         design = drawn.cameras[name]
         assert 0.0 < abs(camera.fx_px / design.fx_px - 1.0) < 0.0031
         assert 0.0 < abs(camera.cx_px - design.cx_px) <= 2.6  # 10 px at full resolution
-        assert 0.0 < abs(camera.port_distance_m - design.port_distance_m) < 0.00101
-        assert 0.0 < np.rad2deg(np.arccos(camera.normal[2])) < 0.43  # 0.3 degrees about each axis
-        assert -0.06 < camera.k1 < -0.04
+        assert 0.0 < abs(camera.port.port_distance_m - design.port.port_distance_m) < 0.00101
+        assert (
+            0.0 < np.rad2deg(np.arccos(camera.port.normal[2])) < 0.43
+        )  # 0.3 degrees about each axis
+        assert -0.06 < camera.lens.k1 < -0.04
     turn = built.cam_from_rig["right"].rotation.magnitude()
     assert 0.0 < np.rad2deg(turn) < 0.53  # 0.3 degrees about each axis
     assert 0.0 < abs(built.baseline_m - drawn.baseline_m) < 0.0003

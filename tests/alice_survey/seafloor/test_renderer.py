@@ -1,4 +1,4 @@
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from alice_survey.seafloor.renderer import (
 )
 from alice_survey.seafloor.terrain import Terrain, build_terrain
 from alice_survey.seafloor.texture import Texture
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from tests.oracles_seafloor import fermat_pixels, world_to_cam
@@ -119,7 +119,7 @@ def test_an_edge_on_the_floor_is_where_fermat_puts_it(
     points = np.zeros((41, 3))
     points[:, axis], points[:, 1 - axis] = at_m, np.linspace(-0.5, 0.5, 41)
     points[:, 2] = FLOOR_M
-    edge = fermat_pixels(asdict(CAMERA), world_to_cam(view, points))
+    edge = fermat_pixels(CAMERA.to_json(), world_to_cam(view, points))
     # North is up in the picture (bright above), east is right (bright on the right).
     for x, y in edge[5:-5]:
         if axis == 0:
@@ -199,7 +199,7 @@ def test_ranges_to_a_flat_floor_are_exact() -> None:
     np.testing.assert_allclose(view.apply(points)[:, 2], FLOOR_M, atol=3e-6)
     some = slice(None, None, 997)
     np.testing.assert_allclose(
-        fermat_pixels(asdict(CAMERA), points[some]), pixels.reshape(-1, 2)[some], atol=1e-5
+        fermat_pixels(CAMERA.to_json(), points[some]), pixels.reshape(-1, 2)[some], atol=1e-5
     )
 
 
@@ -255,7 +255,7 @@ def test_a_camera_that_sees_no_floor_is_refused() -> None:
 
 
 def test_a_lens_without_an_inverse_is_refused() -> None:
-    bent = FlatPortCamera(
+    bent = flat_port_camera(
         width_px=64, height_px=64, fx_px=30.0, fy_px=30.0, cx_px=32.0, cy_px=32.0, k1=-0.5
     )
     with pytest.raises(ImageError):

@@ -19,7 +19,7 @@ from alice_survey.seafloor.light import (
     beam_solid_angle_sr,
     camera_light,
 )
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.water import (
     ASYMMETRY,
     WaterOptics,
@@ -143,14 +143,14 @@ def test_backscatter_of_a_strobe_behind_the_camera_is_its_integral() -> None:
 
 
 @pytest.fixture(scope="module")
-def camera() -> FlatPortCamera:
-    return FlatPortCamera(
+def camera() -> Camera:
+    return flat_port_camera(
         width_px=211, height_px=169, fx_px=212.0, fy_px=212.0, cx_px=105.5, cy_px=84.5,
         port_distance_m=0.02, glass_thickness_m=0.01,
     )  # fmt: skip
 
 
-def test_the_table_of_backscatter_gives_the_integral_of_any_ray(camera: FlatPortCamera) -> None:
+def test_the_table_of_backscatter_gives_the_integral_of_any_ray(camera: Camera) -> None:
     imaging, water = ImagingConfig(), water_optics("III")
     body_from_cam = RigidTransform.from_components([0.55, -0.05, 0.05], BODY_FROM_NADIR_CAM)
     light = camera_light(camera, body_from_cam, imaging, water, 5.0)

@@ -1,11 +1,11 @@
 """The camera and the ports of the project's design study, and what it found."""
 
 import math
-from dataclasses import replace
 
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
+from tests.cameras import changed
 
-CAMERA = FlatPortCamera(
+CAMERA = flat_port_camera(
     width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,
 )  # fmt: skip
 STUDY = [
@@ -18,9 +18,9 @@ STUDY = [
 """Residual of a fixed warp at 2 m with 0.5 m of relief."""
 
 
-def behind_port(distance_mm: float, glass_mm: float, tilt_deg: float = 0.0) -> FlatPortCamera:
+def behind_port(distance_mm: float, glass_mm: float, tilt_deg: float = 0.0) -> Camera:
     tilt = math.radians(tilt_deg)
-    return replace(
+    return changed(
         CAMERA,
         port_distance_m=distance_mm / 1e3,
         glass_thickness_m=glass_mm / 1e3,

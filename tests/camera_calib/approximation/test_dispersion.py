@@ -1,7 +1,5 @@
 """Colours through a flat port: the design figures, and a rendered pattern made to fit again."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -20,10 +18,11 @@ from camera_calib.approximation.dispersion import (
     shifts_report,
     undisperse,
 )
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.water import CHANNELS
+from tests.cameras import changed
 
-ALICE = FlatPortCamera(
+ALICE = flat_port_camera(
     width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,
     port_distance_m=0.02, glass_thickness_m=0.01, n_water=1.3419,
 )  # fmt: skip
@@ -43,7 +42,7 @@ def pattern(points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.3 * value / np.abs(value).max()
 
 
-def render(cameras: dict[str, FlatPortCamera], range_m: float) -> np.ndarray:
+def render(cameras: dict[str, Camera], range_m: float) -> np.ndarray:
     """What each channel sees of the pattern: (rows, columns, 3)."""
     green = cameras["green"]
     pixels = green.pixel_centres()
@@ -87,23 +86,23 @@ def test_shifts_are_those_of_the_design_study() -> None:
 
 def test_from_fresh_water_to_the_sea_the_corner_moves() -> None:
     """15 px, at 20 C and at 24 C with 39 psu: why a calibration is carried by its index."""
-    pool = replace(ALICE, n_water=float(n_water(20.0, 0.0, 0.0)))
-    sea = replace(ALICE, n_water=float(n_water(24.0, 39.0, 0.0)))
+    pool = changed(ALICE, n_water=float(n_water(20.0, 0.0, 0.0)))
+    sea = changed(ALICE, n_water=float(n_water(24.0, 39.0, 0.0)))
     corner = np.array([[0.0, 0.0]])
     moved = np.linalg.norm(shift_px(sea, pool, corner, RANGE_M))
     assert moved == pytest.approx(15.0, abs=0.2)
 
 
 def test_green_keeps_what_was_calibrated() -> None:
-    camera = replace(ALICE, n_water=1.337, n_glass=1.49)
+    camera = changed(ALICE, n_water=1.337, n_glass=1.49)
     cameras = channel_cameras(camera, **SEA, glass="pmma", wavelengths_nm=[620, 540, 450])
 
     assert cameras["green"] == camera
     water, port = n_water(20, 35, 10, [620, 540, 450]), n_glass("pmma", [620, 540, 450])
     assert cameras["blue"].n_water - 1.337 == pytest.approx(water[2] - water[1], abs=1e-15)
     assert cameras["red"].n_water - 1.337 == pytest.approx(water[0] - water[1], abs=1e-15)
-    assert cameras["blue"].n_glass - 1.49 == pytest.approx(port[2] - port[1], abs=1e-15)
-    assert replace(cameras["blue"], n_water=1.337, n_glass=1.49) == camera
+    assert cameras["blue"].port.n_glass - 1.49 == pytest.approx(port[2] - port[1], abs=1e-15)
+    assert changed(cameras["blue"], n_water=1.337, n_glass=1.49) == camera
 
 
 @given(x=st.floats(0, 3384), y=st.floats(0, 2710), range_m=st.floats(0.5, 10))
@@ -120,7 +119,7 @@ def test_one_spot_of_the_scene_is_seen_by_all_channels(x: float, y: float, range
 
 
 def test_maps_are_exact_between_their_nodes() -> None:
-    camera = replace(
+    camera = changed(
         ALICE, k1=-0.12, k2=0.08, p1=3e-4, p2=-2e-4, normal=(0.05, -0.03, (1 - 0.0034) ** 0.5)
     )
     cameras = channel_cameras(camera, **SEA)
@@ -140,7 +139,7 @@ def test_maps_are_exact_between_their_nodes() -> None:
 def test_a_rendered_pattern_fits_again(dtype: type[np.uint8] | type[np.uint16]) -> None:
     """A quarter of the resolution, with a port far before the pupil and a tilt."""
     tilted = (0.03, 0.0, float(np.sqrt(1 - 0.03**2)))
-    camera = replace(ALICE, port_distance_m=0.05, glass_thickness_m=0.015, normal=tilted).reduced(4)
+    camera = changed(ALICE, port_distance_m=0.05, glass_thickness_m=0.015, normal=tilted).reduced(4)
     cameras = channel_cameras(camera, **LEVANT)
     full = np.iinfo(dtype).max
     picture = np.round(render(cameras, RANGE_M) * full).astype(dtype)
@@ -199,7 +198,7 @@ def test_what_cannot_be_corrected_is_refused() -> None:
         channel_maps(cameras, 0.02)
     with pytest.raises(ConfigError):
         channel_cameras(ALICE, **SEA, wavelengths_nm=[460.0, 530.0, 600.0])
-    folded = {name: replace(camera, k1=-2.0) for name, camera in cameras.items()}
+    folded = {name: changed(camera, k1=-2.0) for name, camera in cameras.items()}
     with pytest.raises(CalibrationError, match="2 m"):
         channel_maps(folded, RANGE_M)
 

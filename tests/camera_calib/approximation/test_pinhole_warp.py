@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, residual_px
-from camera_calib.flat_port import IN_AIR, FlatPortCamera
+from camera_calib.camera import Camera
+from camera_calib.lenses.fisheye import FisheyeLens
 from tests.camera_calib.approximation.ports import STUDY, behind_port
 
 DEPTHS_M = np.linspace(1.5, 2.5, 5)
@@ -47,7 +48,7 @@ def test_the_closed_form_finds_the_centre_that_a_search_finds(port: float, tilt_
 
 
 def test_a_camera_of_one_centre_is_its_own_pinhole() -> None:
-    camera = replace(behind_port(0, 0), n_water=1.0)
+    camera = behind_port(0, 0).in_air()
     warp = best_warp(camera, 1.5, 2.5)
 
     assert warp.centre_m == (0.0, 0.0, 0.0)
@@ -70,23 +71,10 @@ def test_the_pinhole_keeps_the_ground_resolution_on_the_axis_and_all_of_the_fram
 
 
 def test_a_wide_lens_is_cut_at_the_largest_growth() -> None:
-    """A barrel lens of 120 degrees: tan(60) is 1.65 times 60 degrees."""
-    half = np.deg2rad(60)
-    # Equidistant up to the seventh power of the angle: tan(a) (1 + k1 tan(a)^2 + ...) is near a.
-    angle = np.linspace(0.0, 1.2 * half, 200)
-    slope = np.tan(angle)
-    powers = np.stack([slope**3, slope**5, slope**7], axis=1)
-    ratio = np.linalg.lstsq(
-        np.concatenate([powers, -angle[:, None] * np.stack([slope**2, slope**4, slope**6], 1)], 1),
-        angle - slope,
-        rcond=None,
-    )[0]
-    k1, k2, k3, k4, k5, k6 = ratio.tolist()
-    focal = 500.0 / half
-    camera = FlatPortCamera(
-        width_px=1000, height_px=600, fx_px=focal, fy_px=focal, cx_px=500.0, cy_px=300.0,
-        k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6, **IN_AIR,
-    )  # fmt: skip
+    """An equidistant fisheye of 120 degrees: tan(60) is 1.65 times 60 degrees."""
+    focal = 500.0 / np.deg2rad(60)
+    lens = FisheyeLens(fx_px=focal, fy_px=focal, cx_px=500.0, cy_px=300.0)
+    camera = Camera(width_px=1000, height_px=600, lens=lens)
     warp = best_warp(camera, 1.5, 2.5)
 
     assert warp.pinhole.width_px == 1500

@@ -20,12 +20,13 @@ from camera_calib.approximation.residual import (
     colmap_pixels,
     residual,
 )
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from tests.camera_calib.approximation.ports import CAMERA, STUDY, behind_port
+from tests.cameras import changed
 
 
 @lru_cache
-def study(camera: FlatPortCamera, *, turned: bool = True) -> dict[str, Residual]:
+def study(camera: Camera, *, turned: bool = True) -> dict[str, Residual]:
     found = approximations(
         camera, 1.5, 2.5, distances_m=(1.5, 2.0, 2.5), working_range_m=2.0, turned=turned
     )
@@ -128,7 +129,7 @@ def test_colmap_itself_finds_the_same_residual(tilt_deg: float) -> None:
 
 
 def test_no_neighbour_of_a_fit_is_better() -> None:
-    camera = replace(behind_port(50, 15, 1.0), k1=-0.15, k2=0.06, p1=4e-4)
+    camera = changed(behind_port(50, 15, 1.0), k1=-0.15, k2=0.06, p1=4e-4)
     for one in approximations(camera, 1.0, 3.0)[2:4]:
         fit = one.stand_in
         for i in range(len(fit.params)):
@@ -149,8 +150,8 @@ def test_no_neighbour_of_a_fit_is_better() -> None:
 
 def test_a_camera_in_air_is_fitted_without_a_rest() -> None:
     """Without refraction its own lens is the answer."""
-    camera = replace(CAMERA, n_water=1.0, k1=-0.12, k2=0.07, p1=5e-4, p2=-3e-4, k3=-0.01)
-    simple = replace(camera, k3=0.0)
+    camera = changed(CAMERA, n_water=1.0, k1=-0.12, k2=0.07, p1=5e-4, p2=-3e-4, k3=-0.01)
+    simple = changed(camera, k3=0.0)
     found = {one.stand_in.model: one for one in approximations(simple, 0.5, 3.0)}
     assert found["OPENCV"].max_px < 1e-2
     np.testing.assert_allclose(
@@ -211,4 +212,4 @@ def test_an_impossible_interval_is_refused(near_m: float, far_m: float) -> None:
 
 def test_a_lens_that_does_not_reach_the_corners_is_refused() -> None:
     with pytest.raises(CalibrationError):
-        approximations(replace(behind_port(20, 10), k1=-2.0), 1.5, 2.5)
+        approximations(changed(behind_port(20, 10), k1=-2.0), 1.5, 2.5)

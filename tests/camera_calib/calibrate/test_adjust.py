@@ -24,11 +24,11 @@ from camera_calib.calibrate.start import locate_all
 from camera_calib.calibration import TargetView
 from camera_calib.freedom import (
     HELD,
-    PORT,
     Freedom,
     Prior,
     intrinsics,
     of_cameras,
+    of_ports,
     pose_names,
     value,
 )
@@ -45,12 +45,13 @@ from tests.camera_calib.calibration_scenes import (
     with_pixels,
     with_values,
 )
+from tests.cameras import changed
 
 NOISE_PX = 0.1
 TRIALS = 60
 TRUTH = built_rig()
 LENS = of_cameras(TRUTH, intrinsics("opencv5"))
-PORTS = (*of_cameras(TRUTH, PORT), *pose_names(TRUTH))
+PORTS = (*of_ports(TRUTH), *pose_names(TRUTH))
 
 
 @pytest.mark.slow
@@ -181,8 +182,8 @@ def test_without_noise_everything_is_recovered_from_the_design() -> None:
     for name, camera in TRUTH.cameras.items():
         other = solved.rig.cameras[name]
         assert other.fx_px == pytest.approx(camera.fx_px, abs=1e-5)
-        assert other.port_distance_m == pytest.approx(camera.port_distance_m, abs=1e-8)
-        np.testing.assert_allclose(other.normal, camera.normal, atol=1e-8)
+        assert other.port.port_distance_m == pytest.approx(camera.port.port_distance_m, abs=1e-8)
+        np.testing.assert_allclose(other.port.normal, camera.port.normal, atol=1e-8)
     assert solved.rig.baseline_m == pytest.approx(TRUTH.baseline_m, abs=1e-9)
 
 
@@ -277,7 +278,7 @@ def test_a_port_at_the_pupil_stays_there() -> None:
         poses = board_poses(flat, 8, rng)
         views = views_of(flat, poses, 0.5, rng)
         found = adjust(views, BOARD, TRUTH, poses, Freedom(free=PORTS)).rig
-        ends += [camera.port_distance_m for camera in found.cameras.values()]
+        ends += [camera.port.port_distance_m for camera in found.cameras.values()]
     assert min(ends) == 0.0
     assert 0.0 < max(ends) < 0.01
 
@@ -291,7 +292,7 @@ def test_what_no_view_shows_is_named() -> None:
 
 def test_a_zoom_and_the_index_of_water_without_a_port_cannot_be_distinguished() -> None:
     thin = replace(
-        TRUTH, cameras={n: replace(c, port_distance_m=0.0, glass_thickness_m=0.0, k1=0.0, k2=0.0,
+        TRUTH, cameras={n: changed(c, port_distance_m=0.0, glass_thickness_m=0.0, k1=0.0, k2=0.0,
                                    k3=0.0, p1=0.0, p2=0.0, n_water=1.0001)
                         for n, c in TRUTH.cameras.items()},
     )  # fmt: skip

@@ -21,14 +21,15 @@ from camera_calib.calibrate.solve import (
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import TargetView
 from camera_calib.freedom import (
-    PORT,
     Freedom,
     Prior,
     intrinsics,
     of_cameras,
+    of_ports,
     pose_names,
     value,
 )
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,
@@ -111,7 +112,9 @@ def test_from_air_to_ports_with_the_prior() -> None:
 def test_from_water_alone_is_the_same_minimum_as_from_the_design() -> None:
     views = scene(TRUTH, 20, seed=6)
     blank = {
-        name: blank_camera(size, n_water=1.34, port_distance_m=0.04, glass_thickness_m=0.01)
+        name: blank_camera(
+            size, "opencv5", FlatPort(n_water=1.34, port_distance_m=0.04, glass_thickness_m=0.01)
+        )
         for name, size in SIZES.items()
     }
     alone = calibrate_in_water_alone(views, BOARD, blank)
@@ -314,7 +317,7 @@ def test_a_blurred_picture_is_named() -> None:
 @pytest.mark.parametrize(
     ("work", "named"),
     [
-        (lambda v: calibrate(v[:3], BOARD, TRUTH, Freedom(free=of_cameras(TRUTH, PORT))), "3 view"),
+        (lambda v: calibrate(v[:3], BOARD, TRUTH, Freedom(free=of_ports(TRUTH))), "3 view"),
         (lambda v: calibrate_in_air(v[:3], BOARD, SIZES), "3 view"),
         (
             lambda v: calibrate(
@@ -324,7 +327,7 @@ def test_a_blurred_picture_is_named() -> None:
             "right",
         ),
         (lambda v: calibrate_through_ports(v, BOARD, DESIGN, "prior"), "covariance"),
-        (lambda v: calibrate_in_air(v, BOARD, SIZES, "fisheye"), "fisheye"),
+        (lambda v: calibrate_in_air(v, BOARD, SIZES, "mirror"), "mirror"),
         (
             lambda v: calibrate_in_air(
                 [with_pixels(view, ("left", "right")[i % 2], None) for i, view in enumerate(v)],

@@ -163,8 +163,8 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
     for name, camera in rig.cameras.items():
         true = truth.cameras[name]
         assert camera.n_water == 1.34
-        assert camera.port_distance_m == pytest.approx(true.port_distance_m, abs=2e-3)
-        assert np.arccos(np.dot(camera.normal, true.normal)) < np.deg2rad(0.2)
+        assert camera.port.port_distance_m == pytest.approx(true.port.port_distance_m, abs=2e-3)
+        assert np.arccos(np.dot(camera.port.normal, true.port.normal)) < np.deg2rad(0.2)
         assert camera.fx_px == pytest.approx(true.fx_px, abs=0.3)
     assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5e-5)
 
@@ -280,7 +280,7 @@ def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
         ({"glass_mm": 10.0}, "--glass"),
         ({"water": True}, "--glass"),
         ({"water": True, "known": "prior", "glass_mm": 10.0}, "--start"),
-        ({"lens": "fisheye"}, "fisheye"),
+        ({"lens": "mirror"}, "mirror"),
         ({"target": "chessboard"}, "chessboard"),
         ({"start": Path("nowhere.json")}, "nowhere.json"),
         ({"left": "none*.png"}, "none"),

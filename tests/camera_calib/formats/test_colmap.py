@@ -3,7 +3,6 @@
 import json
 import struct
 import tempfile
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,19 +13,21 @@ from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.colmap import read_colmap, write_colmap, write_flatport
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
+from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
+from tests.cameras import changed
 from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, fault_of, rigs
 
-AIR = FlatPortCamera(
+AIR = flat_port_camera(
     width_px=1920, height_px=1200, fx_px=705.5, fy_px=705.25, cx_px=963.5, cy_px=604.75,
     n_water=1.0,
 )  # fmt: skip
-WET = replace(
+WET = changed(
     AIR, port_distance_m=0.025, glass_thickness_m=0.01, n_glass=1.49, n_water=1.333,
     normal=(0.6, 0.0, 0.8),
 )  # fmt: skip
@@ -35,10 +36,10 @@ WET = replace(
 fault = partial(fault_of, read_colmap)
 
 
-def pair(camera: FlatPortCamera) -> Rig:
+def pair(camera: Camera) -> Rig:
     turn = Rotation.from_rotvec([0.01, -0.02, 0.03])
     return Rig(
-        cameras={"left": camera, "right": replace(camera, fx_px=710.5, k1=-0.125)},
+        cameras={"left": camera, "right": changed(camera, fx_px=710.5, k1=-0.125)},
         cam_from_rig={
             "left": RigidTransform.identity(),
             "right": RigidTransform.from_components([-0.1, 0.001, 0.002], turn),
@@ -156,7 +157,7 @@ def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
     assert "3, 7" in fault(path)
     rig = read_colmap(path, ReadOptions(camera="3"))
     (camera,) = rig.cameras.values()
-    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.k1) == (500, 500, 320, -0.1)
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.lens.k1) == (500, 500, 320, -0.1)
     assert camera.n_water == 1.0
 
 
@@ -217,7 +218,7 @@ def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
     )
     assert detect(text).name == "flatport"
     dry = read_colmap(text, ReadOptions(camera="2")).cameras["2"]
-    assert (dry.n_water, dry.port_distance_m) == (1.0, 0.0)
+    assert dry.port == NO_PORT
     binary = tmp_path / "cameras.bin"
     lens = (1, 9, 8, 5.0, 6.0, 4.0, 3.0)
     port = (0, 0.0, 0.0, 1.0, 0.02, 0.01, 1.0, 1.5, 1.33)
@@ -235,7 +236,7 @@ def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text("1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1.25 1.5 1.5\n")
     camera = read_colmap(path, ReadOptions()).cameras["1"]
-    assert (camera.n_glass, camera.n_water) == (1.2, 1.2)
+    assert (camera.port.n_glass, camera.n_water) == (1.2, 1.2)
 
 
 def test_faults_name_file_and_line(tmp_path: Path) -> None:

@@ -16,20 +16,21 @@ from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.cli.main import main
 from camera_calib.formats.convert import Conversion, convert, in_water
 from camera_calib.formats.registry import FORMATS, detect
-from camera_calib.formats.rigs import ReadOptions, only, renamed, with_port
+from camera_calib.formats.rigs import ReadOptions, in_air, only, renamed, with_port
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
+from tests.cameras import changed
 from tests.strategies_formats import assert_same_geometry, covariance_of
 
 DESIGN = design_rig(CameraConfig(), WaterConfig(), scale=4)
 BENT = replace(
     DESIGN,
     cameras={
-        "left": replace(DESIGN.cameras["left"], k1=-0.1, p2=1e-3),
-        "right": replace(DESIGN.cameras["right"], k1=-0.12),
+        "left": changed(DESIGN.cameras["left"], k1=-0.1, p2=1e-3),
+        "right": changed(DESIGN.cameras["right"], k1=-0.12),
     },
 )
 FULL = replace(BENT, covariance=covariance_of(BENT, np.random.default_rng(4)))
-IN_AIR = with_port(BENT, {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": 1.0})
+IN_AIR = in_air(BENT)
 CHANNELS = {
     "opencv": "o.xml",
     "colmap": "model",
@@ -82,7 +83,7 @@ def test_a_covariance_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) 
 )  # fmt: skip
 def test_distortion_is_never_lost(tmp_path: Path, name: str, term: str) -> None:
     rig = replace(IN_AIR, cameras={**IN_AIR.cameras})
-    cameras = {**rig.cameras, "right": replace(rig.cameras["right"], **{term: 1e-3})}
+    cameras = {**rig.cameras, "right": changed(rig.cameras["right"], **{term: 1e-3})}
     write_rig(tmp_path / "rig.json", replace(rig, cameras=cameras))
     shown = refused(tmp_path / "rig.json", tmp_path / CHANNELS[name], target_format=name)
     assert term in shown and "right" in shown
@@ -154,7 +155,7 @@ def test_centres_follow_the_fit_onto_the_vehicle() -> None:
 
 def test_a_camera_in_air_fits_itself(tmp_path: Path) -> None:
     """The way of a rational lens into Kalibr: the best radtan, at a stated price."""
-    rational = replace(IN_AIR.cameras["left"], k4=0.02)
+    rational = changed(IN_AIR.cameras["left"], k4=0.02)
     rig = only(replace(IN_AIR, cameras={**IN_AIR.cameras, "left": rational}), "left")
     write_rig(tmp_path / "rig.json", rig)
     _, data = convert_files(

@@ -12,17 +12,18 @@ from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
+from tests.cameras import changed
 from tests.strategies_formats import POINTS_RIG, fault_of, rigs
 
-AIR = FlatPortCamera(
+AIR = flat_port_camera(
     width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=320.25, cy_px=241.0, n_water=1.0
 )
 STEREO = Rig(
-    cameras={"left": AIR, "right": replace(AIR, fx_px=540.0, k1=-0.1)},
+    cameras={"left": AIR, "right": changed(AIR, fx_px=540.0, k1=-0.1)},
     cam_from_rig={
         "left": RigidTransform.identity(),
         "right": RigidTransform.from_components([-0.1, 0, 0], Rotation.from_rotvec([0, 0.01, 0])),
@@ -92,8 +93,8 @@ def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> 
     assert (camera.width_px, camera.height_px) == (640, 480)
     assert camera.fx_px == camera.fy_px == 535.91573396163199
     assert camera.cx_px == pytest.approx(342.28315473308373 + 0.5, abs=1e-12)
-    assert (camera.k1, camera.k3) == (-0.26637260909660682, 0.23839153080878486)
-    assert (camera.k4, camera.s1, camera.n_water) == (0.0, 0.0, 1.0)
+    assert (camera.lens.k1, camera.lens.k3) == (-0.26637260909660682, 0.23839153080878486)
+    assert (camera.lens.k4, camera.lens.s1, camera.n_water) == (0.0, 0.0, 1.0)
 
 
 def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_path: Path) -> None:
@@ -113,7 +114,7 @@ def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_
     )
     assert rig.baseline_m == pytest.approx(3.33 * 0.025, abs=1e-15)
     assert list(rig.cameras) == ["left", "right"]
-    assert rig.cameras["right"].k1 == -0.16916358306948096
+    assert rig.cameras["right"].lens.k1 == -0.16916358306948096
 
 
 def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
@@ -129,14 +130,19 @@ def test_other_common_keys_are_understood(tmp_path: Path, matrix: str, k: str) -
     text = GOOD.replace("camera_matrix", matrix) + f"{k}: [ -0.1, 0.02, 0.001, -0.002 ]\n"
     (camera,) = read_opencv(write(tmp_path / "a.yml", text), ReadOptions()).cameras.values()
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (530, 531, 320, 240)
-    assert (camera.k1, camera.k2, camera.p1, camera.p2) == (-0.1, 0.02, 0.001, -0.002)
+    assert (camera.lens.k1, camera.lens.k2, camera.lens.p1, camera.lens.p2) == (
+        -0.1,
+        0.02,
+        0.001,
+        -0.002,
+    )
 
 
 def test_a_tilted_sensor_is_refused_and_a_level_one_read(tmp_path: Path) -> None:
     coefficients = "distortion_coefficients: [" + ", ".join(["0.001"] * 12)
     level = write(tmp_path / "a.yml", GOOD + coefficients + ", 0., 0. ]\n")
     (camera,) = read_opencv(level, ReadOptions()).cameras.values()
-    assert (camera.k6, camera.s4) == (0.001, 0.001)
+    assert (camera.lens.k6, camera.lens.s4) == (0.001, 0.001)
     shown = fault(tmp_path / "b.yml", GOOD + coefficients + ", 0.01, 0. ]\n")
     assert "distortion_coefficients" in shown
 

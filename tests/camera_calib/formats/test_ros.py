@@ -13,11 +13,12 @@ from hypothesis import assume, given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.ros import read_ros, write_ros
 from camera_calib.rig import Rig
+from tests.cameras import changed
 from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, fault_of, rigs
 
 SAMPLE = """\
@@ -42,11 +43,11 @@ projection_matrix:
   cols: 4
   data: [4827.94, 0, 1223.5, 0, 0, 4835.62, 1024.5, 0, 0, 0, 1, 0]
 """
-AIR = FlatPortCamera(
+AIR = flat_port_camera(
     width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=320.25, cy_px=241.0, n_water=1.0
 )
 PAIR = Rig(
-    cameras={"left": AIR, "right": replace(AIR, k1=-0.1)},
+    cameras={"left": AIR, "right": changed(AIR, k1=-0.1)},
     cam_from_rig={
         "left": RigidTransform.identity(),
         "right": RigidTransform.from_translation([-0.1, 0.0, 0.0]),
@@ -151,7 +152,12 @@ def test_the_sample_of_the_wiki_is_read(tmp_path: Path) -> None:
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (
         4827.94, 4835.62, 1224.0, 1025.0,
     )  # fmt: skip
-    assert (camera.k1, camera.k2, camera.p1, camera.p2) == (-0.41527, 0.31874, -0.00197, 7.1e-04)
+    assert (camera.lens.k1, camera.lens.k2, camera.lens.p1, camera.lens.p2) == (
+        -0.41527,
+        0.31874,
+        -0.00197,
+        7.1e-04,
+    )
 
 
 def test_the_reference_is_the_camera_without_baseline(tmp_path: Path) -> None:
@@ -169,7 +175,7 @@ def test_half_a_pair_says_that_the_other_half_is_left_out(
 ) -> None:
     write_ros(tmp_path / "pair", PAIR)
     rig = read_ros(tmp_path / "pair" / "right.yaml", ReadOptions())
-    assert rig.cameras["right"].k1 == -0.1
+    assert rig.cameras["right"].lens.k1 == -0.1
     assert "baseline" in capsys.readouterr().err
 
 

@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import ConfigError
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m, glass_z_m
+from camera_calib.camera import Camera
+from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.fov.table import FovChoices, fov_table
 from camera_calib.rig import design_rig
+from tests.cameras import changed
 from tests.oracles_fov import traced_blur_px
 
 PORT = CameraConfig()
@@ -19,8 +20,8 @@ CAMERA = design_rig(PORT, WaterConfig(n_water=1.34)).cameras["left"]
 LENS = FocusedLens(focal_m=12.5e-3, f_number=4.0, pixel_m=3.69e-6, focus_m=1.5)
 
 
-def tilted(camera: FlatPortCamera, x: float, y: float) -> FlatPortCamera:
-    return replace(camera, normal=(x, y, math.sqrt(1.0 - x * x - y * y)))
+def tilted(camera: Camera, x: float, y: float) -> Camera:
+    return changed(camera, normal=(x, y, math.sqrt(1.0 - x * x - y * y)))
 
 
 @given(
@@ -75,14 +76,14 @@ def test_line_images_are_where_neighbouring_rays_meet(
     Rays across the plane of incidence are turned about the axis and meet on it: at r / sin a along
     the ray. Rays in it meet at the distance dr/da cos a from the pupil.
     """
-    camera = replace(CAMERA, n_water=n_water, port_distance_m=port_m, glass_thickness_m=glass_m)
+    camera = changed(CAMERA, n_water=n_water, port_distance_m=port_m, glass_thickness_m=glass_m)
     a = math.radians(half_angle_deg)
 
     def reach(angle: float) -> float:
         sine = math.sin(angle)
         return (
             port_m * math.tan(angle)
-            + glass_m * math.tan(math.asin(sine / camera.n_glass))
+            + glass_m * math.tan(math.asin(sine / camera.port.n_glass))
             + altitude_m * math.tan(math.asin(sine / n_water))
         )
 
@@ -111,7 +112,7 @@ def test_blur_is_that_of_the_apertures_edge_rays(
     radial = away / length if length > 0 else np.array([1.0, 0.0])
     across = np.array([-radial[1], radial[0]])
     for altitude_m in (1.2, 2.0, 3.5):
-        point = CAMERA.at_depth(pixel, glass_z_m(CAMERA) + altitude_m)[0]
+        point = CAMERA.at_depth(pixel, CAMERA.front_cam[2] + altitude_m)[0]
         ours = lens.blur_px(apparent_depths(CAMERA, pixel).at(altitude_m))[0]
         traced = [traced_blur_px(CAMERA, lens, point, along) for along in (radial, across)]
         assert ours == pytest.approx(traced, rel=0.002, abs=0.002)
@@ -121,7 +122,7 @@ def test_a_tilted_port_is_traced_too() -> None:
     """Along and across the plane that holds the ray and the port's normal."""
     camera = tilted(CAMERA, 0.08, 0.0)
     pixel = np.array([[camera.width_px * 1.0, camera.cy_px]])
-    point = camera.at_depth(pixel, glass_z_m(camera) + 2.0)[0]
+    point = camera.at_depth(pixel, camera.front_cam[2] + 2.0)[0]
     ours = LENS.blur_px(apparent_depths(camera, pixel).at(2.0))[0]
     traced = [
         traced_blur_px(camera, LENS, point, along)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import ConfigError
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera
 from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.fov.table import (
     MATCH_SIGMA_PX,
@@ -21,6 +21,7 @@ from camera_calib.fov.table import (
     rig_fov_table,
 )
 from camera_calib.rig import Rig, design_rig
+from tests.cameras import changed
 from tests.oracles_camera import project_by_shortest_path
 from tests.oracles_fov import triangulated_depth_sigma_m
 
@@ -28,7 +29,7 @@ NO_PORT = CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0)
 PORT = CameraConfig()
 
 
-def left(config: CameraConfig, n_water: float) -> FlatPortCamera:
+def left(config: CameraConfig, n_water: float) -> Camera:
     return design_rig(config, WaterConfig(n_water=n_water)).cameras["left"]
 
 
@@ -38,7 +39,7 @@ def crooked_rig() -> Rig:
     normal /= np.linalg.norm(normal)
     rig = design_rig(PORT, WaterConfig())
     cameras = {
-        name: replace(camera, k1=-0.12, k2=0.08, p1=1e-3, normal=tuple(normal.tolist()))
+        name: changed(camera, k1=-0.12, k2=0.08, p1=1e-3, normal=tuple(normal.tolist()))
         for name, camera in rig.cameras.items()
     }
     poses = {
@@ -87,10 +88,28 @@ def test_without_a_port_water_magnifies_a_pinhole_n_times(
     )
 
 
+@given(lens_mm=st.floats(3.0, 50.0), altitude_m=st.floats(0.3, 10.0))
+def test_the_sure_rectangle_lies_between_the_corners(lens_mm: float, altitude_m: float) -> None:
+    """Its corners are where the picture's corners see the floor, by three tangents."""
+    row = fov_table([lens_mm], [altitude_m], 1.34, PORT)[0]
+    halves = np.array([3384, 2710]) * 3.69e-3 / 2
+    sine = math.sin(math.atan(np.hypot(*halves) / lens_mm))
+    layers = (
+        (PORT.port.port_distance_m, 1.0),
+        (PORT.port.glass_thickness_m, 1.52),
+        (altitude_m, 1.34),
+    )
+    reach = sum(thick * math.tan(math.asin(sine / n)) for thick, n in layers)
+    sure = (row.sure_horizontal_m, row.sure_vertical_m)
+    assert sure == pytest.approx(2 * reach * halves / np.hypot(*halves), rel=1e-9)
+    assert sure[0] < row.horizontal_m and sure[1] < row.vertical_m
+
+
 def test_in_air_it_is_a_pinhole() -> None:
     row = fov_table([12.5], [2.0], 1.0, NO_PORT)[0]
 
     assert row.horizontal_m == pytest.approx(2 * 3384 * 3.69e-3 / 12.5)
+    assert row.sure_horizontal_m == pytest.approx(row.horizontal_m)
     assert row.pixel_centre_mm == pytest.approx(row.pixel_mean_mm)
     assert row.pixel_corner_mm == pytest.approx(row.pixel_centre_mm)
     assert row.diagonal_water_deg == pytest.approx(row.diagonal_air_deg)
@@ -133,7 +152,7 @@ def test_depth_precision_is_the_scatter_of_triangulated_points(
 ) -> None:
     rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
     row = rig_fov_table(rig, [altitude_m], PORT)[0]
-    floor_z = 0.03 * rig.cameras["left"].normal[2] + altitude_m
+    floor_z = 0.03 * rig.cameras["left"].port.normal[2] + altitude_m
     scatter_m = triangulated_depth_sigma_m(
         rig, floor_z, MATCH_SIGMA_PX, 20_000, np.random.default_rng(4)
     )
@@ -162,11 +181,11 @@ def test_a_focused_point_is_sharp_where_its_rays_seem_to_come_from() -> None:
 def test_overlap_is_the_share_of_random_spots_that_both_cameras_see(kind: str) -> None:
     rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
     first, second = rig.cameras["left"], rig.cameras["right"]
-    floor_z = 0.03 * first.normal[2] + 1.0
+    floor_z = 0.03 * first.port.normal[2] + 1.0
     rng = np.random.default_rng(7)
     spots = np.column_stack([rng.uniform(-0.6, 0.6, (60_000, 2)), np.full(60_000, floor_z)])
 
-    def sees(camera: FlatPortCamera, points: Any) -> Any:
+    def sees(camera: Camera, points: Any) -> Any:
         pixels = camera.project(points)
         return np.all((pixels >= 0) & (pixels <= [camera.width_px, camera.height_px]), axis=1)
 
@@ -205,7 +224,7 @@ def test_a_calibrated_rig_is_seen_with_its_distortion_and_tilt() -> None:
     assert abs(row.horizontal_m / straight.horizontal_m - 1) > 0.01
 
     ends = np.array([[0.0, 1355.0], [3384.0, 1355.0]])
-    spots = camera.at_depth(ends, 0.03 * camera.normal[2] + 2.0)
+    spots = camera.at_depth(ends, 0.03 * camera.port.normal[2] + 2.0)
     assert row.horizontal_m == pytest.approx(float(np.linalg.norm(spots[1] - spots[0])))
     for end, spot in zip(ends, spots, strict=True):
         np.testing.assert_allclose(project_by_shortest_path(camera, spot), end, atol=1e-5)

@@ -8,6 +8,7 @@ from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.calibration import TargetView
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.homography import homography_residuals, homography_test
+from tests.cameras import changed
 from tests.oracles_report import (
     DESIGN,
     SQUARE_M,
@@ -56,7 +57,7 @@ def test_an_error_of_the_pose_hardly_matters() -> None:
 
 def test_residuals_are_those_of_opencvs_homography() -> None:
     """For a pinhole without port or lens, where both minimise the same pixels."""
-    bare = replace(DESIGN.cameras["left"], port_distance_m=0.0, glass_thickness_m=0.0, n_water=1.0)
+    bare = changed(DESIGN.cameras["left"], port_distance_m=0.0, glass_thickness_m=0.0, n_water=1.0)
     rig = replace(DESIGN, cameras={"left": bare, "right": bare})
     made = synthetic_views(rig, 2, 0.3, 5)
     pixels = made.views[0].pixels["left"]

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.flat_port import PARAMETERS
 from camera_calib.freedom import POSE
 from camera_calib.judge.judgement import anchors_cam
 from camera_calib.judge.uncertainty import (
@@ -24,6 +23,8 @@ from camera_calib.judge.uncertainty import (
     stereo_sigma,
     taken_up,
 )
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance
 from camera_calib.triangulate import reproject, triangulate
 from tests.oracles_report import (
@@ -34,6 +35,8 @@ from tests.oracles_report import (
     usual,
     with_one_error,
 )
+
+PARAMETERS = (*OpenCVLens.parameters, *FlatPort.parameters)
 
 POINTS = np.array([[0.1, -0.2, 1.0], [-0.3, 0.25, 1.7], [0.02, 0.01, 0.8]])
 

@@ -8,7 +8,6 @@ from alice_survey.base.artefacts import write_csv
 from alice_survey.base.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
-from missions.values.footprint import glass_point_cam
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
 
@@ -16,7 +15,7 @@ from missions.values.plan_file import Plan
 def log_of(flown: Stations, plan: Plan, rig: Rig) -> BelievedNavigation:
     """The navigation log of a body whose left port's glass is at the stations."""
     attitude, ones = flown.attitude_rad, np.ones(len(flown))
-    lever = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
+    lever = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
     glass = np.column_stack([flown.glass_ne, plan.seafloor_depth_m - flown.altitude_m])
     assert flown.time_s is not None
     return BelievedNavigation(

@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 
 from missions.exposure.footprints import pixel_on_floor_m
 from missions.exposure.trigger import blur_rates, exposure_for_rate, exposure_rows
-from missions.values.footprint import glass_point_cam
 from tests.missions.exposure.surveys import survey
 from tests.oracles_imaging import moved_pixel
 
@@ -65,7 +64,7 @@ def test_motion_agrees_with_pixels_before_and_after(
     rates = blur_rates(rig, config.plan, height)
     camera = rig.cameras["left"]
     pixels = np.array([[0.0, 0.0], [3384.0, 2710.0], [0.0, 2710.0], [1692.0, 1355.0]])
-    spots = camera.at_depth(pixels, glass_point_cam(camera)[2] + height)
+    spots = camera.at_depth(pixels, camera.front_cam[2] + height)
     turn = np.deg2rad([roll, roll, yaw])
     short = 1e-4
     signs = [(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]

@@ -14,6 +14,7 @@ from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift
+from tests.cameras import changed
 from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
@@ -105,7 +106,7 @@ def test_a_camera_in_plain_air_is_left_as_it_is(tmp_path: Path) -> None:
     """Zero distance, zero thickness: a pinhole. The same code, and no pixel moves."""
     scene = make_scene(lines=1, stations=4, points=300, noise_px=0.2, port_distance_m=0.02)
     cameras = {
-        name: replace(camera, port_distance_m=0.0, glass_thickness_m=0.0, n_water=1.0)
+        name: changed(camera, port_distance_m=0.0, glass_thickness_m=0.0, n_water=1.0)
         for name, camera in scene.rig.cameras.items()
     }
     scene = replace(scene, rig=replace(scene.rig, cameras=cameras))

@@ -32,6 +32,7 @@ from reconstruct.mapping.rig_refinement import (
 )
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid
+from tests.cameras import changed
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
@@ -62,7 +63,7 @@ def modelled(scene: Scene, rig: Rig, folder: Path) -> tuple[Mapped, Observations
 def nearer(rig: Rig, by_m: float) -> Rig:
     """The same with shorter ports."""
     cameras = {
-        name: replace(c, port_distance_m=c.port_distance_m - by_m)
+        name: changed(c, port_distance_m=c.port.port_distance_m - by_m)
         for name, c in rig.cameras.items()
     }
     return replace(rig, cameras=cameras)
@@ -147,7 +148,7 @@ def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> N
     right = scene.rig.cameras["right"]
     wrong = replace(
         scene.rig,
-        cameras={**scene.rig.cameras, "right": replace(right, cx_px=right.cx_px + 1.0)},
+        cameras={**scene.rig.cameras, "right": changed(right, cx_px=right.cx_px + 1.0)},
         covariance=Covariance(parameters=names, matrix=covariance),
     )
     mapped, seen = modelled(scene, wrong, tmp_path)
@@ -209,7 +210,7 @@ def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     written = read_rig(tmp_path / "rig.json")
     said = json.loads((tmp_path / "port.json").read_text())
     assert said["parameters"][0] == "left.port_distance_m"
-    assert written.cameras["left"].port_distance_m == pytest.approx(said["after"][0])
+    assert written.cameras["left"].port.port_distance_m == pytest.approx(said["after"][0])
     left = refined.warps["left"]
     assert left.camera == written.cameras["left"]
     assert np.diag(said["correlation"]) == pytest.approx(1.0)

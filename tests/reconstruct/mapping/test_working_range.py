@@ -15,6 +15,7 @@ from reconstruct.mapping.working_range import (
     warp_record,
 )
 from reconstruct.matching.features import Features, save_features
+from tests.cameras import changed
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 
@@ -69,8 +70,7 @@ def test_cameras_without_refraction_need_no_distance(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=2, points=10)
     paths = features_of(scene, tmp_path)
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
-    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": 1.0}
-    cameras = {name: replace(camera, **bare) for name, camera in scene.rig.cameras.items()}
+    cameras = {name: camera.in_air() for name, camera in scene.rig.cameras.items()}
     rig = replace(scene.rig, cameras=cameras)
     found = find_distances(blind, paths, rig, given_m=None, ratio=0.8, executor=SERIAL)
     assert 0 < found.near_m < found.far_m and found.source == "no refraction"
@@ -99,7 +99,7 @@ def test_a_pinhole_that_stands_in_badly_is_warned_of_in_one_line() -> None:
     usual = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     good = best_warp(camera, usual.near_m, usual.far_m)
     close = WorkingDistances(near_m=0.15, far_m=2.0, source="test")
-    wide = replace(camera, port_distance_m=0.1, fx_px=0.3 * camera.fx_px, fy_px=0.3 * camera.fy_px)
+    wide = changed(camera, port_distance_m=0.1, fx_px=0.3 * camera.fx_px, fy_px=0.3 * camera.fy_px)
     bad = best_warp(wide, close.near_m, close.far_m)
 
     assert 1e-5 < warp_record(good, usual).contraction < 0.01
@@ -116,11 +116,6 @@ def test_a_pinhole_that_stands_in_badly_is_warned_of_in_one_line() -> None:
 
 
 def test_a_camera_of_one_centre_has_nothing_to_warn_of() -> None:
-    camera = replace(
-        make_scene(lines=1, stations=1, points=10).rig.cameras["left"],
-        port_distance_m=0.0,
-        glass_thickness_m=0.0,
-        n_water=1.0,
-    )
+    camera = make_scene(lines=1, stations=1, points=10).rig.cameras["left"].in_air()
     found = warp_record(best_warp(camera, 0.1, 10.0), None)
     assert (found.offset_m, found.contraction, found.cut_share) == (0.0, 0.0, 0.0)

@@ -88,7 +88,7 @@ def test_footprints_have_the_size_of_the_exact_port_camera() -> None:
     level = [replace(r, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0) for r in scene.records[:2]]
     left, right = footprints(level, scene.rig, DATUM)
     camera = scene.rig.cameras["left"]
-    depth = ALTITUDE_M + camera.port_distance_m + camera.glass_thickness_m
+    depth = ALTITUDE_M + camera.port.port_distance_m + camera.port.glass_thickness_m
     corners = camera.at_depth(camera.border(8), depth)
     across, along = np.ptp(corners[:, 0]), np.ptp(corners[:, 1])
     south, west, north, east = left.bounds

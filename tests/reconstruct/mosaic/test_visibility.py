@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import Camera, flat_port_camera
 from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
 from reconstruct.mosaic.visibility import (
     Ground,
@@ -25,7 +25,7 @@ from reconstruct.views.range_shift import range_shift
 from tests.oracles_mosaic import lanczos_at
 
 TILT = np.deg2rad(2.0)
-CAMERA = FlatPortCamera(
+CAMERA = flat_port_camera(
     width_px=846, height_px=676, fx_px=848.0, fy_px=848.5, cx_px=424.0, cy_px=340.0,
     k1=-0.045, k2=0.02, p1=2e-4, p2=-1e-4, port_distance_m=0.1, glass_thickness_m=0.02,
     normal=(np.sin(TILT), 0.0, np.cos(TILT)),
@@ -58,7 +58,7 @@ def relief() -> tuple[DemGrid, np.ndarray]:
     return grid, height.astype(np.float32)
 
 
-def misses_px(sight: SeenCells, camera: FlatPortCamera, view: View) -> np.ndarray:
+def misses_px(sight: SeenCells, camera: Camera, view: View) -> np.ndarray:
     """How far from the exact pixel of a camera each cell of the relief is looked up."""
     grid, height = relief()
     columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)

@@ -8,7 +8,7 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ImageError, WorkspaceError
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
-from camera_calib.flat_port import FlatPortCamera
+from camera_calib.camera import flat_port_camera
 from reconstruct.mapping.database import colmap_pinhole
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 320, 240
 
 
 def port_lens() -> PinholeWarp:
-    camera = FlatPortCamera(
+    camera = flat_port_camera(
         width_px=WIDTH, height_px=HEIGHT, fx_px=300.0, fy_px=301.0, cx_px=158.0, cy_px=121.0,
         k1=-0.15, k2=0.05, p1=1e-3, p2=-5e-4, port_distance_m=0.02, glass_thickness_m=0.01,
         normal=(np.sin(0.02), 0.0, np.cos(0.02)),

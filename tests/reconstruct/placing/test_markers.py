@@ -13,7 +13,6 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import write_manifest
 from camera_calib.approximation.pinhole_warp import best_warp
-from camera_calib.flat_port import FlatPortCamera
 from reconstruct.placing.control_file import read_picks
 from reconstruct.placing.markers import find_markers, survey_control
 from reconstruct.placing.picked_points import Camera, find_spots
@@ -39,7 +38,7 @@ def corners_ned() -> Array:
     return np.column_stack([plan, np.full(4, DEPTH_M)])
 
 
-def picture(camera: FlatPortCamera, ned_from_cam: RigidTransform, dictionary: int) -> np.ndarray:
+def picture(camera: Camera, ned_from_cam: RigidTransform, dictionary: int) -> np.ndarray:
     """A grey sea floor with the marker, every pixel's ray traced through the port."""
     paper = np.full((800, 800), 120.0, np.float32)  # twice the marker's side, 400 texels
     paper[120:680, 120:680] = 220.0

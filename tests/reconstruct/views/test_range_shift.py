@@ -17,15 +17,15 @@ from reconstruct.views.range_shift import (
     no_shift,
     range_shift,
 )
+from tests.cameras import changed
 
 
 def warp_of(distance_m: float, tilt_deg: float) -> PinholeWarp:
-    from dataclasses import replace
 
     camera = design_rig(CameraConfig(port_distance_m=distance_m), WaterConfig(), scale=4)
     left = camera.cameras[camera.reference]
     tilt = np.deg2rad(tilt_deg)
-    return best_warp(replace(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
+    return best_warp(changed(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 2.0])

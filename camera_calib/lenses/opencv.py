@@ -1,19 +1,24 @@
-"""OpenCV's lens distortion with all its named terms, its derivatives and its inverse.
+"""A pinhole with OpenCV's lens distortion and all its named terms.
 
     x = u L + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2
     y = v L + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2
     L = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3),  r2 = u^2 + v^2
 
 (u, v) are tangents of the ray in air, (x, y) what the sensor sees of them. The source is OpenCV's
-documentation of `calib3d`. Coefficients come as one vector in the order of `COEFFICIENTS`.
+documentation of `calib3d`. Coefficients come as one vector in the order of `COEFFICIENTS`; kernels
+of whole rays take `OpenCVLens.values`.
 """
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from alice_survey.base.compiled import compiled, compiled_ieee
 from alice_survey.base.frames import Array
+from camera_calib.lenses.values import FOCAL_AND_CENTRE, LensValues
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """The same order as OpenCV's vector of distortion coefficients."""
@@ -22,6 +27,38 @@ _NEWTON_STEPS = 60
 _BISECTIONS = 60
 _SETTLED = 1e-9
 """After a step of Newton's method this short in a tangent, the remaining error is its square."""
+_BLOCK = 128
+_COUNT = 4 + len(COEFFICIENTS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenCVLens(LensValues):
+    """A pinhole with the distortion terms of OpenCV."""
+
+    model: ClassVar[str] = "opencv"
+    kind: ClassVar[int] = 0
+    parameters: ClassVar[tuple[str, ...]] = (*FOCAL_AND_CENTRE, *COEFFICIENTS)
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    """k4 to k6 divide: OpenCV's rational model."""
+    s1: float = 0.0
+    s2: float = 0.0
+    s3: float = 0.0
+    s4: float = 0.0
+    """s1 to s4: OpenCV's thin prism."""
+
+    @cached_property
+    def values(self) -> Array:
+        """(17,) focal lengths, centre, distortion, and the squared tangent at the fold."""
+        terms = np.array([getattr(self, name) for name in self.parameters])
+        return np.append(terms, fold(terms[4:]))
 
 
 def fold(k: Array) -> float:
@@ -151,3 +188,74 @@ def undistort_block(x: Array, y: Array, k: Array, fold2: float, u: Array, v: Arr
     for j in range(len(x)):
         if not math.isfinite(u[j]):
             u[j], v[j] = undistort(x[j], y[j], k, fold2)
+
+
+@compiled_ieee
+def opencv_pixels(rays: Array, lens: Array, pixels: Array) -> None:
+    """Pixels (B, 2), to be filled in, of rays in air (B, 3) of any length."""
+    fx, fy, cx, cy, fold2 = lens[0], lens[1], lens[2], lens[3], lens[_COUNT]
+    k = lens[4:_COUNT]
+    for j in range(len(rays)):
+        pixels[j, 0] = pixels[j, 1] = math.nan
+        dz = rays[j, 2]
+        if not dz > 0.0:
+            continue
+        u, v = rays[j, 0] / dz, rays[j, 1] / dz
+        if u * u + v * v < fold2:
+            x, y = distort(u, v, k)
+            pixels[j, 0], pixels[j, 1] = fx * x + cx, fy * y + cy
+
+
+@compiled_ieee
+def opencv_rays(pixels: Array, lens: Array, rays: Array) -> None:
+    """Unit rays in air (B, 3), to be filled in, that pixels (B, 2) see; at most 128 at a time."""
+    count = len(pixels)
+    x, y, u, v = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    for j in range(count):
+        x[j] = (pixels[j, 0] - lens[2]) / lens[0]
+        y[j] = (pixels[j, 1] - lens[3]) / lens[1]
+    undistort_block(x[:count], y[:count], lens[4:_COUNT], lens[_COUNT], u[:count], v[:count])
+    for j in range(count):
+        length = math.sqrt(u[j] * u[j] + v[j] * v[j] + 1.0)
+        rays[j, 0], rays[j, 1], rays[j, 2] = u[j] / length, v[j] / length, 1.0 / length
+
+
+@compiled_ieee
+def opencv_slopes(
+    ray: tuple[float, float, float], lens: Array, by_ray: Array, by_lens: Array
+) -> tuple[float, float]:
+    """The pixel of one ray in air, NaN without one; fill in its slopes.
+
+    Args:
+        ray: of any length.
+        lens: `OpenCVLens.values`.
+        by_ray: (2, 3) to be filled in.
+        by_lens: (2, 16) to be filled in.
+    """
+    dx, dy, dz = ray
+    u, v = dx / dz, dy / dz
+    if not (dz > 0.0 and u * u + v * v < lens[_COUNT]):
+        return math.nan, math.nan
+    fx, fy, k = lens[0], lens[1], lens[4:_COUNT]
+    x, y, x_u, x_v, y_u, y_v = distort_slopes(u, v, k)
+    by_ray[0, 0], by_ray[0, 1] = fx * x_u / dz, fx * x_v / dz
+    by_ray[1, 0], by_ray[1, 1] = fy * y_u / dz, fy * y_v / dz
+    for row in range(2):
+        by_ray[row, 2] = -(u * by_ray[row, 0] + v * by_ray[row, 1])
+    r2 = u * u + v * v
+    ratio, _, bottom = radial(r2, k)
+    by_lens[:, :] = 0.0
+    by_lens[0, 0], by_lens[1, 1], by_lens[0, 2], by_lens[1, 3] = x, y, 1.0, 1.0
+    xu, yv = fx * u, fy * v
+    one, two, three = r2 / bottom, r2 * r2 / bottom, r2 * r2 * r2 / bottom
+    by_lens[0, 4], by_lens[1, 4] = xu * one, yv * one
+    by_lens[0, 5], by_lens[1, 5] = xu * two, yv * two
+    by_lens[0, 6], by_lens[1, 6] = fx * 2.0 * u * v, fy * (r2 + 2.0 * v * v)
+    by_lens[0, 7], by_lens[1, 7] = fx * (r2 + 2.0 * u * u), fy * 2.0 * u * v
+    by_lens[0, 8], by_lens[1, 8] = xu * three, yv * three
+    by_lens[0, 9], by_lens[1, 9] = -xu * ratio * one, -yv * ratio * one
+    by_lens[0, 10], by_lens[1, 10] = -xu * ratio * two, -yv * ratio * two
+    by_lens[0, 11], by_lens[1, 11] = -xu * ratio * three, -yv * ratio * three
+    by_lens[0, 12], by_lens[0, 13] = fx * r2, fx * r2 * r2
+    by_lens[1, 14], by_lens[1, 15] = fy * r2, fy * r2 * r2
+    return fx * x + lens[2], fy * y + lens[3]

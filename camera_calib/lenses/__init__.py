@@ -1,0 +1,1 @@
+"""Lenses in air: one file each."""

@@ -1,0 +1,64 @@
+"""What all lenses have: focal lengths and a centre."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Self
+
+from pydantic import ConfigDict
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+
+FOCAL_AND_CENTRE = ("fx_px", "fy_px", "cx_px", "cy_px")
+_MOST_PX = 1e7
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensValues:
+    """A lens in air: rays of any length to pixels and back, by the kernels of its file."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
+
+    model: ClassVar[str]
+    """Its name in files."""
+    kind: ClassVar[int]
+    """Its number in kernels."""
+    parameters: ClassVar[tuple[str, ...]]
+    """Names of its parameters, ordered as its slopes."""
+
+    falloff: ClassVar[float] = 4.0
+    """Power of the cosine off the axis with which its pictures darken."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not math.isfinite(getattr(self, field.name)):
+                raise CalibrationError(
+                    f"camera: {field.name} = {getattr(self, field.name)} is not finite"
+                )
+        if min(self.fx_px, self.fy_px) <= 0:
+            raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
+        if max(self.fx_px, self.fy_px) > _MOST_PX:
+            raise CalibrationError(f"camera: a size or focal length exceeds {_MOST_PX:g} px")
+
+    @property
+    def values(self) -> Array:
+        """Its parameters, and what else its kernels need."""
+        raise NotImplementedError
+
+    def parameter(self, name: str) -> float:
+        """The value of one of `parameters`."""
+        return float(getattr(self, name))
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The same lens with some parameters set to other values."""
+        return replace(self, **{name: float(value) for name, value in values.items()})
+
+    def reduced(self, scale: float) -> Self:
+        """The same lens with pixels `scale` times as large."""
+        return replace(self, **{name: getattr(self, name) / scale for name in FOCAL_AND_CENTRE})

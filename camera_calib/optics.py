@@ -1,0 +1,130 @@
+"""Points to pixels and back through any lens and port: the one entry for all kernels.
+
+A camera comes as one value, `Optics`: the kind of its lens with the lens's values, and the kind of
+its port with the port's. A new lens or port is one file, and one branch in each function here.
+Rows without a solution are NaN.
+"""
+
+import math
+
+import numpy as np
+
+from alice_survey.base.compiled import compiled, compiled_ieee
+from alice_survey.base.frames import Array
+from camera_calib.lenses.fisheye import FisheyeLens, fisheye_pixels, fisheye_rays, fisheye_slopes
+from camera_calib.lenses.opencv import OpenCVLens, opencv_pixels, opencv_rays, opencv_slopes
+from camera_calib.lenses.values import LensValues
+from camera_calib.ports.dome import DomePort, dome_leave, dome_ray, dome_rays, dome_slopes
+from camera_calib.ports.flat import FlatPort, flat_leave, flat_ray, flat_rays, flat_slopes
+from camera_calib.ports.none import NoPort, bare_leave, bare_rays
+from camera_calib.ports.values import PortValues
+
+Optics = tuple[int, Array, int, Array]
+"""Kind and values of a lens, kind and values of a port."""
+LENSES: dict[str, type[LensValues]] = {lens.model: lens for lens in (OpenCVLens, FisheyeLens)}
+PORTS: dict[str, type[PortValues]] = {port.shape: port for port in (NoPort, FlatPort, DomePort)}
+_FISHEYE = FisheyeLens.kind
+_FLAT, _DOME = FlatPort.kind, DomePort.kind
+_BLOCK = 128
+"""Points at a time: loops over a block that do not branch become vector instructions."""
+
+
+@compiled_ieee
+def _air_rays(points: Array, port_kind: int, port: Array, rays: Array) -> None:
+    if port_kind == _FLAT:
+        flat_rays(points, port, rays)
+    elif port_kind == _DOME:
+        dome_rays(points, port, rays)
+    else:
+        bare_rays(points, rays)
+
+
+@compiled_ieee
+def _pixels(rays: Array, lens_kind: int, lens: Array, pixels: Array) -> None:
+    if lens_kind == _FISHEYE:
+        fisheye_pixels(rays, lens, pixels)
+    else:
+        opencv_pixels(rays, lens, pixels)
+
+
+@compiled(nogil=True, error_model="numpy")
+def project(points: Array, optics: Optics) -> Array:
+    """(N, 2) pixels of (N, 3) points."""
+    lens_kind, lens, port_kind, port = optics
+    pixels = np.empty((points.shape[0], 2))
+    rays = np.empty((_BLOCK, 3))
+    for first in range(0, points.shape[0], _BLOCK):
+        block = points[first : first + _BLOCK]
+        _air_rays(block, port_kind, port, rays)
+        _pixels(rays[: len(block)], lens_kind, lens, pixels[first : first + _BLOCK])
+    return pixels
+
+
+@compiled(nogil=True, error_model="numpy")
+def unproject(pixels: Array, optics: Optics) -> tuple[Array, Array]:
+    """Points on the outer surface and unit directions in water, (N, 3) each, of (N, 2) pixels."""
+    lens_kind, lens, port_kind, port = optics
+    points = np.empty((pixels.shape[0], 3))
+    directions = np.empty((pixels.shape[0], 3))
+    air = np.empty((_BLOCK, 3))
+    for first in range(0, pixels.shape[0], _BLOCK):
+        block = pixels[first : first + _BLOCK]
+        rays = air[: len(block)]
+        if lens_kind == _FISHEYE:
+            fisheye_rays(block, lens, rays)
+        else:
+            opencv_rays(block, lens, rays)
+        starts, ways = points[first : first + _BLOCK], directions[first : first + _BLOCK]
+        if port_kind == _FLAT:
+            flat_leave(rays, port, starts, ways)
+        elif port_kind == _DOME:
+            dome_leave(rays, port, starts, ways)
+        else:
+            bare_leave(rays, starts, ways)
+    return points, directions
+
+
+@compiled(nogil=True, error_model="numpy")
+def project_jacobian(
+    points: Array, optics: Optics, of_lens: int, of_port: int
+) -> tuple[Array, Array, Array]:
+    """Pixels (N, 2) with their slopes by point (N, 2, 3) and by parameter (N, 2, P).
+
+    Args:
+        points: (N, 3).
+        optics: of the camera.
+        of_lens: parameters of the lens, which come first in P.
+        of_port: parameters of the port.
+    """
+    lens_kind, lens, port_kind, port = optics
+    count = points.shape[0]
+    pixels = np.empty((count, 2))
+    by_point = np.empty((count, 2, 3))
+    by_parameter = np.empty((count, 2, of_lens + of_port))
+    by_ray = np.empty((2, 3))
+    for i in range(count):
+        point = points[i]
+        turn = 0.0
+        if port_kind == _FLAT:
+            dx, dy, dz, turn = flat_ray(point, port)
+        elif port_kind == _DOME:
+            dx, dy, dz, turn = dome_ray(point, port)
+        else:
+            dx, dy, dz = point[0], point[1], point[2]
+        ray = dx, dy, dz
+        by_lens, by_port = by_parameter[i, :, :of_lens], by_parameter[i, :, of_lens:]
+        if lens_kind == _FISHEYE:
+            x, y = fisheye_slopes(ray, lens, by_ray, by_lens)
+        else:
+            x, y = opencv_slopes(ray, lens, by_ray, by_lens)
+        pixels[i, 0], pixels[i, 1] = x, y
+        if not math.isfinite(x):
+            by_point[i, :, :] = math.nan
+            by_parameter[i, :, :] = math.nan
+        elif port_kind == _FLAT:
+            flat_slopes(point, turn, port, by_ray, by_point[i], by_port)
+        elif port_kind == _DOME:
+            dome_slopes(point, turn, port, by_ray, by_point[i], by_port)
+        else:
+            by_point[i, :, :] = by_ray
+    return pixels, by_point, by_parameter

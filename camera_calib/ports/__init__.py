@@ -1,0 +1,1 @@
+"""Ports between the lens and the water: one file each."""
