@@ -9,9 +9,11 @@ import pycolmap
 import pytest
 
 from alice_survey.base.frames import Array
+from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
+from reconstruct.mapping.working_range import WorkingDistances, warp_record
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift
 from tests.cameras import changed
@@ -66,6 +68,36 @@ def test_without_noise_nothing_is_left_of_the_port(
     warp_only = adjust_freely(start[0])
     _, _, bent, _ = pupils_and_points(warp_only, scene)
     assert rigid_rms(bent, true_points) > 0.05e-3, "what was to be corrected was there"
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "corrected_px", "contraction"),
+    [
+        ((0.0, 0.0, 0.0), 0.0, 0.0),
+        ((0.0, 0.0, 0.005), 1.8e-4, 2.3e-6),
+        ((0.012, -0.01, 0.02), 0.026, 1.7e-4),
+    ],
+)
+def test_without_noise_nothing_is_left_of_a_dome(
+    offset_m: tuple[float, float, float], corrected_px: float, contraction: float, tmp_path: Path
+) -> None:
+    """A dome of 50 mm before a pupil at its centre, 5 mm behind it, and strongly off it."""
+    x, y, z = offset_m
+    dome = DomePort(
+        dome_x_m=x, dome_y_m=y, dome_z_m=z, outer_radius_m=0.05, glass_thickness_m=0.005
+    )
+    scene = make_scene(lines=2, stations=4, points=900, port=dome, scale=1, relief_m=0.3)
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
+    mapped, found = refract(start, seen, tmp_path)
+    pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
+    assert rigid_rms(points, true_points) < 0.01e-3
+    assert rigid_rms(pupils, true_pupils) < 0.01e-3
+    assert found.settled
+    assert found.corrected_px == pytest.approx(corrected_px, rel=0.2)
+    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
+    record = warp_record(warps["left"], distances)
+    assert record.contraction == pytest.approx(contraction, rel=0.2)
 
 
 @pytest.mark.parametrize(("port_m", "tilt_deg"), PORTS)

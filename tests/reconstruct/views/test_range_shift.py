@@ -1,5 +1,6 @@
 """The shift with distance that a warp to one pinhole leaves."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,9 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.lenses.values import LensValues
+from camera_calib.ports.dome import DomePort
 from camera_calib.rig import design_rig
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import (
@@ -28,16 +32,34 @@ def warp_of(distance_m: float, tilt_deg: float) -> PinholeWarp:
     return best_warp(changed(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 2.0])
-@pytest.mark.parametrize("distance_m", [0.0, 0.02, 0.1])
-def test_the_shift_is_exact_at_every_distance(distance_m: float, tilt_deg: float) -> None:
+def behind_dome(x_m: float, y_m: float, z_m: float, lens: LensValues | None = None) -> PinholeWarp:
+    left = warp_of(0.02, 0.0).camera
+    dome = DomePort(
+        dome_x_m=x_m, dome_y_m=y_m, dome_z_m=z_m, outer_radius_m=0.05, glass_thickness_m=0.005
+    )
+    return best_warp(replace(left, port=dome, lens=left.lens if lens is None else lens), 1.5, 2.5)
+
+
+FISHEYE = FisheyeLens(fx_px=450.0, fy_px=450.0, cx_px=420.0, cy_px=340.0, k1=-0.02)
+WARPS = {
+    **{f"flat {d} m, {t} deg": warp_of(d, t) for d in (0.0, 0.02, 0.1) for t in (0.0, 2.0)},
+    "centred dome": behind_dome(0.0, 0.0, 0.0),
+    "dome 5 mm ahead": behind_dome(0.0, 0.0, 0.005),
+    "dome off its axis": behind_dome(0.012, -0.01, 0.02),
+    "fisheye behind a dome": behind_dome(0.003, 0.0, -0.004, FISHEYE),
+}
+
+
+@pytest.mark.parametrize("warp", WARPS.values(), ids=WARPS)
+def test_the_shift_is_exact_at_every_distance(warp: PinholeWarp) -> None:
     """Against points traced through the port: the field is linear in inverse depth."""
-    warp = warp_of(distance_m, tilt_deg)
     shift = range_shift(warp)
     rng = np.random.default_rng(3)
-    size = [warp.camera.width_px, warp.camera.height_px]
-    taken = rng.uniform(0.02, 0.98, (500, 2)) * size
+    taken = rng.uniform(0.02, 0.98, (500, 2)) * warp.size_px
     warped = warp.to_pinhole(taken)
+    inside = ((warped > 0) & (warped < warp.pinhole.size_px)).all(axis=1)
+    assert inside.mean() > 0.9
+    taken, warped = taken[inside], warped[inside]
     for depth_m in (0.6, 1.5, 2.0, 2.5, 6.0):
         spots = warp.camera.at_depth(taken, depth_m)
         points = warp.pinhole_from_cam.apply(spots)
@@ -49,6 +71,14 @@ def test_the_shift_is_exact_at_every_distance(distance_m: float, tilt_deg: float
         moved = np.abs(ideal - warped).max()
         np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=2e-3 * moved + 1e-9)
         np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=3e-3 * moved + 1e-9)
+
+
+def test_rays_through_a_dome_that_is_centred_on_the_pupil_meet_there() -> None:
+    warp = behind_dome(0.0, 0.0, 0.0)
+    np.testing.assert_allclose(warp.centre_m, 0.0, atol=1e-12)
+    assert warp.largest_offset_m == 0.0
+    assert not range_shift(warp).nodes.any()
+    assert warp.pinhole.fx_px == pytest.approx(warp.camera.fx_px)
 
 
 def test_without_a_port_nothing_shifts() -> None:
