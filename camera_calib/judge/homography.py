@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
-from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.calibration import Calibration, stack_views
-from camera_calib.camera import Camera
 from camera_calib.judge.fit_quality import (
     Profile,
     largest_radius_px,
@@ -88,11 +87,11 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     if not usable:
         return None
     depths = np.concatenate([poses[v].apply(points[kept[v]])[:, 2] for v in usable])
-    pinhole = best_pinhole(model, float(depths.min()), float(depths.max()))
+    warp = best_warp(model, float(depths.min()), float(depths.max()))
     fits = []
     for v in usable:
         at = np.nonzero(kept[v])[0]
-        stay, residual, freedom = _fit_view(model, pinhole, points[at], measured[v, at], poses[v])
+        stay, residual, freedom = _fit_view(warp, points[at], measured[v, at], poses[v])
         kept[v, at[~stay]] = False
         fits.append((residual, freedom))
     pixels = np.concatenate([measured[v, kept[v]] for v in usable])
@@ -119,8 +118,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
 
 
 def _fit_view(
-    camera: Camera,
-    pinhole: VirtualPinhole,
+    warp: PinholeWarp,
     target_points: Array,
     pixels: Array,
     cam_from_target: RigidTransform,
@@ -133,7 +131,7 @@ def _fit_view(
     stay = np.ones(len(pixels), dtype=bool)
     while True:
         residuals, freedom = homography_residuals(
-            camera, pinhole, target_points[stay], pixels[stay], cam_from_target
+            warp, target_points[stay], pixels[stay], cam_from_target
         )
         length = np.linalg.norm(residuals, axis=1)
         outlying = length > _OUTLYING * float(np.median(length))
@@ -153,8 +151,7 @@ def _is_flat(points: Array) -> bool:
 
 
 def homography_residuals(
-    camera: Camera,
-    pinhole: VirtualPinhole,
+    warp: PinholeWarp,
     target_points: Array,
     pixels: Array,
     cam_from_target: RigidTransform,
@@ -162,8 +159,7 @@ def homography_residuals(
     """Fit one view's homography, least squares in the camera's own pixels.
 
     Args:
-        camera: its lens and port are undone.
-        pinhole: the ideal camera that looks instead.
+        warp: the camera, whose lens and port are undone, and the pinhole that looks instead.
         target_points: (N, 3) on one plane, N > 4.
         pixels: (N, 2) as measured.
         cam_from_target: gives the distances of the points.
@@ -175,7 +171,7 @@ def homography_residuals(
     depth = cam_from_target.apply(target_points)[:, 2]
 
     def ideal(at: Array) -> Array:
-        return pinhole.project(camera.at_depth(at, depth))
+        return warp.to_pinhole(at, depth)
 
     seen = ideal(pixels)
     # How ideal pixels move with measured ones, whose noise is the same everywhere.

@@ -18,7 +18,6 @@ from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import LinearObservations
-from reconstruct.views.lens import Lens
 
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
@@ -73,7 +72,7 @@ def choose_pixels(
 
     Args:
         mapped: exact model; picture i of `seen` has the id i + 1.
-        seen: keypoints as warped by the model's lenses.
+        seen: keypoints.
         names: of the cameras.
         frames: ids of the stations, ascending.
     """
@@ -82,8 +81,7 @@ def choose_pixels(
     taken = np.empty((len(found.point), 2))
     for n, number in enumerate(found.pictures.tolist()):
         rows, record = found.of(n), seen.images[number - 1]
-        lens: Lens = mapped.lenses[record.camera]
-        taken[rows] = lens.from_pinhole(seen.pixels[number - 1][found.keypoint[rows]])
+        taken[rows] = seen.taken[number - 1][found.keypoint[rows]]
         camera[rows] = names.index(record.camera)
         station[rows] = np.searchsorted(frames, model.images[number].frame_id)
     every = -(-len(found.point) // _MOST_OBSERVATIONS)
@@ -115,7 +113,7 @@ def start_state(
         frames: ids of the stations, ascending.
         ids: of the points.
     """
-    model, pinhole_from_cam = mapped.model, mapped.lenses[names[0]].pinhole_from_cam
+    model, pinhole_from_cam = mapped.model, mapped.warps[names[0]].pinhole_from_cam
     reference = rig.cam_from_rig[names[0]]
     poses = [
         as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames

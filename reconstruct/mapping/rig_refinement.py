@@ -25,12 +25,13 @@ from alice_survey.base.errors import CalibrationError, ReconstructionError, warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PortRecord
 from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, at_bound, moved, pose_names, value
 from camera_calib.rig import Covariance, Rig, write_rig
 from reconstruct.mapping.arrays import Indices, cross_matrices, first_pictures, frames_of
 from reconstruct.mapping.bundle import move_points
-from reconstruct.mapping.database import Observations, rigid3d
+from reconstruct.mapping.database import Observations, colmap_pinhole, rigid3d
 from reconstruct.mapping.exact_observations import (
     Pixels,
     RigState,
@@ -51,9 +52,7 @@ from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.robust import cauchy_cost, cauchy_weights, sigma_of, variance_of
 from reconstruct.mapping.working_range import WorkingDistances
-from reconstruct.matching.matches import as_seen
 from reconstruct.matching.pairs import positions_ned
-from reconstruct.views.lens import Lens, flat_port_lens
 
 _PORT_SIGMAS = {
     "port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005,
@@ -449,12 +448,11 @@ def refine_rig(
         if settings.refine_port or settings.refine_rig == "on":
             raise
         return f"rig as calibrated: {error}"
-    lenses: dict[str, Lens] = {
-        name: flat_port_lens(fit.rig.cameras[name], distances.near_m, distances.far_m)
-        for name in names
+    warps = {
+        name: best_warp(fit.rig.cameras[name], distances.near_m, distances.far_m) for name in names
     }
-    mapped, seen = on_rig(mapped, seen, fit, lenses)
-    adjust = NavigationAdjuster(seen.images, fit.rig, lenses, datum)
+    mapped, seen = on_rig(mapped, seen, fit, warps)
+    adjust = NavigationAdjuster(seen.images, fit.rig, warps, datum)
     poses = {name: fit.rig.cam_from_rig[name] for name in names}
     mapped, convergence = refract(mapped, seen, folder, adjust, poses, near=True)
     PortRecord.save(folder / "port.json", fit.to_json())
@@ -465,22 +463,21 @@ def refine_rig(
 
 
 def on_rig(
-    mapped: Mapped, seen: Observations, fit: RigFit, lenses: dict[str, Lens]
+    mapped: Mapped, seen: Observations, fit: RigFit, warps: Mapping[str, PinholeWarp]
 ) -> tuple[Mapped, Observations]:
-    """A model and its keypoints for refined lenses, as warped."""
+    """A model and its keypoints for the pinholes of a refined rig."""
     model = pycolmap.Reconstruction(mapped.model)
     names = list(seen.cameras)
-    pixels = [
-        as_seen(mapped.lenses[record.camera].from_pinhole(rows), lenses[record.camera])
-        for record, rows in zip(seen.images, seen.pixels, strict=True)
-    ]
+    pinholes = {name: colmap_pinhole(warps[name].pinhole) for name in names}
+    seen = replace(seen, warps=warps, cameras=pinholes)
     pinhole_from_rig: dict[str, RigidTransform] = {
-        name: lenses[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
+        name: warps[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
     }
     rig_from_reference = pinhole_from_rig[names[0]].inv()
     for number, name in enumerate(names, 1):
         camera = model.cameras[number]
-        camera.params = lenses[name].pinhole.colmap.params
+        camera.width, camera.height = warps[name].pinhole.size_px
+        camera.params = pinholes[name].params
         if number > 1:
             for rig in model.rigs.values():
                 rig.set_sensor_from_rig(
@@ -488,24 +485,18 @@ def on_rig(
                 )
     frames = frames_of(model).tolist()
     for frame, station in zip(frames, fit.stations, strict=True):
-        pose = lenses[names[0]].pinhole_from_cam * station.inv()
+        pose = warps[names[0]].pinhole_from_cam * station.inv()
         model.frames[frame].rig_from_world = rigid3d(pose)
     for point, xyz in zip(fit.point_ids.tolist(), fit.points, strict=True):
         model.points3D[point].xyz = xyz
     for number, image in model.images.items():
-        for point, xy in zip(image.points2D, pixels[number - 1], strict=True):
+        for point, xy in zip(image.points2D, seen.pixels[number - 1], strict=True):
             point.xy = xy
     if len(fit.points) < len(model.points3D):  # the others lie where the old rig had them
         move_points(model, fit.sigma_px)
     notes = (*mapped.notes, "rig and port refined from the survey's own pictures")
-    return (
-        replace(mapped, model=model, lenses=lenses, baseline=model_baseline(model), notes=notes),
-        replace(
-            seen,
-            pixels=pixels,
-            cameras={name: lenses[name].pinhole.colmap for name in names},
-        ),
-    )
+    baseline = model_baseline(model)
+    return replace(mapped, model=model, warps=warps, baseline=baseline, notes=notes), seen
 
 
 def navigation_fixes(

@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.placing.control_file import Pick
-from reconstruct.views.lens import FlatPortLens, Lens
 
 _ROBUST_PX = 1.0
 _WRONG_SIGMAS = 5.0
@@ -21,35 +21,25 @@ _LARGEST_CONDITION = 1e8
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
-    """A registered picture: its lens, and where its pinhole stands in the model."""
+    """A registered picture: its camera, and where its pinhole stands in the model."""
 
-    lens: Lens
+    warp: PinholeWarp
     model_from_pinhole: RigidTransform
 
     def project(self, point: Array) -> Array:
         """(2,) pixel of the picture as taken at which a point (3,) of the model is seen."""
-        there = self.model_from_pinhole.inv().apply(point[None])
-        if isinstance(self.lens, FlatPortLens):
-            cam = self.lens.pinhole_from_cam.inv().apply(there)
-            return np.asarray(self.lens.camera.project(cam)[0])
-        if not there[0, 2] > 0:
-            return np.full(2, np.nan)
-        pinhole = self.lens.pinhole
-        ideal = pinhole.focal_px * there[:, :2] / there[:, 2:] + [pinhole.cx_px, pinhole.cy_px]
-        return np.asarray(self.lens.from_pinhole(ideal)[0])
+        seen = self._model_from_cam.inv().apply(point[None])
+        return np.asarray(self.warp.camera.project(seen)[0])
 
     def ray(self, pixel: Array) -> tuple[Array, Array]:
         """Start and unit direction, (3,) each, in the model, of a pixel of the picture as taken."""
-        if isinstance(self.lens, FlatPortLens):
-            start, way = self.lens.camera.unproject(pixel[None])
-            start = self.lens.pinhole_from_cam.apply(start)
-            way = self.lens.pinhole_from_cam.rotation.apply(way)
-        else:
-            pinhole, ideal = self.lens.pinhole, self.lens.to_pinhole(pixel[None])
-            slope = (ideal - [pinhole.cx_px, pinhole.cy_px]) / pinhole.focal_px
-            start, way = np.zeros((1, 3)), np.column_stack([slope, np.ones(1)])
-        way = self.model_from_pinhole.rotation.apply(way[0])
-        return self.model_from_pinhole.apply(start[0]), way / np.linalg.norm(way)
+        start, way = self.warp.camera.unproject(pixel)
+        there = self._model_from_cam
+        return there.apply(start), there.rotation.apply(way)
+
+    @property
+    def _model_from_cam(self) -> RigidTransform:
+        return self.model_from_pinhole * self.warp.pinhole_from_cam
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
