@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Equations, Flags, Minimum, Step, minimise
+from alice_survey.base.block_solver import BlockStep, Equations, Flags, Minimum, minimise
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem, State
@@ -136,7 +136,7 @@ class _Solver(CalibrationProblem):
         weights = self.weights(guess, noise)
         return self.equations(guess.state, weights / (noise * self.blur) ** 2)
 
-    def moved(self, guess: _Guess, equations: Equations, step: Step) -> _Guess | None:
+    def moved(self, guess: _Guess, equations: Equations, step: BlockStep) -> _Guess | None:
         """The guess after a step; None where a camera would leave its range."""
         try:
             return self.seen_from(self.stepped(guess.state, step))

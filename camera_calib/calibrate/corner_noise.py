@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import Adjustment
 from camera_calib.calibrate.normal_equations import CalibrationProblem
-from camera_calib.calibration import CornerNoise, Spread
+from camera_calib.calibration import CornerNoise, CornerSpread
 from camera_calib.rig import Covariance
 
 _REACHES = (0.12, 0.3, 0.8)
@@ -49,7 +49,7 @@ class _Part:
         return out
 
 
-class _Rows:
+class _CornerRows:
     """Weighted slopes and residuals of all views; 0 where unseen."""
 
     def __init__(self, problem: CalibrationProblem, found: Adjustment) -> None:
@@ -81,14 +81,14 @@ class _Rows:
         self.missed -= np.einsum("vcnak,vk->vcna", self.poses, taken_px)
 
 
-def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
+def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
     """Estimate the noise from the residuals of an adjustment, and propagate it.
 
     Args:
         problem: whose pixels and parameters were adjusted.
         found: the result.
     """
-    rows = _Rows(problem, found)
+    rows = _CornerRows(problem, found)
     diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
     squares = cdist(problem.points, problem.points, "sqeuclidean")
     parts = [_Part(kernel=np.eye(len(problem.points)), in_all=False)]
@@ -111,7 +111,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
         shared.append(inverse[:, prior_at] @ np.linalg.cholesky(problem.prior_information))
     factor = np.concatenate(shared, axis=1)
     matrix = inverse @ meat @ inverse + factor @ factor.T
-    return Spread(
+    return CornerSpread(
         noise=CornerNoise(
             alone=float(pictures[0]),
             together=pictures[1:],
@@ -130,7 +130,7 @@ class _Products:
     matrices, the mean of r^T K_i r is the sum of v_j tr(K_i M K_j M).
     """
 
-    def __init__(self, rows: _Rows, parts: list[_Part], inverse: Array) -> None:
+    def __init__(self, rows: _CornerRows, parts: list[_Part], inverse: Array) -> None:
         views, size = len(rows.seen), len(inverse)
         self.rows, self.parts, self.inverse = rows, parts, inverse
         self.smoothed = [part.smoothed(rows.by_rig, rows.seen) for part in parts]
