@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Equations, Flags, Indices
+from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.camera import pose_jacobian
