@@ -353,7 +353,7 @@ def _uncertainty_section(judged: Judgement) -> Section:
             alt="Maps of the projection's standard deviation over each frame",
             shows="One sigma, in its worst direction, of where a point is projected, from the "
             "calibration alone. Above, the point is fixed to the targets seen, and the pose that "
-            "fits best takes up what it can (mrcal's uncertainty): what surveys suffer whose poses "
+            "fits best takes up what it can: what surveys suffer whose poses "
             "come from the pictures. Below, the point is fixed to the camera.",
             good="Above: less than the noise of a point over most of the frame.",
             otherwise="Dark corners need points there; dark everywhere needs more views.",
