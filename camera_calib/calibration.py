@@ -1,7 +1,7 @@
 """Input and result of a calibration, as values and as arrays over all views."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -68,6 +68,29 @@ class CornerSpread:
     target's points, with poses, rig and shape adjusted to them."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class HousingTrial:
+    """How well the views fit one kind of port."""
+
+    port: str
+    noise_px: float
+    criterion: float
+    """Schwarz's: the lower, the likelier."""
+    why: str
+    """Why it could not be calibrated; empty if it could."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HousingJudgement:
+    """What views under water show of the housing."""
+
+    focal_ratios: Mapping[str, float] = field(default_factory=dict)
+    """Focal lengths as if without a housing, over those in air, by camera."""
+    trials: tuple[HousingTrial, ...] = ()
+    chosen: str = ""
+    """The likeliest of the trials."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
     """A calibrated rig, with all that is needed to assess it."""
@@ -98,6 +121,7 @@ class Calibration:
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
+    housing: HousingJudgement = HousingJudgement()
     spread: CornerSpread | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 

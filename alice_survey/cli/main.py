@@ -258,7 +258,8 @@ def calibrate(
     target: Annotated[str | None, typer.Option(help="A target in words, or target.json.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     lens: Annotated[
-        str, typer.Option(help="pinhole, k1, k2, opencv4, opencv5, rational, prism or full.")
+        str,
+        typer.Option(help="pinhole, k1, k2, opencv4, opencv5, rational, prism, full or fisheye."),
     ] = "opencv5",
     water: Annotated[
         bool, typer.Option("--water/--air", help="Under water through ports, or in air.")
@@ -267,6 +268,13 @@ def calibrate(
     intrinsics: Annotated[
         Literal["held", "prior", "free"] | None,
         typer.Option(help="Treatment of the intrinsics of --start; prior where it has sigmas."),
+    ] = None,
+    port: Annotated[
+        Literal["flat", "dome", "none", "auto"] | None,
+        typer.Option(help="Kind of the port; auto: the likeliest. That of --start, or flat."),
+    ] = None,
+    dome_radius: Annotated[
+        float | None, typer.Option(min=5, max=1000, help="Outer radius of a dome, mm.")
     ] = None,
     port_distance: Annotated[
         float | None, typer.Option(min=0, max=500, help="Pupil to glass, first value, mm.")
@@ -306,7 +314,8 @@ def calibrate(
 
     options = CalibrateOptions(
         left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
-        water=water, start=start, known=intrinsics, port_distance_mm=port_distance, glass_mm=glass,
+        water=water, start=start, known=intrinsics, port=port, dome_radius_mm=dome_radius,
+        port_distance_mm=port_distance, glass_mm=glass,
         glass_sigma_mm=glass_sigma, n_glass=n_glass, n_glass_sigma=n_glass_sigma, n_water=n_water,
         n_water_sigma=n_water_sigma, carry_to_n=carry_to_n,
     )  # fmt: skip

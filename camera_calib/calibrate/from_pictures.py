@@ -7,6 +7,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,12 @@ from alice_survey.base.executor import Executor, local_executor
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
+from camera_calib.calibrate.housing import (
+    compare_housings,
+    focal_ratios,
+    housing_lines,
+    likely_port,
+)
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
 from camera_calib.calibrate.solve import (
     Intrinsics,
@@ -28,11 +35,14 @@ from camera_calib.calibrate.solve import (
     first_cameras,
 )
 from camera_calib.calibrate.start import same_numbering
-from camera_calib.calibration import Calibration
+from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import Camera
 from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
+from camera_calib.optics import PORTS
+from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.none import NO_PORT, NoPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.target_shape import BOW_X, BOW_Y, SHEAR, STRETCH, TWIST
@@ -45,7 +55,8 @@ _WRITTEN = (
 )  # fmt: skip
 """Files of this command; a folder with other files is not replaced."""
 _GUESSED_PORT_M = 0.02
-_FRESH_WATER, _GLASS = 1.34, 1.52
+_USUAL_DOME_M = 0.08
+_FRESH_WATER = 1.34
 _LEVELS = ("bad", "look", "good")
 
 
@@ -69,6 +80,10 @@ class CalibrateOptions:
     """rig.json of a calibration in air, or an earlier one."""
     known: Intrinsics | None = None
     """Use of the intrinsics of `start`; None: prior if it has a covariance, or held."""
+    port: str | None = None
+    """Kind of the port, of `optics.PORTS`, or auto: the likeliest; flat where None."""
+    dome_radius_mm: float | None = None
+    """Outer radius of a dome."""
     port_distance_mm: float | None = None
     """First value; it is estimated."""
     glass_mm: float | None = None
@@ -131,7 +146,7 @@ def calibrate_pictures(
     with _replacing(output) as partial:
         found = detect_views(pair_pictures(lists), target, executor or local_executor())
         warn_of_unseen(found)
-        calibration = finish(partial, _calibrated(settings, found, target, start), found)
+        calibration = finish(partial, calibrated(settings, found, target, start), found)
         _check_sides(calibration.rig)
         if settings.carry_to_n is not None:
             write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
@@ -151,6 +166,8 @@ def carried(rig: Rig, n_water: float) -> Rig:
 
 def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
     ports = {
+        "--port": settings.port,
+        "--dome-radius": settings.dome_radius_mm,
         "--port-distance": settings.port_distance_mm,
         "--glass": settings.glass_mm,
         "--glass-sigma": settings.glass_sigma_mm,
@@ -170,7 +187,9 @@ def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
         raise CalibrationError(
             f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
         )
-    if settings.glass_mm is None:
+    if settings.port == "dome" and settings.dome_radius_mm is None:
+        raise CalibrationError("--port dome needs --dome-radius, of its outer surface in mm")
+    if settings.glass_mm is None and settings.port != "none":
         thin = start is None or not any(
             "glass_thickness_m" in c.parameters and c.parameter("glass_thickness_m") > 0.0
             for c in start.cameras.values()
@@ -181,21 +200,88 @@ def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
             )
 
 
-def _calibrated(
+def calibrated(
     settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None
 ) -> Calibration:
+    """The calibration that the settings ask for.
+
+    Args:
+        settings: of the command.
+        found: views of the target.
+        target: what they show.
+        start: a rig calibrated in air, or an earlier one.
+
+    Raises:
+        CalibrationError: the views do not determine it.
+    """
     points, lens = target.points, settings.lens
-    cameras = _first(settings, found.sizes, start)
-    known = settings.known
-    if start is not None:
-        start = replace(_matching(start, found.sizes), cameras=cameras)
-        known = known or ("held" if start.covariance is None else "prior")
-    views = found.views
-    if target.is_ambiguous and len(cameras) > 1:
-        near = cameras if start is not None else first_cameras(views, points, cameras, lens)
-        views = tuple(same_numbering(near, views, points, target.symmetries))
+    start = None if start is None else _matching(start, found.sizes)
     if not settings.water:
+        bare = {name: blank_camera(size, lens) for name, size in found.sizes.items()}
+        if start is not None:
+            bare = {name: camera.in_air() for name, camera in start.cameras.items()}
+            start = replace(start, cameras=bare)
+        views = _numbered(found, target, bare, lens, known=start is not None)
         return calibrate_in_air(views, points, found.sizes, lens, start)
+    ratios: dict[str, float] = {}
+    if start is not None:
+        views = _numbered(found, target, start.cameras, lens, known=True)
+        ratios = focal_ratios(views, points, start, lens)
+    if settings.port == "auto":
+        found_by = {kind: partial(_through, settings, found, target, start, kind) for kind in PORTS}
+        calibration = compare_housings(found_by)
+    else:
+        old = NO_PORT if start is None else next(iter(start.cameras.values())).port
+        kind = settings.port or (old.shape if old.parameters else FlatPort.shape)
+        try:
+            calibration = _through(settings, found, target, start, kind)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}{_other_housing(ratios, kind)}") from None
+    return replace(calibration, housing=replace(calibration.housing, focal_ratios=ratios))
+
+
+def _other_housing(ratios: Mapping[str, float], kind: str) -> str:
+    """What focal lengths say against a kind of port, for the end of a message."""
+    likely = {name: likely_port(ratio) for name, ratio in ratios.items()}
+    against = [
+        name
+        for name, port in likely.items()
+        if (port == FlatPort.shape) != (kind == FlatPort.shape)
+    ]
+    if not against:
+        return ""
+    name = against[0]
+    return (
+        f"; focal lengths of {name} under water are {ratios[name]:.3f} times those in air, which "
+        f"says --port {likely[name]}"
+    )
+
+
+def _numbered(
+    found: Detections, target: Target, cameras: Mapping[str, Camera], lens: str, *, known: bool
+) -> tuple[TargetView, ...]:
+    """Views whose points all cameras number alike."""
+    if not target.is_ambiguous or len(cameras) < 2:
+        return found.views
+    views, points = found.views, target.points
+    near = cameras if known else first_cameras(views, points, cameras, lens)
+    return tuple(same_numbering(near, views, points, target.symmetries))
+
+
+def _through(
+    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None, kind: str
+) -> Calibration:
+    """The calibration under water through ports of one kind."""
+    points, lens = target.points, settings.lens
+    if start is None:
+        port = _port(kind, NO_PORT, settings)
+        cameras = {name: blank_camera(size, lens, port) for name, size in found.sizes.items()}
+    else:
+        cameras = {
+            name: replace(camera, port=_port(kind, camera.port, settings))
+            for name, camera in start.cameras.items()
+        }
+    views = _numbered(found, target, cameras, lens, known=start is not None)
     known_to = {
         "glass_thickness_m": _metres(settings.glass_sigma_mm),
         "n_glass": settings.n_glass_sigma,
@@ -203,50 +289,39 @@ def _calibrated(
     }
     sigmas = {
         f"{name}.{parameter}": sigma
-        for name in cameras
+        for name, camera in cameras.items()
         for parameter, sigma in known_to.items()
-        if sigma is not None
+        if sigma is not None and parameter in camera.parameters
     }
-    if start is None or known is None:
+    if start is None:
         return calibrate_in_water_alone(views, points, cameras, lens, sigmas)
+    known = settings.known or ("held" if start.covariance is None else "prior")
+    start = replace(start, cameras=cameras)
     return calibrate_through_ports(views, points, start, known, lens, sigmas)
-
-
-def _first(
-    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None
-) -> dict[str, Camera]:
-    """Cameras of the start, or blank ones, in air or behind the port that the user names."""
-    if start is not None:
-        return {
-            name: _behind_port(camera, settings) if settings.water else camera.in_air()
-            for name, camera in _matching(start, sizes).cameras.items()
-        }
-    if not settings.water:
-        return {name: blank_camera(size, settings.lens) for name, size in sizes.items()}
-    port = _named_port(FlatPort(port_distance_m=_GUESSED_PORT_M, n_water=_FRESH_WATER), settings)
-    return {name: blank_camera(size, settings.lens, port) for name, size in sizes.items()}
 
 
 def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
 
 
-def _behind_port(camera: Camera, settings: CalibrateOptions) -> Camera:
-    """A camera of the start behind the port and in the water that the user names."""
-    port = camera.port
-    if not port.parameters:
-        port = FlatPort(port_distance_m=_GUESSED_PORT_M, n_water=_FRESH_WATER)
-    return replace(camera, port=_named_port(port, settings))
-
-
-def _named_port(port: PortValues, settings: CalibrateOptions) -> PortValues:
+def _port(kind: str, old: PortValues, settings: CalibrateOptions) -> PortValues:
+    """First values of a port of some kind: those of the start, or usual ones, or as named."""
+    usual: dict[str, PortValues] = {
+        NoPort.shape: NO_PORT,
+        FlatPort.shape: FlatPort(port_distance_m=_GUESSED_PORT_M, n_water=_FRESH_WATER),
+        DomePort.shape: DomePort(outer_radius_m=_USUAL_DOME_M, n_water=_FRESH_WATER),
+    }
+    port = old if old.shape == kind else usual[kind]
     given = {
         "glass_thickness_m": _metres(settings.glass_mm),
+        "outer_radius_m": _metres(settings.dome_radius_mm),
         "n_glass": settings.n_glass,
         "n_water": settings.n_water,
         "port_distance_m": _metres(settings.port_distance_mm),
     }
-    return port.with_parameters({k: v for k, v in given.items() if v is not None})
+    return port.with_parameters(
+        {k: v for k, v in given.items() if v is not None and k in port.parameters}
+    )
 
 
 def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
@@ -358,6 +433,7 @@ def calibration_text(
         f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
         *_baseline_lines(rig, target),
         *_shape_lines(calibration),
+        *housing_lines(calibration.housing),
     ]
     for name in rig.cameras:
         lines += _camera_lines(rig, name)

@@ -70,7 +70,12 @@ def unobservable(calibration: Calibration) -> tuple[str, ...]:
     Args:
         calibration: through ports.
     """
-    lines = (_line(calibration, name, error) for name, error in _TAKEN_FOR_GRANTED.items())
+    known = {name for camera in calibration.rig.cameras.values() for name in camera.parameters}
+    lines = (
+        _line(calibration, name, error)
+        for name, error in _TAKEN_FOR_GRANTED.items()
+        if name in known
+    )
     return tuple(line for line in lines if line)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import with_sigma
+from camera_calib.calibrate.housing import likely_port
 from camera_calib.judge.judgement import CameraJudgement, Judgement
 from camera_calib.target_shape import BOW_X, BOW_Y
 
@@ -20,6 +21,12 @@ _HALVES_LOOK, _HALVES_BAD = 2.0, 3.5
 """One difference is a single draw from what is expected."""
 _P_LOOK, _P_BAD = 1e-2, 1e-6
 """Probabilities of the difference of two halves."""
+_FRESH_WATER = 1.33
+_RATIO_OFF = 0.12
+"""Share by which a ratio of focal lengths may miss what the port makes of it; domes are centred by
+hand, and a flat port's distance lengthens them a little."""
+_NEAREST_GLASS_M, _FARTHEST_GLASS_M = 0.002, 0.25
+"""Distances from the pupil that a flat port of a housing may have."""
 _OPEN = 0.5
 """Share of its prior's sigma above which the views do not show a bow."""
 _VERY_BENT = 2.0
@@ -39,6 +46,7 @@ def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
 
 def _lines(judged: Judgement) -> Iterator[Verdict]:
     yield from _fit_verdicts(judged)
+    yield from _housing_verdicts(judged)
     yield from _hold_out_verdicts(judged)
     yield from _length_verdicts(judged)
     yield from _target_verdicts(judged)
@@ -81,6 +89,41 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
             level="look",
             text=f"{outliers} of {points} points are outliers; look where they lie in the pictures",
         )
+
+
+def _housing_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Whether the port that was calibrated can be the one that the views were taken through."""
+    calibration = judged.calibration
+    for name, camera in calibration.rig.cameras.items():
+        flat = camera.port.magnification
+        ratio = calibration.housing.focal_ratios.get(name)
+        n_water = max(camera.n_water, _FRESH_WATER)
+        if ratio is not None:
+            text = (
+                f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
+                f"{n_water:.3g} behind a flat port, near 1 behind a dome or without a port"
+            )
+            likely = likely_port(ratio)
+            fits = abs(ratio / flat - 1.0) < _RATIO_OFF
+            more = "" if fits else f"; calibrate with --port {likely}, or --port auto"
+            yield Verdict(level="good" if fits else "bad", text=text + more)
+        sigma_m = calibration.rig.sigmas.get(f"{name}.port_distance_m")
+        if sigma_m is None:
+            continue
+        distance_m = camera.parameter("port_distance_m")
+        if not distance_m + _SIGMAS * sigma_m > _NEAREST_GLASS_M:
+            yield Verdict(
+                level="bad",
+                text=f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the pupil, "
+                "where no glass can be: the pictures are through a dome, without a port, or in "
+                "air; try --port auto",
+            )
+        elif distance_m - _SIGMAS * sigma_m > _FARTHEST_GLASS_M:
+            yield Verdict(
+                level="bad",
+                text=f"the flat port of {name} ended {distance_m * 1e3:.0f} mm before the pupil, "
+                "farther than in any housing: the pictures may be through a dome; try --port auto",
+            )
 
 
 def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:

@@ -1,0 +1,98 @@
+"""Housings told apart: by focal lengths in water and in air, and by what each leaves."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from alice_survey.base.errors import CalibrationError
+from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrated
+from camera_calib.calibrate.housing import housing_lines
+from camera_calib.calibrate.solve import calibrate_in_air
+from camera_calib.calibration import TargetView
+from camera_calib.judge.judgement import judge
+from camera_calib.judge.verdicts import verdicts
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.values import PortValues
+from camera_calib.rig import Rig
+from tests.camera_calib.calibration_scenes import (
+    BOARD,
+    board_poses,
+    built_rig,
+    in_air,
+    views_of,
+)
+
+TRUTH = built_rig()
+SIZES = {name: (camera.width_px, camera.height_px) for name, camera in TRUTH.cameras.items()}
+NOISE_PX = 0.1
+
+FLAT = FlatPort(port_distance_m=0.025, glass_thickness_m=0.006, n_glass=1.49)
+CENTRED = DomePort(outer_radius_m=0.08, glass_thickness_m=0.006)
+OFF = replace(CENTRED, dome_x_m=0.002, dome_z_m=0.006)
+
+
+class Seen:
+    """Views as `detect_views` gives them."""
+
+    def __init__(self, views: list[TargetView]) -> None:
+        self.views, self.sizes = tuple(views), SIZES
+
+
+class Board:
+    points, is_ambiguous = BOARD, False
+
+
+@cache
+def dry() -> Rig:
+    rng = np.random.default_rng(4)
+    air = in_air(TRUTH)
+    return calibrate_in_air(
+        views_of(air, board_poses(air, 12, rng), NOISE_PX, rng), BOARD, SIZES
+    ).rig
+
+
+def through(port: PortValues) -> Seen:
+    rng = np.random.default_rng(5)
+    wet = replace(TRUTH, cameras={n: replace(c, port=port) for n, c in TRUTH.cameras.items()})
+    return Seen(views_of(wet, board_poses(wet, 10, rng), NOISE_PX, rng))
+
+
+@pytest.mark.parametrize(
+    ("port", "chosen", "ratio"), [(FLAT, "flat", 1.34), (CENTRED, "none", 1.0), (OFF, "dome", 0.98)]
+)
+def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> None:
+    settings = CalibrateOptions(water=True, port="auto", glass_mm=6.0)
+    found = calibrated(settings, through(port), Board(), dry())
+    assert found.housing.chosen == chosen
+    for value in found.housing.focal_ratios.values():
+        assert value == pytest.approx(ratio, abs=0.01)
+    lines = housing_lines(found.housing)
+    assert ("same camera" in lines[-1]) == (chosen == "none")
+    assert 0.8 * NOISE_PX < found.noise_px < 1.2 * NOISE_PX
+    if chosen == "dome":
+        for camera in found.rig.cameras.values():
+            for name, sigma_most in (("dome_x_m", 3e-4), ("dome_z_m", 3e-4)):
+                assert camera.parameter(name) == pytest.approx(getattr(port, name), abs=sigma_most)
+    said = verdicts(judge(found, None))
+    assert not [v for v in said if v.level == "bad" and "focal lengths" in v.text]
+
+
+def test_a_dome_taken_for_a_flat_port_is_bad() -> None:
+    settings = CalibrateOptions(water=True, glass_mm=6.0)
+    try:
+        found = calibrated(settings, through(CENTRED), Board(), dry())
+    except CalibrationError as error:
+        assert "--port dome" in str(error)
+    else:
+        said = [v.text for v in verdicts(judge(found, None)) if v.level == "bad"]
+        assert any("--port dome" in text for text in said)
+
+
+def test_a_flat_port_taken_for_a_dome_is_bad() -> None:
+    settings = CalibrateOptions(water=True, port="none")
+    found = calibrated(settings, through(FLAT), Board(), dry())
+    said = [v.text for v in verdicts(judge(found, None)) if v.level == "bad"]
+    assert any("--port flat" in text for text in said)
