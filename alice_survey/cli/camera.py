@@ -163,7 +163,12 @@ def convert(
         tuple[float, float] | None,
         typer.Option(metavar="NEAR FAR", help="m: fit cameras without port for these distances."),
     ] = None,
-    model: Annotated[str, typer.Option(help="Model to fit: OPENCV or FULL_OPENCV.")] = "OPENCV",
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="To fit: OPENCV, FULL_OPENCV or OPENCV_FISHEYE; as the lens if not given."
+        ),
+    ] = None,
     drop_port: Annotated[bool, typer.Option("--drop-port", help="Cameras as in air.")] = False,
     drop_covariance: Annotated[
         bool, typer.Option("--drop-covariance", help="Leave it out where OUT cannot hold it.")
