@@ -368,7 +368,8 @@ def _model_inputs(workspace: Path) -> list[Path]:
 
 
 def _dense_inputs(workspace: Path) -> list[Path]:
-    return [*_there(workspace / "mapping" / "covariance.npz"), *_model_inputs(workspace)]
+    poses = workspace / "mapping" / "covariance.npz", workspace / "sparse" / "registration.json"
+    return [*_there(*poses), *_model_inputs(workspace)]
 
 
 def _dense_summary(folder: Path) -> Summary:
@@ -595,7 +596,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="mapping",
         command="reconstruct",
         about="cameras and points in the model's own gauge",
-        version=4,
+        version=5,
         work="reconstruct.mapping.run:run_mapping",
         takes=("reconstruct", "seed"),
         needs=("image",),
@@ -619,7 +620,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="sparse",
         command="reconstruct",
         about="the model placed in the world",
-        version=2,
+        version=3,
         work="reconstruct.placing.run:run_sparse",
         takes=("reconstruct",),
         needs=("image", "mapping"),
@@ -635,7 +636,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="dense",
         command="reconstruct",
         about="the surface: depth of every view, fused",
-        version=3,
+        version=4,
         work="reconstruct.dense.run:run_dense",
         takes=("reconstruct",),
         needs=("image", "placing"),

@@ -27,6 +27,9 @@ from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
+from camera_calib.approximation.pinhole_warp import best_warp
+from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
 from reconstruct.raster import DemGrid, tiled_raster, tiles_of
 from reconstruct.views.model import WorldFrame, write_frame
 
@@ -119,21 +122,16 @@ def _write_sparse(sparse: Path, names: list[str], centres: Array) -> None:
         name="ned", datum=Datum(32.8236, 34.9553), scaled=True, vertical_datum="sea surface"
     )
     (sparse / "model").mkdir(parents=True)
-    pinhole = {
-        "width_px": WIDTH, "height_px": HEIGHT, "focal_px": FOCAL,
-        "cx_px": WIDTH / 2, "cy_px": HEIGHT / 2,
-    }  # fmt: skip
-    lens = {
-        "kind": "colmap", "model": "PINHOLE", "width_px": WIDTH, "height_px": HEIGHT,
-        "params": [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], "pinhole": pinhole,
-    }  # fmt: skip
+    lens = OpenCVLens(fx_px=FOCAL, fy_px=FOCAL, cx_px=WIDTH / 2, cy_px=HEIGHT / 2)
+    camera = Camera(width_px=WIDTH, height_px=HEIGHT, lens=lens)
+    warp = best_warp(camera, 1.0, 1.0)
     images = {name: {"camera": "left", "station": n, "mask": ""} for n, name in enumerate(names)}
-    write_json(sparse / "cameras.json", {"cameras": {"left": lens}, "images": images})
+    write_json(sparse / "cameras.json", {"cameras": {"left": warp.to_json()}, "images": images})
     write_frame(sparse / "frame.json", frame)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
-            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=lens["params"]
+            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=warp.pinhole.numbers
         )
     )
     rng = np.random.default_rng(2)

@@ -27,8 +27,8 @@ from reconstruct.mapping.bundle import all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.priors import adjust_freely
 from reconstruct.mapping.refraction import refract
+from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.placing.alignment import align_rigid
-from reconstruct.views.lens import self_calibrated_lens
 from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
@@ -89,8 +89,8 @@ def _figures(where: str, found: Sequence[tuple[str, float, float, float]]) -> li
 
 def rows(scene: Scene, *, with_oracle: bool) -> Sequence[tuple[str, float, float, float]]:
     """Method, rms of points and of cameras, metres, and seconds."""
-    seen, lenses = warped_scene(scene)
-    start = near_truth(scene, seen, lenses, np.random.default_rng(1))
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
     found = []
     began = time.monotonic()
     with TemporaryDirectory() as folder:
@@ -108,7 +108,7 @@ def rows(scene: Scene, *, with_oracle: bool) -> Sequence[tuple[str, float, float
 
 def self_calibrated_opencv(scene: Scene) -> Mapped:
     """COLMAP's adjustment of the pixels as taken, with OPENCV lenses freed and the true rig."""
-    seen, lenses = warped_scene(scene)
+    seen, warps = warped_scene(scene)
     rig = scene.rig
     cameras = {
         name: pycolmap.Camera(
@@ -128,8 +128,8 @@ def self_calibrated_opencv(scene: Scene) -> Mapped:
         )
         for name, camera in rig.cameras.items()
     }
-    plain = replace(seen, cameras=cameras, pixels=scene.pixels)
-    start = near_truth(scene, plain, lenses, np.random.default_rng(1))
+    plain = replace(seen, cameras=cameras, warps={})
+    start = near_truth(scene, plain, warps, np.random.default_rng(1))
     model = start.model
     options = held_options(NOISE_PX)
     options.refine_focal_length = options.refine_extra_params = True
@@ -137,9 +137,9 @@ def self_calibrated_opencv(scene: Scene) -> Mapped:
     config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     shifted = {
-        name: self_calibrated_lens(model.cameras[number]) for number, name in enumerate(cameras, 1)
+        name: self_calibrated_warp(model.cameras[number]) for number, name in enumerate(cameras, 1)
     }
-    return replace(start, lenses=shifted)
+    return replace(start, warps=shifted)
 
 
 def _row(name: str, mapped: Mapped, scene: Scene, began: float) -> tuple[str, float, float, float]:

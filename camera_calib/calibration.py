@@ -9,7 +9,8 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.freedom import HELD, Freedom
-from camera_calib.rig import Rig
+from camera_calib.rig import Covariance, Rig
+from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,13 +35,47 @@ class Rejection:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class CornerNoise:
+    """What the errors of corners are made of."""
+
+    alone: float
+    """Variance of independent errors, over that of all without correlation."""
+    together: Array
+    """(R,) variances of errors that go together in a picture, by their reach, then, for several
+    cameras, in all pictures of a view; in the same unit."""
+    place_sigmas_m: tuple[float, float]
+    """Sigmas of the places of corners on the target, along each axis of its plane and across."""
+
+    @property
+    def together_share(self) -> float:
+        """Share of the variance in a picture that goes together."""
+        total = self.alone + float(self.together.sum())
+        return float(self.together.sum()) / total
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CornerSpread:
+    """Covariance of a calibration under the noise that its residuals show."""
+
+    noise: CornerNoise
+    covariance: Covariance
+    """Of rig and shape together."""
+    shared: Array
+    """(P, M) factor of the part of it that other views of the same target have in common: errors of
+    the priors' means and of the places of corners. The product with its transpose is that part."""
+    of_places: Array
+    """(N, 3, N, 3) information of the views, over that of independent noise, on offsets of the
+    target's points, with poses, rig and shape adjusted to them."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
     """A calibrated rig, with all that is needed to assess it."""
 
     rig: Rig
     """The rig with its covariance."""
     target_points: Array
-    """(N, 3) in the target's frame, metres."""
+    """(N, 3) in the target's frame, metres, in the shape that was found."""
     views: tuple[TargetView, ...]
     """(V) the adjusted views."""
     rig_from_target: RigidTransform
@@ -61,6 +96,10 @@ class Calibration:
     """(V, cameras, N, 2) measured pixels that took no part; NaN elsewhere."""
     blur: Array | None = None
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
+    shape: TargetShape = AS_DRAWN
+    """How the target differs from its drawing: part of `target_points`."""
+    spread: CornerSpread | None = None
+    """Noise of the corners and what follows of it; None if it was taken as independent."""
 
     def __post_init__(self) -> None:
         shape = (len(self.views), len(self.rig.cameras), len(self.target_points), 2)
@@ -69,6 +108,28 @@ class Calibration:
                 f"calibration: residuals {self.residuals_px.shape}, weights {self.weights.shape}; "
                 f"{shape} expected"
             )
+
+    @property
+    def drawn_points(self) -> Array:
+        """(N, 3) points of the target as drawn, metres."""
+        drawn: Array = self.target_points - self.shape.offsets_m
+        return drawn
+
+    @property
+    def shared(self) -> Array:
+        """(P, M) factor of what the rig's covariance has in common with other views of the target.
+
+        That is by errors of the priors' means and of the places of the target's corners.
+        """
+        covariance = self.rig.covariance
+        if covariance is None:
+            return np.zeros((0, 0))
+        if self.spread is not None:
+            return self.spread.shared[: len(covariance.parameters)]
+        prior = self.freedom.prior
+        at = [covariance.parameters.index(name) for name in prior.parameters]
+        factor: Array = covariance.matrix[:, at] @ np.linalg.cholesky(prior.information)
+        return factor
 
     @property
     def sigma_px(self) -> Array:

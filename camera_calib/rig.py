@@ -1,6 +1,6 @@
 """The rig: cameras behind their ports, fixed to each other and to the vehicle; `rig.json`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,11 +58,13 @@ class Covariance:
 
     def without(self, field: str) -> "Covariance":
         """Covariance without one parameter of every camera: it is marginalised."""
-        names = self.parameters
-        kept = [i for i, name in enumerate(names) if not name.endswith(f".{field}")]
-        return Covariance(
-            parameters=tuple(names[i] for i in kept), matrix=self.matrix[np.ix_(kept, kept)]
-        )
+        return self.marginal(n for n in self.parameters if not n.endswith(f".{field}"))
+
+    def marginal(self, names: Iterable[str]) -> "Covariance":
+        """Covariance of some of the parameters alone."""
+        kept = tuple(names)
+        at = [self.parameters.index(name) for name in kept]
+        return Covariance(parameters=kept, matrix=self.matrix[np.ix_(at, at)])
 
     @property
     def correlation(self) -> Array:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -13,10 +13,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, best_warp
+from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import design_rig
-from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
-from reconstruct.views.range_shift import range_shift
+from reconstruct.views.range_shift import no_shift, range_shift
 from tests.cameras import changed
 
 DATUM = Datum(32.8236, 34.9553)
@@ -24,6 +26,10 @@ FRAME = WorldFrame(
     name="ned", datum=DATUM, scaled=True, vertical_datum="sea surface", notes=("a test",)
 )
 WIDTH, HEIGHT, FOCAL = 320, 256, 430.0
+PINHOLE = Pinhole(
+    width_px=WIDTH, height_px=HEIGHT, fx_px=FOCAL, fy_px=FOCAL,
+    cx_px=WIDTH / 2 + 2.0, cy_px=HEIGHT / 2 - 1.5,
+)  # fmt: skip
 ALTITUDE_M, DEPTH_M = 2.0, 12.0
 
 
@@ -146,13 +152,9 @@ def stereo_views(norths: Array, easts: Array, heading_deg: float = 20.0) -> list
                     image=f"{camera}/{station:03d}.png",
                     camera=camera,
                     station=station,
-                    width_px=WIDTH,
-                    height_px=HEIGHT,
-                    fx_px=FOCAL,
-                    fy_px=FOCAL,
-                    cx_px=WIDTH / 2 + 2.0,
-                    cy_px=HEIGHT / 2 - 1.5,
+                    pinhole=PINHOLE,
                     world_from_cam=pose,
+                    shift=no_shift(WIDTH, HEIGHT),
                 )
             )
     return sorted(views, key=lambda view: view.image)
@@ -163,26 +165,21 @@ def port_view(centre: list[float], rpy_deg: list[float]) -> View:
     rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
     tilt = np.deg2rad(2.0)
     camera = changed(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
-    lens = flat_port_lens(camera, 1.5, 2.5)
+    warp = best_warp(camera, 1.5, 2.5)
     turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
     return View(
         image="a",
         camera="left",
         station=0,
-        width_px=lens.pinhole.width_px,
-        height_px=lens.pinhole.height_px,
-        fx_px=lens.pinhole.focal_px,
-        fy_px=lens.pinhole.focal_px,
-        cx_px=lens.pinhole.cx_px,
-        cy_px=lens.pinhole.cy_px,
+        pinhole=warp.pinhole,
         world_from_cam=RigidTransform.from_components(centre, turn * BODY_FROM_NADIR_CAM),
-        shift=range_shift(lens),
+        shift=range_shift(warp),
     )
 
 
 def plane_depth(view: View, down: float) -> np.ndarray:
     """Depth (H, W) at which a view's pixels meet the level plane so far down."""
-    rows, columns = np.mgrid[: view.height_px, : view.width_px]
+    rows, columns = np.mgrid[: view.pinhole.height_px, : view.pinhole.width_px]
     pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
     depth = np.full(len(pixels), down)
     for _ in range(30):
@@ -194,9 +191,11 @@ def plane_depth(view: View, down: float) -> np.ndarray:
 def hits(view: View, scene: Scene, oversample: int = 1) -> Array:
     """World points (H, W, 3) that a view's pixels see, approached from above (within 1e-9 m)."""
     step = 1.0 / oversample
-    x = (np.arange(view.width_px * oversample) + 0.5) * step
-    y = (np.arange(view.height_px * oversample) + 0.5) * step
-    grid_x, grid_y = np.meshgrid((x - view.cx_px) / view.fx_px, (y - view.cy_px) / view.fy_px)
+    x = (np.arange(view.pinhole.width_px * oversample) + 0.5) * step
+    y = (np.arange(view.pinhole.height_px * oversample) + 0.5) * step
+    grid_x, grid_y = np.meshgrid(
+        (x - view.pinhole.cx_px) / view.pinhole.fx_px, (y - view.pinhole.cy_px) / view.pinhole.fy_px
+    )
     rays = np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
     world = view.world_from_cam.rotation.apply(rays.reshape(-1, 3)).reshape(rays.shape)
     centre = view.world_from_cam.translation
@@ -212,7 +211,7 @@ def render(view: View, scene: Scene) -> np.ndarray:
     """A picture (H, W, 3), each pixel the mean of 2 x 2 samples, without noise."""
     points = hits(view, scene, oversample=2)
     fine = scene.paint(points[..., 0], points[..., 1])
-    mean = fine.reshape(view.height_px, 2, view.width_px, 2, 3).mean(axis=(1, 3))
+    mean = fine.reshape(view.pinhole.height_px, 2, view.pinhole.width_px, 2, 3).mean(axis=(1, 3))
     return np.rint(np.clip(mean, 0, 255)).astype(np.uint8)
 
 
@@ -226,7 +225,7 @@ def sparse_model(views: list[View], scene: Scene, points: int = 400, seed: int =
     rows = []
     for number, view in enumerate(views):
         pixels = view.project(world)
-        inside = ((pixels > 0) & (pixels < [view.width_px, view.height_px])).all(axis=1)
+        inside = ((pixels > 0) & (pixels < view.pinhole.size_px)).all(axis=1)
         rows += [(int(point), number) for point in np.flatnonzero(inside)]
     return SparseModel(
         frame=FRAME,
@@ -250,7 +249,7 @@ def write_workspace(folder: Path, model: SparseModel, scene: Scene) -> Path:
     write_json(
         sparse / "cameras.json",
         {
-            "cameras": {name: _lens(view) for name, view in cameras.items()},
+            "cameras": {name: _warp(view) for name, view in cameras.items()},
             "images": {
                 view.image: {"camera": view.camera, "station": view.station, "mask": ""}
                 for view in model.views
@@ -262,22 +261,16 @@ def write_workspace(folder: Path, model: SparseModel, scene: Scene) -> Path:
     return folder
 
 
-def _lens(view: View) -> dict[str, object]:
-    pinhole = [view.fx_px, view.fy_px, view.cx_px, view.cy_px]
-    return {
-        "kind": "colmap",
-        "model": "PINHOLE",
-        "width_px": view.width_px,
-        "height_px": view.height_px,
-        "params": pinhole,
-        "pinhole": {
-            "width_px": view.width_px,
-            "height_px": view.height_px,
-            "focal_px": view.fx_px,
-            "cx_px": view.cx_px,
-            "cy_px": view.cy_px,
-        },
-    }
+def _warp(view: View) -> dict[str, object]:
+    pinhole = asdict(view.pinhole)
+    width, height = pinhole.pop("width_px"), pinhole.pop("height_px")
+    warp = PinholeWarp(
+        camera=Camera(width_px=width, height_px=height, lens=OpenCVLens(**pinhole)),
+        pinhole=view.pinhole,
+        centre_m=(0.0, 0.0, 0.0),
+        working_range_m=1.0,
+    )
+    return warp.to_json()
 
 
 def _colmap(model: SparseModel) -> pycolmap.Reconstruction:
@@ -289,9 +282,9 @@ def _colmap(model: SparseModel) -> pycolmap.Reconstruction:
             pycolmap.Camera(
                 camera_id=number,
                 model="PINHOLE",
-                width=view.width_px,
-                height=view.height_px,
-                params=[view.fx_px, view.fy_px, view.cx_px, view.cy_px],
+                width=view.pinhole.width_px,
+                height=view.pinhole.height_px,
+                params=view.pinhole.numbers,
             )
         )
     tracks: dict[int, list[pycolmap.TrackElement]] = {}

@@ -96,6 +96,7 @@ def adjusted(
         residuals_px=found.residuals_px,
         weights=found.weights,
         noise_px=found.noise_px,
+        freedom=freedom,
     )
 
 

@@ -182,7 +182,7 @@ class PlanConfig(Config):
     altitude_m: float = Field(2.0, ge=0.3, le=10)
     speed_mps: float = Field(0.2, gt=0, le=3)
     forward_overlap: float = Field(0.6, ge=0, le=0.95)
-    side_overlap: float = Field(0.29, ge=0, le=0.95)
+    side_overlap: float = Field(0.28, ge=0, le=0.95)
     line_spacing_m: float | None = Field(None, gt=0, le=20)
     line_heading_deg: float | None = Field(None, ge=0, lt=360)
     overlap_over_relief: bool = False

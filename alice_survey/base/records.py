@@ -173,6 +173,18 @@ class AcceptanceRecord(JsonRecord):
     notes: Notes = ()
 
 
+class WarpRecord(JsonRecord):
+    """How well a pinhole stands in for a camera."""
+
+    offset_m: float
+    """Largest distance by which rays of the frame miss the pinhole's centre."""
+    contraction: float
+    """Change of a pixel's shift with the pixel, over the distances: below 1 the warp is one to one.
+    """
+    cut_share: float
+    """Share of the frame that the pinhole's picture leaves out."""
+
+
 class MappingRecord(JsonRecord):
     """`mapping/mapping.json`."""
 
@@ -186,6 +198,7 @@ class MappingRecord(JsonRecord):
     rig_factor: float | None = None
     distances: RangeRecord | None = None
     refraction: RefractionRecord | None = None
+    warps: dict[str, WarpRecord] = Field(default_factory=dict)
     doming: DomingRecord | None = None
     acceptance: AcceptanceRecord | None = None
     gauge: str = ""
@@ -223,6 +236,14 @@ class GeoreferenceRecord(JsonRecord):
     scale_of_navigation_sigma: float | None = None
 
 
+class SimilarityRecord(JsonRecord):
+    """`target = scale * rotation * source + translation`; the identity by default."""
+
+    scale: float = Field(1.0, gt=0)
+    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 class RegistrationRecord(JsonRecord):
     """`sparse/registration.json`."""
 
@@ -237,7 +258,9 @@ class RegistrationRecord(JsonRecord):
     baseline: float | None = None
     rig_factor: float | None = None
     scale_source: str | None
-    world_per_mapping_unit: float = 1.0
+    gauge: str = ""
+    """Digest of the mapped model, as in its `MappingRecord`."""
+    world_from_mapping: SimilarityRecord = SimilarityRecord()
     working_range: RangeRecord | None = None
     georeference: GeoreferenceRecord | None = None
 
@@ -299,11 +322,11 @@ class PictureCamera(JsonRecord):
 
 
 class CamerasRecord(JsonRecord):
-    """`sparse/cameras.json`: lenses by camera, and the pictures of a model."""
+    """`sparse/cameras.json`: the cameras and the pictures of a model."""
 
     path: ClassVar = "sparse/cameras.json"
     cameras: dict[str, dict[str, Any]]
-    """As `reconstruct.views.lens` reads them."""
+    """As `camera_calib.approximation.pinhole_warp` reads them."""
     images: dict[str, PictureCamera]
 
 

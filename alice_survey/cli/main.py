@@ -130,8 +130,9 @@ def fov(
 ) -> None:
     """Show field of view and resolution.
 
-    Footprint, pixel, focus, depth of field, stereo and blur through the exact flat port, for any
-    lens, altitude and water. What is not given is the survey's, or else the paper's.
+    Footprint (across the middle of the frame, and surely, between its corners), pixel, focus, depth
+    of field, stereo and blur through the exact flat port, for any lens, altitude and water. What is
+    not given is the survey's, or else the paper's.
     """
     from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
     from camera_calib.fov.table import FovChoices
@@ -214,9 +215,9 @@ def image(
 @app.command(
     epilog=examples(
         'target "charuco 12x9 40mm 30mm" -o board.pdf',
-        'target "chessboard 9x6 25mm" -o board.svg --paper A4',
-        'target "apriltag 6x6 88mm 0.3" -o grid.pdf --paper A1',
-        'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o board.png --dpi 600',
+        'target "chessboard 9x6 25mm" -o chess.svg --paper A4',
+        'target "apriltag 6x6 70mm 0.3" -o grid.pdf --paper A1',
+        'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o old.png --dpi 600',
     )
 )
 def target(

@@ -38,6 +38,7 @@ from alice_survey.kit.words import (
 from alice_survey.report import plots
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, known_column
+from camera_calib.freedom import intrinsics
 from missions.values.plan_file import Plan
 
 
@@ -358,11 +359,14 @@ def _camera(figures: Figures) -> Section:
     if cameras is not None and calibrated is None and refined is None:
         text.append("The cameras calibrated themselves from the survey's pictures.")
         rows = [
-            (name, str(camera.get("model", camera["kind"])),
-             ", ".join(f"{p:.6g}" for p in camera.get("params", [])))
-            for name, camera in cameras.cameras.items()
+            (name, ", ".join(
+                f"{key} {warp['camera'][key]:.6g}"
+                for key in intrinsics("full")
+                if warp["camera"].get(key)
+            ))
+            for name, warp in cameras.cameras.items()
         ]  # fmt: skip
-        tables.append(Table(title="Cameras", header=("camera", "model", "parameters"), rows=rows))
+        tables.append(Table(title="Cameras", header=("camera", "parameters"), rows=rows))
     return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import CalibrationError, ConfigError
 from alice_survey.base.frames import Array
-from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
 
 COLMAP_PARAMETERS = {
@@ -135,9 +135,9 @@ def approximations(
 ) -> list[Residual]:
     """The usual stand-ins for a flat-port camera over an interval of distances.
 
-    Two pinholes after a warp, at the entrance pupil and at the best point of the port's normal;
-    then some of COLMAP's models, fitted by least squares to exact rays, with the centre along the
-    port's normal.
+    Two pinholes after a warp, at the entrance pupil and at the point that rays miss least; then
+    some of COLMAP's models, fitted by least squares to exact rays, with the centre along the port's
+    normal.
 
     Args:
         camera: exact.
@@ -160,8 +160,8 @@ def approximations(
             f"glass, {closest:g} m from the entrance pupil"
         )
     distances = np.linspace(near_m, far_m, 9) if distances_m is None else np.array(distances_m)
-    best = best_pinhole(camera, near_m, far_m, working_range_m)
-    at_pupil = replace(best, centre_x_m=0.0, centre_y_m=0.0, centre_z_m=0.0)
+    best = best_warp(camera, near_m, far_m, working_range_m)
+    at_pupil = replace(best, centre_m=(0.0, 0.0, 0.0))
     pixels, points = _seen(camera, distances, _GRID)
     stand_ins = [
         _warped("pinhole at the pupil, warped", at_pupil),
@@ -225,13 +225,13 @@ def colmap_pixels(model: str, params: Sequence[float] | Array, points: Array) ->
     return pixels
 
 
-def _warped(name: str, pinhole: VirtualPinhole) -> StandIn:
+def _warped(name: str, warp: PinholeWarp) -> StandIn:
     return StandIn(
         name=name,
         model="PINHOLE",
-        params=(pinhole.focal_px, pinhole.focal_px, pinhole.cx_px, pinhole.cy_px),
-        warped_at_m=pinhole.working_range_m,
-        centre_m=(pinhole.centre_x_m, pinhole.centre_y_m, pinhole.centre_z_m),
+        params=tuple(warp.pinhole.numbers.tolist()),
+        warped_at_m=warp.working_range_m,
+        centre_m=warp.centre_m,
         approx_from_cam=Rotation.identity(),
     )
 

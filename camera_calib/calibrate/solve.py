@@ -12,11 +12,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.block_solver import Flags
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibrate.adjust import Adjustment, adjust
-from camera_calib.calibrate.normal_equations import Flags
+from camera_calib.calibrate.corner_noise import spread_of
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
 from camera_calib.calibration import (
@@ -40,6 +42,7 @@ from camera_calib.freedom import (
 from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
+from camera_calib.target_shape import TargetShape, usual_shape
 
 Intrinsics = Literal["held", "prior", "free"]
 
@@ -73,22 +76,26 @@ def calibrate(
     freedom: Freedom,
     *,
     source: str = "calibration",
+    shape: TargetShape | None = None,
 ) -> Calibration:
     """Adjust a rig over all views, from a rig near the truth.
 
     Args:
         views: where the cameras saw the target.
-        points: (N, 3) the target's points in its own frame, metres.
+        points: (N, 3) the target's points as drawn, in its own frame, metres.
         start: near the truth, such as the design; what is not adjusted is taken from it.
         freedom: what is adjusted.
         source: how, for the rig's `source`.
+        shape: how the target may differ from its drawing; None for that of a flat sheet, and
+            `AS_DRAWN` for points that are known better.
 
     Raises:
         CalibrationError: too few views, or they do not determine what is free.
     """
     usable, rejections = _usable(views, points)
     _check_served(usable, start)
-    found = locate_all(start, usable, points)
+    shape = usual_shape(points) if shape is None else shape
+    found = locate_all(start, usable, points + shape.offsets_m)
     for view, pose in zip(usable, found, strict=True):
         if pose is None:
             reason = "no pose of the target was found"
@@ -99,7 +106,7 @@ def calibrate(
     pixels = stack_views(usable, start, len(points))
     poses = RigidTransform.concatenate([pose for pose in found if pose is not None])
     adjusted, kept, alive_views = _adjust_without_outliers(
-        usable, pixels, points, start, poses, freedom
+        usable, pixels, points, start, poses, freedom, shape
     )
     rejections += _rejected(usable, pixels, kept, start, adjusted)
     _check_focal(adjusted.rig, adjusted.rig_from_target)
@@ -115,10 +122,18 @@ def calibrate(
         )
         for i, v in enumerate(np.flatnonzero(alive_views))
     )
-    rig = replace(adjusted.rig, source=f"{source} from {len(final)} views")
+    problem = CalibrationProblem(used, points, start, freedom, shape)
+    spread = spread_of(problem, adjusted)
+    rig = replace(
+        adjusted.rig,
+        source=f"{source} from {len(final)} views",
+        covariance=spread.covariance.marginal(freedom.names(start)),
+    )
+    of_shape = spread.covariance.marginal(shape.parameters).matrix
+    found_shape = adjusted.shape.found(adjusted.shape.values, of_shape)
     return Calibration(
         rig=rig,
-        target_points=points,
+        target_points=points + found_shape.offsets_m,
         views=final,
         rig_from_target=adjusted.rig_from_target,
         residuals_px=adjusted.residuals_px,
@@ -136,13 +151,15 @@ def calibrate(
         freedom=freedom,
         rejected=left_out,
         blur=adjusted.blur,
+        shape=found_shape,
+        spread=spread,
     )
 
 
 def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibration:
     """The same calibration from other views, such as a part of those it used."""
-    freedom, source = calibration.freedom, "calibration"
-    return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
+    found = calibration
+    return calibrate(views, found.drawn_points, found.rig, found.freedom, shape=found.shape)
 
 
 @progress.step("find cameras")
@@ -359,6 +376,7 @@ def _adjust_without_outliers(
     rig: Rig,
     poses: RigidTransform,
     freedom: Freedom,
+    shape: TargetShape,
 ) -> tuple[Adjustment, Flags, Flags]:
     """Adjust and leave out gross outliers, until that set stays the same.
 
@@ -370,9 +388,11 @@ def _adjust_without_outliers(
     blur = np.ones(measured.shape[:2])
     for _ in range(_ROUNDS):
         trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-        adjusted = adjust(trimmed, points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive])
+        adjusted = adjust(
+            trimmed, points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive], shape=shape
+        )
         lengths = np.full(measured.shape, np.inf)
-        lengths[alive] = _lengths(adjusted, pixels[alive], points)
+        lengths[alive] = _lengths(adjusted, pixels[alive], points + adjusted.shape.offsets_m)
         found = np.ones_like(blur)
         found[alive] = _blur(adjusted)
         limits = np.maximum(_OUTLIER * adjusted.noise_px * found, _LEAST_LIMIT_PX)
@@ -383,9 +403,10 @@ def _adjust_without_outliers(
         still = alive & fitting.any(axis=(1, 2))
         _check_enough(int(still.sum()), len(views))
         poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
-        rig, kept, alive, blur = adjusted.rig, fitting, still, found
+        rig, kept, alive, blur, shape = adjusted.rig, fitting, still, found, adjusted.shape
     trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-    return adjust(trimmed, points, rig, poses, freedom, blur=blur[alive]), kept, alive
+    last = adjust(trimmed, points, rig, poses, freedom, blur=blur[alive], shape=shape)
+    return last, kept, alive
 
 
 def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:

@@ -24,6 +24,7 @@ from camera_calib.calibration import TargetView
 from camera_calib.camera import Camera
 from camera_calib.freedom import HELD
 from camera_calib.rig import Rig
+from camera_calib.target_shape import is_sheet
 
 Indices = NDArray[np.intp]
 
@@ -136,7 +137,8 @@ def _poses(camera: Camera, pixels: Array, points: Array) -> list[RigidTransform]
 
 
 def _pinhole_poses(tangents: Array, points: Array, centre: Array) -> list[RigidTransform]:
-    planar = float(np.ptp(points[:, 2])) == 0.0
+    planar = is_sheet(points)
+    points = points * [1.0, 1.0, 0.0] if planar else points
     flag = cv2.SOLVEPNP_IPPE if planar else cv2.SOLVEPNP_SQPNP
     try:
         _, turns, shifts, misses = cv2.solvePnPGeneric(

@@ -8,7 +8,7 @@ import numpy as np
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.seawater import n_water as n_water_of_colour
-from camera_calib.approximation.virtual_pinhole import best_pinhole, residual_px
+from camera_calib.approximation.pinhole_warp import best_warp, residual_px
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.fov.table import check_range
@@ -116,7 +116,7 @@ def _angle_row(
     paraxial = glass_z - camera.port.magnification * apparent_distance_m(camera, 0.0)
 
     near, far = glass_z + altitude_m * (1 - RELIEF), glass_z + altitude_m * (1 + RELIEF)
-    residual = residual_px(camera, best_pinhole(camera, near, far), np.linspace(near, far, 11))
+    residual = residual_px(best_warp(camera, near, far), np.linspace(near, far, 11))
 
     spot = camera.at_depth(corner, glass_z + altitude_m)
     colours = [camera.in_water(n).project(spot)[0] for n in _blue_red(n_water)]

@@ -28,6 +28,13 @@ from camera_calib.rig import Rig, design_rig
 MATCH_SIGMA_PX = 0.3
 """Disparity noise for which the depth precision is stated."""
 
+FISHEYE_FOV_DEG = 100.0
+"""Full angle in air beyond which lenses are made as fisheyes: a straight picture of it is drawn
+out at its edges, 1 / cos^2 of the half angle in the corner's radius, 2.4 times at 100 degrees."""
+
+_POINTS_PER_SIDE = 16
+"""Points of a frame's border on each side."""
+
 TRUSTED_FOV_DEG = 70.0
 """Full angle in air up to which the paper trusts a flat port (its section III.B)."""
 
@@ -67,6 +74,11 @@ class FovRow:
     """Width of the footprint along the middle row."""
     vertical_m: float
     """Height of the footprint along the middle column."""
+    sure_horizontal_m: float
+    """Width of the upright rectangle that is surely seen: between the footprint's corners, where
+    its sides bulge, as they do through a flat port."""
+    sure_vertical_m: float
+    """Its height."""
     pixel_centre_mm: float
     """Root of the area on the sea floor of the central pixel."""
     pixel_mean_mm: float
@@ -270,6 +282,7 @@ def _row(
     hyperfocal = lens.hyperfocal_m(choices.coc_px)
     blur = lens.blur_px(depths)
     air_deg = _widest_deg(air_rays(camera, corners))
+    sure_m = sure_size_m(camera, floor_z)
     return FovRow(
         lens_mm=lens_mm,
         altitude_m=altitude_m,
@@ -277,6 +290,8 @@ def _row(
         port=camera.port.words,
         horizontal_m=horizontal,
         vertical_m=float(np.linalg.norm(edges[3] - edges[2])),
+        sure_horizontal_m=sure_m[0],
+        sure_vertical_m=sure_m[1],
         pixel_centre_mm=float(pixel_mm[0]),
         pixel_mean_mm=horizontal / w * 1e3,
         pixel_corner_mm=float(pixel_mm[1:].max()),
@@ -303,6 +318,31 @@ def _row(
         corner_blur_px=float(blur[1:].max()),
         within_trusted_fov=air_deg <= TRUSTED_FOV_DEG,
     )
+
+
+def sure_size_m(camera: Camera, floor_z_m: float) -> tuple[float, float]:
+    """Width and height of the largest upright rectangle about the axis that is seen.
+
+    It lies between the footprint's corners where the sides bulge, as they do through a flat port,
+    and between the middles of the sides where a lens makes them hollow.
+
+    Args:
+        camera: the camera.
+        floor_z_m: where a sea floor square to its axis is, in its frame.
+
+    Returns:
+        NaN where rays of the border never reach the sea floor.
+    """
+    border = camera.at_depth(camera.border(_POINTS_PER_SIDE), floor_z_m)
+    top, right, bottom, left = sides_of(border)
+    across_m, along_m = right[:, 0].min() - left[:, 0].max(), bottom[:, 1].min() - top[:, 1].max()
+    return float(across_m), float(along_m)
+
+
+def sides_of(border: Array) -> list[Array]:
+    """The four sides of a frame's border, each with both its corners: top, right, bottom, left."""
+    closed, n = np.vstack([border, border[:1]]), len(border) // 4
+    return [closed[k * n : (k + 1) * n + 1] for k in range(4)]
 
 
 def _pixel_sizes_mm(camera: Camera, pixels: Array, floor_z: float) -> Array:

@@ -11,7 +11,7 @@ from alice_survey.base.artefacts import json_values
 from alice_survey.base.text_table import text_table
 from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, PaperValidation
-from camera_calib.fov.table import TRUSTED_FOV_DEG, BlurRow, FovRow
+from camera_calib.fov.table import FISHEYE_FOV_DEG, TRUSTED_FOV_DEG, BlurRow, FovRow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,19 +99,31 @@ def _footprints(rows: Sequence[FovRow]) -> TextTable:
             f"stereo: baseline {first.baseline_m * 1e3:.1f} mm, share of the left footprint that "
             f"both see; depth sigma for {first.match_sigma_px:g} px of disparity noise"
         )
+    notes.append(
+        "footprint: across the middle of the frame; surely: the rectangle between its corners, "
+        "which plans count on"
+    )
     if any(not row.within_trusted_fov for row in rows):
         notes.append(f"(!) wider than {TRUSTED_FOV_DEG:g} deg: the paper trusts no flat port here")
+    widest = max(rows, key=lambda row: row.diagonal_air_deg)
+    if widest.diagonal_air_deg > FISHEYE_FOV_DEG:
+        notes.append(
+            f"a lens of {widest.diagonal_air_deg:.0f} deg is made as a fisheye, which sees more "
+            "than a straight lens of its focal length: calibrate it with a fisheye lens model, and "
+            "give its rig.json with --rig"
+        )
     return TextTable(
         title="Footprint and resolution",
         header=(
-            "lens", "altitude", "footprint", "pixel centre/mean/corner", "diagonal air/water",
-            "stereo", "depth sigma",
+            "lens", "altitude", "footprint", "surely", "pixel centre/mean/corner",
+            "diagonal air/water", "stereo", "depth sigma",
         ),
         cells=tuple(
             (
                 f"{r.lens_mm:.4g} mm",
                 f"{r.altitude_m:g} m",
                 f"{r.horizontal_m:.3f} x {r.vertical_m:.3f} m",
+                f"{r.sure_horizontal_m:.3f} x {r.sure_vertical_m:.3f} m",
                 f"{r.pixel_centre_mm:.3f} / {r.pixel_mean_mm:.3f} / {r.pixel_corner_mm:.3f} mm",
                 f"{r.diagonal_air_deg:.1f} / {r.diagonal_water_deg:.1f} deg"
                 + ("" if r.within_trusted_fov else " (!)"),

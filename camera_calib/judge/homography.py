@@ -5,7 +5,7 @@ pinhole's pixels by a homography, whatever its pose. The flat port has no single
 ray is followed exactly to the target's own distance there, and a virtual pinhole looks at that
 spot. Of the pose only these distances are used, and they hardly matter: an error of 1 cm moves
 such a pixel by about 0.001 px (20 mm port, 12.5 mm lens). No truth is needed; a trend with the
-radius is an error of the model.
+radius is an error of the model. What the found shape of a bent target moves is taken off first.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
-from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.calibration import Calibration, stack_views
-from camera_calib.camera import Camera
 from camera_calib.judge.fit_quality import (
     Profile,
     largest_radius_px,
@@ -72,7 +71,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     Returns:
         None where the target is not flat, or no view has enough points.
     """
-    points = calibration.target_points
+    points = calibration.drawn_points
     if not _is_flat(points):
         return None
     index = list(calibration.rig.cameras).index(camera)
@@ -80,15 +79,19 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     kept = np.isfinite(calibration.residuals_px[:, index, :, 0])
     measured = stack_views(calibration.views, calibration.rig, len(points))[:, index]
     poses = [calibration.rig.cam_from_rig[camera] * pose for pose in calibration.rig_from_target]
+    if calibration.shape.parameters:
+        for v, pose in enumerate(poses):
+            bent = model.project(pose.apply(calibration.target_points))
+            measured[v] -= bent - model.project(pose.apply(points))
     usable = [v for v in range(len(poses)) if kept[v].sum() >= _FEWEST_POINTS]
     if not usable:
         return None
     depths = np.concatenate([poses[v].apply(points[kept[v]])[:, 2] for v in usable])
-    pinhole = best_pinhole(model, float(depths.min()), float(depths.max()))
+    warp = best_warp(model, float(depths.min()), float(depths.max()))
     fits = []
     for v in usable:
         at = np.nonzero(kept[v])[0]
-        stay, residual, freedom = _fit_view(model, pinhole, points[at], measured[v, at], poses[v])
+        stay, residual, freedom = _fit_view(warp, points[at], measured[v, at], poses[v])
         kept[v, at[~stay]] = False
         fits.append((residual, freedom))
     pixels = np.concatenate([measured[v, kept[v]] for v in usable])
@@ -115,8 +118,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
 
 
 def _fit_view(
-    camera: Camera,
-    pinhole: VirtualPinhole,
+    warp: PinholeWarp,
     target_points: Array,
     pixels: Array,
     cam_from_target: RigidTransform,
@@ -129,7 +131,7 @@ def _fit_view(
     stay = np.ones(len(pixels), dtype=bool)
     while True:
         residuals, freedom = homography_residuals(
-            camera, pinhole, target_points[stay], pixels[stay], cam_from_target
+            warp, target_points[stay], pixels[stay], cam_from_target
         )
         length = np.linalg.norm(residuals, axis=1)
         outlying = length > _OUTLYING * float(np.median(length))
@@ -149,8 +151,7 @@ def _is_flat(points: Array) -> bool:
 
 
 def homography_residuals(
-    camera: Camera,
-    pinhole: VirtualPinhole,
+    warp: PinholeWarp,
     target_points: Array,
     pixels: Array,
     cam_from_target: RigidTransform,
@@ -158,8 +159,7 @@ def homography_residuals(
     """Fit one view's homography, least squares in the camera's own pixels.
 
     Args:
-        camera: its lens and port are undone.
-        pinhole: the ideal camera that looks instead.
+        warp: the camera, whose lens and port are undone, and the pinhole that looks instead.
         target_points: (N, 3) on one plane, N > 4.
         pixels: (N, 2) as measured.
         cam_from_target: gives the distances of the points.
@@ -171,7 +171,7 @@ def homography_residuals(
     depth = cam_from_target.apply(target_points)[:, 2]
 
     def ideal(at: Array) -> Array:
-        return pinhole.project(camera.at_depth(at, depth))
+        return warp.to_pinhole(at, depth)
 
     seen = ideal(pixels)
     # How ideal pixels move with measured ones, whose noise is the same everywhere.

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import chi2
 
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.camera import Camera, pose_jacobian
-from camera_calib.freedom import NO_PRIOR, Prior
+from camera_calib.freedom import POSE, value
 from camera_calib.judge.fit_quality import rms_length_px, within_gate
 from camera_calib.judge.uncertainty import (
     camera_slopes,
@@ -37,6 +38,8 @@ from camera_calib.triangulate import triangulate
 
 _EVERY = 5
 """One view in this many is held out."""
+_LEAST_KNOWN = 1e-12
+"""Least eigenvalue over the largest of a covariance scaled to unit variances; less is rounding."""
 
 Calibrate = Callable[[Sequence[TargetView]], Calibration]
 Locate = Callable[[Rig, TargetView, Array], RigidTransform]
@@ -54,8 +57,8 @@ class HeldOut:
     """(H,) their poses, found in the rig of `used`."""
     residuals_px: Array
     """(H, cameras, N, 2) projected minus measured."""
-    halves: tuple[Rig, Rig] | None
-    """Two rigs, each from every other view; None where a half did not suffice."""
+    halves: tuple[Calibration, Calibration] | None
+    """Each from every other view; None where a half did not suffice."""
 
 
 @progress.step("hold views out")
@@ -88,7 +91,7 @@ def hold_out(views: Sequence[TargetView], calibrate: Calibrate, locate: Locate) 
         warn(f"no hold-out test: none of {len(held)} held-out views could be posed")
         return None
     try:
-        halves = (calibrate(views[::2]).rig, calibrate(views[1::2]).rig)
+        halves = (calibrate(views[::2]), calibrate(views[1::2]))
     except CalibrationError as error:
         warn(f"no test by halves: half of {len(views)} views does not calibrate: {error}")
         halves = None
@@ -173,43 +176,78 @@ class HalvesDifference:
         return float(np.sqrt(np.nanmean(self.expected_px**2)))
 
 
+@dataclass(frozen=True, kw_only=True)
+class HalvesAgreement:
+    """Difference of the parameters of two calibrations, by their covariances."""
+
+    chi2: float
+    parameters: int
+    """Mean of `chi2`, if the covariances are true."""
+
+    @property
+    def p_value(self) -> float:
+        """Probability of as large a difference, if the covariances are true."""
+        return float(chi2.sf(self.chi2, self.parameters))
+
+
+def _difference_covariance(halves: tuple[Calibration, Calibration]) -> Array:
+    """(P, P) covariance of the difference of both rigs' parameters.
+
+    Errors of what both took as known, and of the one target that both saw, are the same in both:
+    only the difference of their effects shows.
+    """
+    first, second = (half.shared for half in halves)
+    apart = first - second
+    matrix = apart @ apart.T
+    for half, shared in zip(halves, (first, second), strict=True):
+        matrix = matrix + covariance_of(half.rig).matrix - shared @ shared.T
+    return matrix
+
+
+def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement:
+    """Compare all calibrated parameters of two calibrations of one rig, turns as small turns."""
+    first, second = (half.rig for half in halves)
+    names = covariance_of(first).parameters
+    apart = np.array([value(second, name) - value(first, name) for name in names])
+    for camera in first.cameras:
+        turns = [f"{camera}.{axis}" for axis in POSE[:3]]
+        if set(turns) <= set(names):
+            turn = second.cam_from_rig[camera].rotation * first.cam_from_rig[camera].rotation.inv()
+            apart[[names.index(name) for name in turns]] = turn.as_rotvec()
+    matrix = _difference_covariance(halves)
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    known = values > _LEAST_KNOWN * values[-1]
+    along = vectors[:, known].T @ (scale * apart)
+    return HalvesAgreement(
+        chi2=float((along**2 / values[known]).sum()), parameters=int(known.sum())
+    )
+
+
 def halves_difference(
-    halves: tuple[Rig, Rig],
+    halves: tuple[Calibration, Calibration],
     camera: str,
     pixels: Array,
     range_m: float,
     anchors_cam: Array,
-    prior: Prior = NO_PRIOR,
 ) -> HalvesDifference:
     """Compare two calibrations as mrcal does: over the frame, after the best pose.
 
-    An error d of the prior's mean, of information I, moves a calibration of covariance S by S I d.
-    Both halves have the same d, so that most of it does not show: what differs are the errors by
-    noise, S - S I S of each, and (S1 - S2) I d.
-
     Args:
-        halves: the rigs.
+        halves: from different views of the same target.
         camera: which camera.
         pixels: (R, C, 2) where to evaluate.
         range_m: distance of the points along the axis.
         anchors_cam: (A, 3) points in the camera's frame that fix the pose between both.
-        prior: what both calibrations took as known.
     """
-    first, second = (rig.cameras[camera] for rig in halves)
+    rig, second = halves[0].rig, halves[1].rig.cameras[camera]
+    first = rig.cameras[camera]
     pose = _best_pose(first, second, anchors_cam)
     flat = pixels.reshape(-1, 2)
     points = first.at_depth(flat, range_m)
-    variance, shared = np.zeros(len(flat)), np.zeros((len(flat), 2, len(prior.parameters)))
-    for rig, sign in zip(halves, (-1.0, 1.0), strict=True):
-        _, by_point, plain = camera_slopes(rig, camera, points)
-        moved = plain + pose_jacobian(by_point, points) @ compensation(rig, camera, anchors_cam)
-        covariance = covariance_of(rig)
-        at = [covariance.parameters.index(name) for name in prior.parameters]
-        by_prior = moved @ covariance.matrix[:, at]
-        shared += sign * by_prior
-        variance += np.einsum("nap,pq,naq->n", moved, covariance.matrix, moved)
-        variance -= np.einsum("nap,pq,naq->n", by_prior, prior.information, by_prior)
-    variance += np.einsum("nap,pq,naq->n", shared, prior.information, shared)
+    _, by_point, plain = camera_slopes(rig, camera, points)
+    moved = plain + pose_jacobian(by_point, points) @ compensation(rig, camera, anchors_cam)
+    variance = np.einsum("nap,pq,naq->n", moved, _difference_covariance(halves), moved)
     return HalvesDifference(
         pixels=pixels,
         difference_px=(second.project(pose.apply(points)) - flat).reshape(pixels.shape),

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from reportlab.lib.units import mm
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import CalibrationError
+from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.targets.target import (
     TAG_BORDER_BITS,
@@ -20,6 +20,7 @@ from camera_calib.targets.target import (
     Target,
     aruco_dictionary,
     parse_target,
+    read_target,
     write_target,
 )
 
@@ -230,12 +231,14 @@ def write_sheet(
         The path of the JSON file, and the page.
 
     Raises:
-        CalibrationError: the suffix or the paper is unknown, or the target does not fit.
+        CalibrationError: the suffix or the paper is unknown, the target does not fit, or the JSON
+            file is there and describes something else.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise CalibrationError(f"{path}: write to a name that ends in {', '.join(SUFFIXES)}")
-    sheet = lay_out(target, paper)
+    sheet, described = lay_out(target, paper), path.with_suffix(".json")
+    _check_description(described, target)
     with atomic_path(path) as temporary:
         if suffix == ".pdf":
             temporary.write_bytes(to_pdf(sheet))
@@ -243,9 +246,22 @@ def write_sheet(
             temporary.write_text(to_svg(sheet), encoding="utf-8")
         else:
             _write_png(sheet, temporary, dpi)
-    described = path.with_suffix(".json")
     write_target(described, target)
     return described, sheet
+
+
+def _check_description(path: Path, target: Target) -> None:
+    """Keep the description of another target, whose sheets may be printed already."""
+    if not path.exists():
+        return
+    try:
+        known = read_target(path).description
+    except AliceError:
+        known = "something else"
+    if known != target.description:
+        raise CalibrationError(
+            f"{path} describes {known}, and would be replaced: choose another name with -o"
+        )
 
 
 def _write_png(sheet: Sheet, path: Path, dpi: float) -> None:

@@ -39,9 +39,9 @@ class FootprintAt:
 
     altitude_m: float
     across_m: float
-    """Width of a footprint on the middle row."""
+    """Width of the rectangle between the footprint's corners: what is surely seen."""
     along_m: float
-    """Length of a footprint on the middle column."""
+    """Its length."""
     pixel_m: float
     """The central pixel on the sea floor (paraxial)."""
     stereo_across_m: float
@@ -64,15 +64,15 @@ class Spacing:
     spacing_m: float
     bound_by: str
     mean_overlap: float
-    """Side overlap of one camera's pictures on the middle row, at the mean altitude."""
+    """Side overlap of what one camera's pictures surely see, at the mean altitude."""
     top_overlap: float
-    """Side overlap on the middle row at the top of the relief."""
+    """The same at the top of the relief."""
     off_track_overlap: float
     """Side overlap at the top of the relief where two neighbours are each off by the track error,
     away from each other."""
     area_overlap: float
     """Share of the area of one camera's picture that the picture abeam on the next line sees too,
-    at the mean altitude. Less than on the middle row: through a port a footprint bulges."""
+    at the mean altitude."""
     swath_overlap: float
     """Side overlap of what one camera surely sees on a line, between its pictures."""
     stereo_overlap: float
@@ -297,9 +297,10 @@ def footprint_rows(prints: FootprintRange) -> list[Setting]:
     top, mean, bottom = over
     where = f"from {top.altitude_m:.3g} / {mean.altitude_m:.3g} / {bottom.altitude_m:.3g} m"
     return settings_of("footprint and lines", [
-        ("footprint across", tuple(p.across_m for p in over), "m", "middle row, traced", _PORT,
-         "altitude_m", f"{where} altitude: top, mean and bottom of the relief"),
-        ("footprint along", tuple(p.along_m for p in over), "m", "middle column, traced", _PORT,
+        ("footprint across", tuple(p.across_m for p in over), "m", "traced", _PORT,
+         "altitude_m", f"{where} altitude: top, mean and bottom of the relief. The rectangle "
+         "between the corners, which is surely seen; the sides bulge beyond it"),
+        ("footprint along", tuple(p.along_m for p in over), "m", "traced", _PORT,
          "altitude_m", ""),
         ("pixel on the floor", tuple(p.pixel_m * 1e3 for p in over), "mm", "D / f", _PORT,
          "altitude_m", ""),
@@ -324,8 +325,8 @@ def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> 
         ("side overlap", (spacing.mean_overlap, spacing.top_overlap, spacing.off_track_overlap),
          "%", "1 - (s + 2 e) / W", _GEOMETRY, "line spacing",
          f"at the mean / over the top of the relief / there with lines each "
-         f"{plan.track_error_m:g} m off (track_error_m). All on the middle row; footprints "
-         f"bulge through a port: by area whole pictures share {spacing.area_overlap:.1%}, "
+         f"{plan.track_error_m:g} m off (track_error_m). All of the rectangles between the "
+         f"corners; by area whole pictures share {spacing.area_overlap:.1%}, "
          f"and the swaths that lines surely see {spacing.swath_overlap:.1%}, at the mean"),
         ("stereo side overlap", spacing.stereo_overlap, "%", "(2 half swath - s) / swath",
          _GEOMETRY, "line spacing",

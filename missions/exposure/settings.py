@@ -101,7 +101,7 @@ class ImagingSettings:
     """Shortest interval of camera and trigger controller."""
     station_spacing_m: float
     forward_overlap: float
-    """Forward overlap as reached, on the middle column."""
+    """Forward overlap as reached, of the rectangles that pictures surely see."""
     strobe_pulse_s: float
     strobe_lead_s: float
     strobe_duty: float

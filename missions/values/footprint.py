@@ -9,6 +9,7 @@ from shapely.geometry import Polygon
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
 from camera_calib.camera import Camera
+from camera_calib.fov.table import sides_of, sure_size_m
 from camera_calib.rig import Rig
 
 _POINTS_PER_SIDE = 16
@@ -109,7 +110,9 @@ def footprint_polygon(
 
 
 def footprint_size_m(camera: Camera, altitude_m: float) -> tuple[float, float]:
-    """Across and along size of a level camera's footprint, on the middle row and column.
+    """Across and along size of the upright rectangle that a level camera surely sees.
+
+    See `camera_calib.fov.table.sure_size_m`.
 
     Args:
         camera: the camera.
@@ -118,12 +121,10 @@ def footprint_size_m(camera: Camera, altitude_m: float) -> tuple[float, float]:
     Raises:
         PlanError: part of the picture looks past the sea floor.
     """
-    w, h = float(camera.width_px), float(camera.height_px)
-    middles = np.array([[0.0, h / 2], [w, h / 2], [w / 2, 0.0], [w / 2, h]])
-    hits = camera.at_depth(middles, camera.front_cam[2] + altitude_m)
-    if not np.all(np.isfinite(hits)):
+    size_m = sure_size_m(camera, camera.front_cam[2] + altitude_m)
+    if not np.all(np.isfinite(size_m)):
         raise PlanError("the camera does not see the sea floor with its whole frame")
-    return float(hits[1, 0] - hits[0, 0]), float(hits[3, 1] - hits[2, 1])
+    return size_m
 
 
 def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath:
@@ -148,9 +149,7 @@ def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath
         raise PlanError(
             f"camera {name} does not see the sea floor {altitude_m:g} m below with its whole frame"
         )
-    closed = np.vstack([border, border[:1]])
-    n = len(border) // 4
-    top, starboard, bottom, port = (closed[k * n : (k + 1) * n + 1] for k in range(4))
+    top, starboard, bottom, port = sides_of(border)
     middle = (top[:, 0].min() + bottom[:, 0].max()) / 2
     return Swath(
         port_m=_least_reach(port[:, 0] - middle, -port[:, 1], step_m),

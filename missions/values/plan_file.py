@@ -87,12 +87,12 @@ class Plan:
     strobe_pulse_s: float
     strobe_lead_s: float
     footprint_m: tuple[float, float]
-    """Across and along the track, on the middle row and column of a picture."""
+    """Across and along the track, of the rectangle that a picture surely shows."""
     line_spacing_m: float
     station_spacing_m: float
     reached_forward_overlap: float
     reached_side_overlap: float
-    """Side overlap of one camera's pictures, on the middle row and column."""
+    """Side overlap of one camera's pictures, of these rectangles."""
     lines: tuple[Line, ...]
     """Lines in the order of flight."""
     dives: tuple[Dive, ...]

@@ -14,7 +14,7 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
 from reconstruct.views.model import View
-from reconstruct.views.sight import FAST, KernelLens, pixel_at
+from reconstruct.views.range_shift import FAST, KernelLens, warped_at
 
 Float32 = NDArray[np.float32]
 Look = tuple[NDArray[np.uint8], NDArray[np.bool_]]
@@ -212,7 +212,7 @@ def count_witnesses(
     Args:
         depth: (H, W) of the reference.
         sigma: (H, W) of it.
-        slopes: (H, W, 2) ray slopes of the reference, see `sight.slopes_of`.
+        slopes: (H, W, 2) ray slopes of the reference, see `range_shift.slopes_of`.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
         other_depth: (h, w) of the other view.
         other_sigma: (h, w) of it.
@@ -226,7 +226,8 @@ def count_witnesses(
     height, width = depth.shape
     confirmed = np.zeros((height, width), np.int8)
     refuted = np.zeros((height, width), np.int8)
-    pinhole, t = other_lens[0], other_from_ref
+    pinhole, field, inverse_working = other_lens
+    t = other_from_ref
     middle_x, middle_y = 0.5 * other_depth.shape[1], 0.5 * other_depth.shape[0]
     reach_x, reach_y = (1 + _SHIFTED) * middle_x, (1 + _SHIFTED) * middle_y
     for row in range(height):
@@ -244,7 +245,7 @@ def count_witnesses(
             at_y = pinhole[1] * b / c + pinhole[3]
             if abs(at_x - middle_x) > reach_x or abs(at_y - middle_y) > reach_y:
                 continue
-            at_x, at_y = pixel_at(other_lens, a, b, c)
+            at_x, at_y = warped_at(field, inverse_working, at_x, at_y, 1.0 / c)
             u, v = math.floor(at_x), math.floor(at_y)
             if u < 0 or v < 0 or u >= other_depth.shape[1] or v >= other_depth.shape[0]:
                 continue

@@ -47,7 +47,7 @@ class Conditions:
 def matching_scale(view: View) -> float:
     """1, 1/2, 1/4, ...: the largest at which a picture has no more than `LARGEST_PIXELS`."""
     scale = 1.0
-    while view.width_px * view.height_px * scale * scale > LARGEST_PIXELS:
+    while np.prod(view.pinhole.size_px) * scale * scale > LARGEST_PIXELS:
         scale /= 2.0
     return scale
 
@@ -144,7 +144,7 @@ def _looks(workspace: Path, view: View, scales: Sequence[float]) -> list[Look]:
     found = []
     for scale in scales:
         small = scaled_view(view, scale)
-        part, usable = _resized(colour, valid, (small.width_px, small.height_px))
+        part, usable = _resized(colour, valid, small.pinhole.size_px)
         found.append((normalise(part), usable))
     return found
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.model import View, enu_from_cam
-from reconstruct.views.sight import FAST, KernelLens, lens_of, slopes_of
+from reconstruct.views.range_shift import FAST, KernelLens, slopes_of
 
 Float32 = NDArray[np.float32]
 
@@ -65,7 +65,7 @@ def points_in_box(
     """
     transform = enu_from_cam(view, offset_enu)
     enu, normals, colours, sigmas = gather(
-        depth, sigma, kept, colour, factors, lens_of(view), transform, np.array(box),
+        depth, sigma, kept, colour, factors, view.kernel_lens, transform, np.array(box),
         _meeting(blocks, offset_enu, box),
     )  # fmt: skip
     return Points(

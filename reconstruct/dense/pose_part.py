@@ -11,11 +11,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
+from alice_survey.base.records import MappingRecord, RegistrationRecord
 from alice_survey.base.run import progress
 from reconstruct.views.model import SparseModel
 
@@ -23,8 +24,6 @@ _COMPANY = 16
 """Sparse points around a spot of which the median counts: a single one may be a wrong match."""
 _NODE_CELLS = 16
 """Cells of the DEM between places where it is computed."""
-_SAME = 1e-6
-"""Share of the model's size: how far points of the two files may lie apart."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,10 +88,14 @@ def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
     from reconstruct.mapping.uncertainty import read_uncertainty
 
     known = read_uncertainty(path)
-    down = _down_in_mapping(workspace / "mapping" / "model", model, known.point_ids)
-    if down is None:
+    placed = RegistrationRecord.read(workspace / "sparse" / "registration.json")
+    mapped = MappingRecord.read(workspace / "mapping" / "mapping.json")
+    if mapped.gauge != placed.gauge or len(known.point_ids) != len(model.points_world):
         warn("mapping/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
         return None
+    # The world's third axis in the mapping's axes, as long as a unit there is in the world.
+    place = placed.world_from_mapping
+    down = place.scale * Rotation.from_quat(place.quaternion_xyzw).as_matrix()[2]
     poses = known.point_cov - known.point_noise
     own = np.einsum("i,nij,j->n", down, poses, down)
     seen = np.isfinite(own)
@@ -100,23 +103,3 @@ def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
         warn("mapping/covariance.npz knows no point: sigma.tif leaves out errors of poses")
         return None
     return PosePart(places=model.points_world[seen, :2], variances=np.maximum(own[seen], 0.0))
-
-
-def _down_in_mapping(folder: Path, model: SparseModel, ids: NDArray[np.int64]) -> Array | None:
-    """The world's third axis in the mapping's axes, as long as a unit there is in the world.
-
-    None where the points of the mapping (with these ids) are not those of the placed model.
-    """
-    from reconstruct.placing.alignment import align_similarity
-    from reconstruct.views.model_files import read_reconstruction
-
-    mapped = read_reconstruction(folder).points3D
-    if not 3 <= len(ids) == len(model.points_world) or any(int(i) not in mapped for i in ids):
-        return None
-    points = np.array([mapped[int(i)].xyz for i in ids])
-    move = align_similarity(points, model.points_world)
-    size = np.ptp(model.points_world, axis=0).max()
-    if np.abs(move.apply(points) - model.points_world).max() > _SAME * size:
-        return None
-    down: Array = move.scale * move.rotation.as_matrix()[2]
-    return down

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.model import View
-from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of
+from reconstruct.views.range_shift import FAST, KernelLens, between_nodes
 
 _LEAST_COSINE = 0.75
 """Least cosine of the angle by which a view may be turned."""
@@ -46,11 +46,6 @@ class Rectification:
     virtual axis."""
 
 
-def intrinsics(view: View) -> Array:
-    """The (3, 3) matrix that takes rays in the camera to pixels."""
-    return np.array([[view.fx_px, 0.0, view.cx_px], [0.0, view.fy_px, view.cy_px], [0.0, 0.0, 1.0]])
-
-
 def rectify(reference: View, partner: View, points_world: Array) -> Rectification | None:
     """Find the virtual pictures of a pair that hold what both see.
 
@@ -76,12 +71,12 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
     world_from_rect = Rotation.from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1))
     # a picture turned by t is stretched by cos(t)^-3 in area at its middle: undo it on average
     stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in axes])) ** 0.5
-    focal = (reference.fx_px + reference.fy_px) / 2.0 / stretch
+    focal = reference.pinhole.focal_px / stretch
     homographies, boxes, cosines = [], [], []
     for view in (reference, partner):
         rotation = (world_from_rect.inv() * view.world_from_cam.rotation).as_matrix()
-        homography = np.diag([focal, focal, 1.0]) @ rotation @ np.linalg.inv(intrinsics(view))
-        w, h = view.width_px, view.height_px
+        homography = np.diag([focal, focal, 1.0]) @ rotation @ np.linalg.inv(view.pinhole.matrix)
+        w, h = view.pinhole.size_px
         corners = np.array([[0.0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]]) @ homography.T
         if corners[:, 2].min() <= 0.2:
             return None
@@ -158,9 +153,9 @@ def depth_in_reference(
     corner = np.array([[1.0, 0, _HALF], [0, 1, _HALF], [0, 0, 1]])
     depth: NDArray[np.float32] = triangulate(
         disparity_px,
-        (reference.height_px, reference.width_px),
-        lens_of(reference),
-        lens_of(partner),
+        reference.pinhole.size_px[::-1],
+        reference.kernel_lens,
+        partner.kernel_lens,
         np.linalg.inv(corner) @ rectification.rect_from_reference,
         np.linalg.inv(corner) @ rectification.rect_from_partner,
         rectification.cosines,
@@ -209,7 +204,7 @@ def triangulate(
     back = np.linalg.inv(g)
     c = cosines
     pinhole, other = reference[0], partner[0]
-    near, far = reference[1][3], partner[1][3]
+    near, far = reference[2], partner[2]
     for row in range(height):
         y = row + 0.5
         for column in range(width):
@@ -237,8 +232,8 @@ def triangulate(
                 v = (back[1, 0] * right + back[1, 1] * level + back[1, 2]) * w
                 other_ray = c[1, 2] + c[1, 0] * (u - other[2]) / other[0]
                 other_ray += c[1, 1] * (v - other[3]) / other[1]
-                ax, ay = field_of(reference, x, y)
-                bx, by = field_of(partner, u, v)
+                ax, ay, _, _, _, _ = between_nodes(reference[1], x, y)
+                bx, by, _, _, _, _ = between_nodes(partner[1], u, v)
                 for _ in range(_ROUNDS):
                     inverse_reach = shifted / focal_baseline
                     step = ray * inverse_reach - near

@@ -26,7 +26,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.views.interpolation import spline_slopes, spline_weights
 from reconstruct.views.model import View
-from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
+from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at
 
 Float32 = NDArray[np.float32]
 
@@ -97,15 +97,13 @@ def pixel_lines(lens: KernelLens, height: int, width: int) -> Float32:
 
     Slopes x/z, y/z at an inverse depth of zero, and how they change with it.
     """
-    pinhole, shift = lens
+    pinhole, field, inverse_working = lens
     lines = np.empty((height, width, 4), np.float32)
     for row in range(height):
         for column in range(width):
-            a, b = field_of(lens, column + 0.5, row + 0.5)
-            lines[row, column, 0] = (column + 0.5 - a * shift[3] - pinhole[2]) / pinhole[0]
-            lines[row, column, 1] = (row + 0.5 - b * shift[3] - pinhole[3]) / pinhole[1]
-            lines[row, column, 2] = a / pinhole[0]
-            lines[row, column, 3] = b / pinhole[1]
+            line = line_of(pinhole, field, inverse_working, column + 0.5, row + 0.5)
+            for k in range(4):
+                lines[row, column, k] = line[k]
     return lines
 
 
@@ -139,7 +137,7 @@ def compare(
     rest = np.full((height, width), np.nan, np.float32)
     slope = np.full((height, width), np.nan, np.float32)
     speed = np.full((height, width), np.nan, np.float32)
-    fx, fy = other_lens[0][0], other_lens[0][1]
+    pinhole, field, inverse_working = other_lens
     t = other_from_ref
     for row in range(height):
         for column in range(width):
@@ -154,7 +152,10 @@ def compare(
             deep = c + w * t[2, 3]
             if deep <= 0.0:
                 continue
-            u, v = pixel_at(other_lens, (a + w * t[0, 3]) / w, (b + w * t[1, 3]) / w, deep / w)
+            inverse = 1.0 / deep
+            u = pinhole[0] * (a + w * t[0, 3]) * inverse + pinhole[2]
+            v = pinhole[1] * (b + w * t[1, 3]) * inverse + pinhole[3]
+            u, v = warped_at(field, inverse_working, u, v, w * inverse)
             u -= 0.5
             v -= 0.5
             j, i = math.floor(u), math.floor(v)
@@ -175,9 +176,9 @@ def compare(
                 value += across[m] * line
                 down += changes[m] * line
                 right += across[m] * (b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3)
-            scale = 1.0 / (deep * deep)
-            du = fx * (t[0, 3] * c - a * t[2, 3]) * scale
-            dv = fy * (t[1, 3] * c - b * t[2, 3]) * scale
+            scale = inverse * inverse
+            du = pinhole[0] * (t[0, 3] * c - a * t[2, 3]) * scale
+            dv = pinhole[1] * (t[1, 3] * c - b * t[2, 3]) * scale
             rest[row, column] = reference[row, column] - value
             slope[row, column] = right * du + down * dv
             speed[row, column] = math.sqrt(du * du + dv * dv)
@@ -279,7 +280,7 @@ def _sums(
     shape = inverse.shape
     pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
     likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    lines = pixel_lines(lens_of(reference.view), *shape)
+    lines = pixel_lines(reference.view.kernel_lens, *shape)
     samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
     mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
     spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean
@@ -291,7 +292,7 @@ def _sums(
             lines,
             other.spline,
             other.valid,
-            lens_of(other.view),
+            other.view.kernel_lens,
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
         )
         known = np.isfinite(rest) & reference.valid

@@ -37,7 +37,7 @@ _LEAST_GAIN = 0.03
 def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
     """Whether points (N, 3) lie before the camera and inside of its picture, occluded or not."""
     pixels = view.project(points_world)
-    inside = (pixels >= 0) & (pixels < [view.width_px, view.height_px])  # NaN compares as False
+    inside = (pixels >= 0) & (pixels < view.pinhole.size_px)  # NaN compares as False
     return np.asarray(inside.all(axis=1))
 
 

@@ -153,7 +153,7 @@ def fuse_tile(
                 index,
                 depth,
                 sigma,
-                store.load_mask(index, "kept", view.width_px) & sure,
+                store.load_mask(index, "kept", view.pinhole.width_px) & sure,
                 store.load_colour(index),
                 light.factors(view.camera, view.image),
                 offset,

@@ -27,7 +27,7 @@ from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joine
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
-from reconstruct.views.sight import lens_of, slopes_of
+from reconstruct.views.range_shift import slopes_of
 
 _BOUND_PERCENT = 0.1
 """Share of a view's points left out on each of its four sides, so that none strays far off."""
@@ -57,7 +57,7 @@ def prepare_view(workspace: Path, task: ViewTask) -> None:
     store, view = task.store, task.view
     if store.has(task.index, "low"):
         return
-    size_px = (view.width_px, view.height_px)
+    size_px = view.pinhole.size_px
     colour, valid = shrunk(Pictures.open(workspace), view.image, size_px)
     store.save_colour(task.index, colour)
     store.save_mask(task.index, "valid", valid)
@@ -87,12 +87,12 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     store = task.store
     if store.has(task.index, "agreeing"):
         return
-    shape = (task.view.height_px, task.view.width_px)
+    shape = task.view.pinhole.size_px[::-1]
     depths, sigmas = [], []
     for number, partner in task.others:
         looks = (
             (_evened(store, task.index), store.load_mask(task.index, "valid", shape[1])),
-            (_evened(store, number), store.load_mask(number, "valid", partner.width_px)),
+            (_evened(store, number), store.load_mask(number, "valid", partner.pinhole.width_px)),
         )
         found = pair_depth((task.view, partner), looks, points_world, match_sigma_px)
         if found is not None:
@@ -114,7 +114,7 @@ def refine_view(task: ViewTask) -> None:
         return
     looks = []
     for number, view in ((task.index, task.view), *task.others):
-        contrast, spline, valid = _look(store, number, view.width_px)
+        contrast, spline, valid = _look(store, number, view.pinhole.width_px)
         looks.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     depth, sigma = store.load_depth(task.index, "depth")
     refined = refine(looks[0], depth, sigma, looks[1:])
@@ -187,7 +187,7 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
     alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
     refuted = np.zeros_like(alike)
     supported = np.zeros_like(alike)
-    slopes = slopes_of(depth, lens_of(view))
+    slopes = slopes_of(depth, view.kernel_lens)
     for number, other in task.others:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
         other_depth, other_sigma = store.load_depth(number, "fine")
@@ -198,7 +198,7 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
             other_depth,
             other_sigma * np.float32(sigma_factor),
-            lens_of(other),
+            other.kernel_lens,
             GATE_SIGMAS,
         )
         supported += seen
@@ -225,7 +225,7 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),
-        footprint=float(np.median(depth[kept]) / np.sqrt(view.fx_px * view.fy_px)),
+        footprint=float(np.median(depth[kept]) / view.pinhole.focal_px),
         sigma=float(np.median(sigma[kept])),
         light=_shared_light(task, points, rows, columns),
         nodes=nodes,
@@ -236,16 +236,15 @@ def _shared_light(
     task: ViewTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> LightSamples:
     """Compare the light of a view and its neighbours on a lattice of its pixels."""
-    step = max(1, task.view.width_px // _LIGHT_LATTICE)
+    step = max(1, task.view.pinhole.width_px // _LIGHT_LATTICE)
     chosen = (rows % step == 0) & (columns % step == 0)
     spots = points[chosen]
-    size = np.array([task.view.width_px, task.view.height_px])
-    here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / size
+    here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / task.view.pinhole.size_px
     own = np.asarray(task.store.load(task.index, "low"))
     parts = []
     for number, other in task.others:
         seen = in_frame(other, spots)
-        there = other.project(spots[seen]) / [other.width_px, other.height_px]
+        there = other.project(spots[seen]) / other.pinhole.size_px
         parts.append(
             compare_light(
                 (task.index, number),

@@ -36,7 +36,7 @@ def ground_pixel_of(model: SparseModel) -> float:
         seen = model.observations[model.observations[:, 1] == index, 0]
         if len(seen):
             depth = view.world_from_cam.inv().apply(model.points_world[seen])[:, 2]
-            pixels.append(depth / (0.5 * (view.fx_px + view.fy_px)))
+            pixels.append(depth / view.pinhole.focal_px)
     return float(np.median(np.concatenate(pixels)))
 
 

@@ -23,6 +23,7 @@ from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, first_pictures, observed
 from reconstruct.mapping.database import as_transform
@@ -30,7 +31,6 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.pictures.files import named
-from reconstruct.views.lens import Lens
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
 """A station is off navigation when it misses by more than both."""
@@ -246,12 +246,12 @@ def scale_trend(
 
 
 def navigation_rotations(
-    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens]
+    records: Sequence[ImageRecord], rig: Rig, warps: Mapping[str, PinholeWarp]
 ) -> dict[int, Rotation]:
     """`ned_from_pinhole` by picture's index, where navigation has attitudes."""
     return {
         i: rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg]))
-        * (rig.body_from_cam(r.camera) * lenses[r.camera].pinhole_from_cam.inv()).rotation
+        * (rig.body_from_cam(r.camera) * warps[r.camera].pinhole_from_cam.inv()).rotation
         for i, r in enumerate(records)
         if r.has_attitude
     }
@@ -422,8 +422,8 @@ def judge_model(
     """
     positions = sigmas = np.full((len(records), 3), np.nan)
     if datum is not None:
-        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
-    rotations = navigation_rotations(records, rig, mapped.lenses)
+        positions, sigmas = pinhole_positions(records, rig, mapped.warps, datum)
+    rotations = navigation_rotations(records, rig, mapped.warps)
     doming = measure_doming(mapped.model, positions, sigmas, rotations)
     # What adjustments made of the rig, before its size was put back.
     rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0

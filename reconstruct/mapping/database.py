@@ -2,7 +2,8 @@
 
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
-from reconstruct.matching.matches import PairMatches
+from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp
+from reconstruct.matching.matches import PairMatches, as_seen
 
 VerifiedPair = tuple[int, int, PairMatches]
 """Indices of two pictures and what they share."""
@@ -26,9 +28,19 @@ class Observations:
     images: Sequence[ImageRecord]
     cameras: Mapping[str, pycolmap.Camera]
     """Cameras by name; the first is the reference of the rig."""
-    pixels: Sequence[Array]
-    """Keypoints of every picture, (N, 2)."""
+    taken: Sequence[Array]
+    """Keypoints of every picture, (N, 2) pixels as taken."""
     pairs: Sequence[VerifiedPair]
+    warps: Mapping[str, PinholeWarp] = field(default_factory=dict)
+    """Warps to the pinholes `cameras`; none where cameras calibrate themselves."""
+
+    @cached_property
+    def pixels(self) -> Sequence[Array]:
+        """Keypoints as `cameras` see them, (N, 2); see `as_seen`."""
+        return [
+            as_seen(rows, self.warps.get(record.camera))
+            for record, rows in zip(self.images, self.taken, strict=True)
+        ]
 
 
 def new_folder(path: Path) -> Path:
@@ -70,6 +82,17 @@ def write_database(
             database.write_frame(frame, use_frame_id=True)
         for i, j, pair in seen.pairs:
             _write_pair(database, i + 1, j + 1, pair)
+
+
+def colmap_pinhole(pinhole: Pinhole) -> pycolmap.Camera:
+    """A pinhole as COLMAP's camera."""
+    return pycolmap.Camera(
+        model="PINHOLE",
+        width=pinhole.width_px,
+        height=pinhole.height_px,
+        params=pinhole.numbers,
+        has_prior_focal_length=True,
+    )
 
 
 def rigid3d(pose: RigidTransform) -> pycolmap.Rigid3d:

@@ -21,12 +21,12 @@ from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.database import as_transform as as_transform
 from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
 from reconstruct.pictures.files import named
-from reconstruct.views.lens import Lens
 
 Method = Literal["auto", "global", "incremental"]
 """How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""
@@ -57,8 +57,8 @@ class Mapped:
     """The largest model that the pictures gave."""
 
     model: pycolmap.Reconstruction
-    lenses: Mapping[str, Lens]
-    """Lens of each camera of the model."""
+    warps: Mapping[str, PinholeWarp]
+    """Each camera of the model, and its pinhole."""
     models: tuple[int, ...]
     """Pictures in each model found, most first; all but the first were dropped."""
     scaled: bool
@@ -74,7 +74,6 @@ class Mapped:
 def map_calibrated(
     seen: Observations,
     cam_from_rig: Mapping[str, RigidTransform],
-    lenses: Mapping[str, Lens],
     folder: Path,
     seed: int,
     *,
@@ -85,15 +84,14 @@ def map_calibrated(
 
     Args:
         seen: pinhole cameras, keypoints as the pinholes see them, matches.
-        cam_from_rig: poses of the flat-port cameras on the rig.
-        lenses: between those cameras and their pinholes, whose centres they shift.
+        cam_from_rig: poses of the cameras on the rig; their pinholes' centres lie elsewhere.
         folder: for scratch files.
         seed: of the mapper.
         method: all stations at once, one after the other, or the first if it works.
         executor: where tasks run for work on pairs; the result does not depend on it.
     """
     pinhole_from_rig = {
-        name: lenses[name].pinhole_from_cam * cam_from_rig[name] for name in seen.cameras
+        name: warp.pinhole_from_cam * cam_from_rig[name] for name, warp in seen.warps.items()
     }
     found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
     model = largest(found, seen.images)
@@ -106,7 +104,7 @@ def map_calibrated(
             scale_model(model, factor)
     return Mapped(
         model=model,
-        lenses=lenses,
+        warps=seen.warps,
         models=sizes(found),
         scaled=len(seen.cameras) > 1,
         baseline=known,

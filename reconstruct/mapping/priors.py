@@ -15,13 +15,13 @@ import pycolmap
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import first_pictures
 from reconstruct.mapping.bundle import FULLY, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.matching.pairs import positions_ned
-from reconstruct.views.lens import Lens
 
 Adjust = Callable[[Mapped, float], Mapped]
 """Adjusts a model, rig and cameras held, to a relative change of the cost; the one given is not
@@ -33,7 +33,7 @@ _WORST_GROWTH = 1.05
 
 
 def pinhole_positions(
-    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens], datum: Datum
+    records: Sequence[ImageRecord], rig: Rig, warps: Mapping[str, PinholeWarp], datum: Datum
 ) -> tuple[Array, Array]:
     """The pinholes' centres by navigation.
 
@@ -52,7 +52,7 @@ def pinhole_positions(
             continue
         attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
         body_from_pinhole = (
-            rig.body_from_cam(record.camera) * lenses[record.camera].pinhole_from_cam.inv()
+            rig.body_from_cam(record.camera) * warps[record.camera].pinhole_from_cam.inv()
         )
         lever = body_from_pinhole.translation
         positions[i] = bodies[i] + rotation_from_attitude(*attitude).apply(lever)
@@ -85,7 +85,7 @@ class NavigationAdjuster:
         self,
         records: Sequence[ImageRecord],
         rig: Rig,
-        lenses: Mapping[str, Lens],
+        warps: Mapping[str, PinholeWarp],
         datum: Datum | None,
     ) -> None:
         """Take the positions of navigation.
@@ -93,11 +93,11 @@ class NavigationAdjuster:
         Args:
             records: pictures; number i has the id i + 1 in the model.
             rig: cameras.
-            lenses: by camera.
+            warps: by camera.
             datum: of the positions; None where there are none.
         """
         self._records = records
-        self._given = None if datum is None else pinhole_positions(records, rig, lenses, datum)
+        self._given = None if datum is None else pinhole_positions(records, rig, warps, datum)
         self._used = False
 
     def __call__(self, mapped: Mapped, tolerance: float = FULLY) -> Mapped:

@@ -1,14 +1,10 @@
-"""Exact flat-port refraction with COLMAP's own adjustment of ideal pinholes.
+"""Exact refraction with COLMAP's own adjustment of ideal pinholes.
 
 COLMAP has no refractive camera. The mapper's keypoints are warped to pinholes, exact at one
-working depth; once a point's depth z before the pinhole's centre is known, where an ideal pinhole
-sees the spot is known too (see `reconstruct.views.range_shift`):
-
-    ideal = warped + A(warped) (1/z - 1/z0).
-
-Keypoints are put there and the model is adjusted, until neither moves. What it converges to is the
-model that explains the pixels as taken through the port. Without a port A is zero, and nothing
-changes.
+working depth; once a point's depth before the pinhole's centre is known, where an ideal pinhole
+sees the spot is known too (see `camera_calib.approximation.pinhole_warp`). Keypoints are put there
+and the model is adjusted, until neither moves. What it converges to is the model that explains the
+pixels as taken through the port. Where rays meet in one centre nothing changes.
 """
 
 import shutil
@@ -23,14 +19,13 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.bundle import FULLY, ROUGHLY
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.priors import Adjust, adjust_freely
 from reconstruct.mapping.robust import pixel_sigma
-from reconstruct.views.lens import FlatPortLens, Lens
-from reconstruct.views.range_shift import field_of
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""
@@ -66,21 +61,21 @@ class Convergence:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Picture:
-    """Keypoints of one picture, and what the port does to them."""
+    """Keypoints of one picture, and their rays in water."""
 
+    warp: PinholeWarp
     warped: Array
     """(N, 2) keypoints as warped."""
-    field: Array
-    """(N, 2) A at every keypoint, px m; zero where it is not known."""
-    working_m: float
-    """z0, at which the warp is exact; infinite without a port."""
+    slope: Array
+    """(N, 2) slopes, and (N, 2) offsets from the pinhole's centre; see `PinholeWarp.lines`."""
+    offset: Array
 
     def ideal(self, at: Indices, depth_m: Array) -> Array:
         """Where the pinhole sees the spots of some keypoints, (M, 2), from their depths (M,)."""
-        metres = np.clip(depth_m, _NEAREST * self.working_m, _FARTHEST * self.working_m)
-        shift = self.field[at] * (1.0 / metres - 1.0 / self.working_m)[:, None]
-        ideal: Array = self.warped[at] + shift
-        return ideal
+        working = self.warp.working_depth_m
+        metres = np.clip(depth_m, _NEAREST * working, _FARTHEST * working)
+        ideal = self.warp.pinhole.pixels(self.slope[at] + self.offset[at] / metres[:, None])
+        return np.where(np.isfinite(ideal), ideal, self.warped[at])
 
 
 class Keypoints:
@@ -91,28 +86,23 @@ class Keypoints:
 
         Args:
             mapped: picture i of `seen` has the id i + 1 and its keypoints in the same order.
-            seen: keypoints as warped.
+            seen: keypoints.
         """
         self._pictures = {
-            number: _picture(mapped.lenses[seen.images[number - 1].camera], seen.pixels[number - 1])
+            number: _picture(mapped.warps[seen.images[number - 1].camera], seen, number - 1)
             for number, image in sorted(mapped.model.images.items())
             if image.has_pose
         }
         self._now = {number: p.warped.copy() for number, p in self._pictures.items()}
 
     @property
-    def through_ports(self) -> bool:
-        """Whether there is anything to correct."""
-        return any(np.isfinite(p.working_m) for p in self._pictures.values())
-
-    @property
     def shifted(self) -> bool:
         """Whether distance moves any keypoint; not so for a pinhole calibrated in water."""
-        return any(np.any(p.field) for p in self._pictures.values())
+        return any(p.warp.largest_offset_m > 0 for p in self._pictures.values())
 
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""
-        working = [p.working_m for p in self._pictures.values() if np.isfinite(p.working_m)]
+        working = [p.warp.working_depth_m for p in self._pictures.values()]
         return float(np.median(working) / np.median(observed(model).in_cameras[:, 2]))
 
     def correct(
@@ -133,7 +123,7 @@ class Keypoints:
         for n, number in enumerate(seen.pictures.tolist()):
             picture, rows = self._pictures[number], seen.of(n)
             at = seen.keypoint[rows]
-            if not (np.isfinite(picture.working_m) and len(at)):
+            if not len(at):
                 continue
             ideal = picture.ideal(at, depths[rows])
             largest = max(largest, self._put(model, number, at, ideal))
@@ -151,7 +141,7 @@ class Keypoints:
             picture, rows = self._pictures[number], seen.of(n)
             at = seen.keypoint[rows]
             rest = np.setdiff1d(np.arange(len(picture.warped)), at)
-            if not (np.isfinite(picture.working_m) and len(at) and len(rest)):
+            if not (len(at) and len(rest)):
                 continue
             _, nearest = KDTree(picture.warped[at]).query(picture.warped[rest])
             self._put(model, number, rest, picture.ideal(rest, depths[rows][nearest]))
@@ -185,10 +175,10 @@ def refract(
 
     Args:
         mapped: picture i of `seen` has the id i + 1.
-        seen: keypoints as warped, and the matches from which tracks are completed.
+        seen: keypoints, and the matches from which tracks are completed.
         folder: for scratch files.
         adjust: how to adjust, such as with priors.
-        cam_from_rig: poses of the flat-port cameras on one rig; None without one.
+        cam_from_rig: poses of the cameras on one rig; None without one.
         settle: go on until keypoints converge; else end after the first turn, near enough to refine
             the rig from.
         near: the model is exact already but for what the rig has moved since: judge at once.
@@ -197,10 +187,6 @@ def refract(
         The exact model, and how the keypoints converged.
     """
     keypoints = Keypoints(mapped, seen)
-    if not keypoints.through_ports:
-        mapped = adjust(mapped, FULLY)
-        none = Convergence(moved_px=(0.0,), corrected_px=0.0, removed=0, added=0, settled=True)
-        return mapped, none
     notes = mapped.notes
     if not mapped.scaled and keypoints.shifted:
         notes = (
@@ -254,9 +240,7 @@ def _pinholes(
 ) -> dict[str, RigidTransform] | None:
     if cam_from_rig is None:
         return None
-    return {
-        name: mapped.lenses[name].pinhole_from_cam * pose for name, pose in cam_from_rig.items()
-    }
+    return {name: mapped.warps[name].pinhole_from_cam * pose for name, pose in cam_from_rig.items()}
 
 
 def _judge_again(
@@ -295,12 +279,6 @@ def _wrong_px(model: pycolmap.Reconstruction) -> float:
     return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _LEAST_WRONG_PX, _MOST_WRONG_PX))
 
 
-def _picture(lens: Lens, warped: Array) -> _Picture:
-    if not isinstance(lens, FlatPortLens):
-        return _Picture(warped=warped, field=np.zeros_like(warped), working_m=np.inf)
-    field = field_of(lens, warped)
-    return _Picture(
-        warped=warped,
-        field=np.where(np.isfinite(field), field, 0.0),
-        working_m=lens.virtual.working_range_m - lens.virtual.centre_z_m,
-    )
+def _picture(warp: PinholeWarp, seen: Observations, index: int) -> _Picture:
+    slope, offset = warp.lines(seen.taken[index])
+    return _Picture(warp=warp, warped=seen.pixels[index], slope=slope, offset=offset)

@@ -21,20 +21,25 @@ from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord, read_manifest
 from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesRecord
 from alice_survey.stages import rig_file
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, read_rig
 from reconstruct.mapping.acceptance import judge_model
-from reconstruct.mapping.database import Observations, VerifiedPair
+from reconstruct.mapping.database import Observations, VerifiedPair, colmap_pinhole
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.rig_refinement import RefinedSurvey, frees_rig, refine_rig
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.mapping.uncertainty import save_uncertainty
-from reconstruct.mapping.working_range import WorkingDistances, find_distances
+from reconstruct.mapping.working_range import (
+    WorkingDistances,
+    find_distances,
+    warn_of_warps,
+    warp_record,
+)
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
-    as_seen,
     coarse_matches,
     match_pair,
 )
@@ -43,7 +48,6 @@ from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px, named
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
-from reconstruct.views.lens import Lens, flat_port_lens
 from reconstruct.views.model import datum_of
 
 RATIO = 0.8
@@ -99,9 +103,9 @@ def _map(
 ) -> None:
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
     features = _find_all(inputs, folder / "features", settings, executor)
-    lenses, distances = _lenses(inputs, features, settings, executor)
-    cameras, exif_focal = _cameras(inputs, lenses)
-    pairs = _match_all(inputs, features, cameras, lenses, seed, executor)
+    warps, distances = _warps(inputs, features, settings, executor)
+    cameras, exif_focal = _cameras(inputs, warps)
+    pairs = _match_all(inputs, features, cameras, warps, seed, executor)
     refined = refine_tracks(
         features,
         [_grey_file(path) for path in features],
@@ -111,24 +115,21 @@ def _map(
     seen = Observations(
         images=inputs.records,
         cameras=cameras,
-        pixels=[
-            as_seen(pixels, lenses.get(record.camera))
-            for record, pixels in zip(inputs.records, refined, strict=True)
-        ],
+        taken=refined,
         pairs=pairs,
+        warps=warps,
     )
     if inputs.rig is not None:
         poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
         mapped = map_calibrated(
             seen,
             poses,
-            lenses,
             folder,
             seed,
             method=settings.mapper,
             executor=executor,
         )
-        adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
+        adjust = NavigationAdjuster(inputs.records, inputs.rig, warps, inputs.datum)
         rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
         mapped, refracted = refract(mapped, seen, folder, adjust, poses, settle=not free)
         if free:
@@ -190,9 +191,9 @@ def _find_all(
     return targets
 
 
-def _lenses(
+def _warps(
     inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, executor: Executor
-) -> tuple[dict[str, Lens], WorkingDistances | None]:
+) -> tuple[dict[str, PinholeWarp], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
         return {}, None
@@ -204,15 +205,16 @@ def _lenses(
         ratio=RATIO,
         executor=executor,
     )
-    lenses: dict[str, Lens] = {
-        name: flat_port_lens(inputs.rig.cameras[name], distances.near_m, distances.far_m)
+    warps = {
+        name: best_warp(inputs.rig.cameras[name], distances.near_m, distances.far_m)
         for name in _camera_names(inputs)
     }
-    return lenses, distances
+    warn_of_warps(warps, distances)
+    return warps, distances
 
 
 def _cameras(
-    inputs: Inputs, lenses: Mapping[str, Lens]
+    inputs: Inputs, warps: Mapping[str, PinholeWarp]
 ) -> tuple[dict[str, pycolmap.Camera], set[str]]:
     """COLMAP's cameras: pinholes of a rig, else first guesses to calibrate from.
 
@@ -220,8 +222,8 @@ def _cameras(
     """
     cameras, stated = {}, set()
     for name in _camera_names(inputs):
-        if name in lenses:
-            cameras[name] = lenses[name].pinhole.colmap
+        if name in warps:
+            cameras[name] = colmap_pinhole(warps[name].pinhole)
             continue
         first = inputs.images / next(r.image for r in inputs.records if r.camera == name)
         height, width = read_colour(first).shape[:2]
@@ -259,7 +261,7 @@ def _match_all(
     inputs: Inputs,
     features: Sequence[Path],
     cameras: Mapping[str, pycolmap.Camera],
-    lenses: Mapping[str, Lens],
+    warps: Mapping[str, PinholeWarp],
     seed: int,
     executor: Executor,
 ) -> list[VerifiedPair]:
@@ -281,7 +283,7 @@ def _match_all(
             second=features[j],
             ratio=RATIO,
             cameras=(fields[names[i]], fields[names[j]]),
-            lenses=(lenses.get(names[i]), lenses.get(names[j])),
+            warps=(warps.get(names[i]), warps.get(names[j])),
             seed=seed,
         )
         for i, j in pairs
@@ -311,7 +313,7 @@ def _write(
     CamerasRecord.save(
         partial / "cameras.json",
         {
-            "cameras": {name: lens.to_json() for name, lens in mapped.lenses.items()},
+            "cameras": {name: warp.to_json() for name, warp in mapped.warps.items()},
             "images": {
                 r.image: {"camera": r.camera, "station": r.station, "mask": r.mask}
                 for r in inputs.records
@@ -334,6 +336,9 @@ def _write(
             "rig_factor": mapped.rig_factor,
             "distances": None if distances is None else vars(distances),
             "refraction": None if refracted is None else vars(refracted),
+            "warps": {
+                name: warp_record(warp, distances).to_json() for name, warp in mapped.warps.items()
+            },
             "doming": None if doming is None else doming.to_json(),
             "acceptance": None if accepted is None else accepted.to_json(),
             "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),

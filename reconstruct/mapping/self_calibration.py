@@ -6,7 +6,7 @@ states is kept unless the pictures contradict it, and the full lens model is acc
 comes out sane.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +17,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import warn
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.formats.camera_files import CameraRecord, camera_of
 from reconstruct.mapping.bundle import all_pictures, direct_solver
-from reconstruct.mapping.database import Observations
+from reconstruct.mapping.database import Observations, colmap_pinhole
 from reconstruct.mapping.mapper import (
     Mapped,
     as_transform,
@@ -29,7 +31,6 @@ from reconstruct.mapping.mapper import (
     scale_model,
     sizes,
 )
-from reconstruct.views.lens import Lens, self_calibrated_lens
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""
@@ -95,21 +96,40 @@ def map_self_calibrated(
         notes.append(
             "the stereo rig calibrated itself; unless scaled, its baseline is the unit of length"
         )
-    lenses: dict[str, Lens] = {
-        name: self_calibrated_lens(model.cameras[number])
+    warps = {
+        name: self_calibrated_warp(model.cameras[number])
         for number, name in enumerate(seen.cameras, 1)
         if number in model.cameras
     }
-    _to_pinholes(model, list(seen.cameras), lenses)
+    _to_pinholes(model, list(seen.cameras), warps)
     return Mapped(
         model=model,
-        lenses=lenses,
+        warps=warps,
         models=sizes(found),
         scaled=False,
         baseline=baseline,
         rig_factor=factor,
         notes=(*notes, *report_left_out(found)),
     )
+
+
+def self_calibrated_warp(camera: pycolmap.Camera) -> PinholeWarp:
+    """A camera that COLMAP calibrated, without distortion; its pinhole has the same centre.
+
+    COLMAP's models here are OpenCV's, with its pixels counted from the same corner as ours.
+
+    Raises:
+        CalibrationError: a value is out of any camera's range.
+    """
+    record = CameraRecord(
+        camera_id=int(camera.camera_id),
+        model=str(camera.model_name),
+        width_px=camera.width,
+        height_px=camera.height,
+        params=tuple(float(p) for p in camera.params),
+    )
+    # Of one centre: exact at every distance.
+    return best_warp(camera_of(Path("pictures"), record), 1.0, 1.0)
 
 
 def rig_from_model(
@@ -195,17 +215,17 @@ def _adjust(model: pycolmap.Reconstruction, *, focal: bool) -> None:
 
 
 def _to_pinholes(
-    model: pycolmap.Reconstruction, names: Sequence[str], lenses: dict[str, Lens]
+    model: pycolmap.Reconstruction, names: Sequence[str], warps: Mapping[str, PinholeWarp]
 ) -> None:
     """Make the model one of ideal pinholes, in place."""
-    of_camera = {n: lenses[name] for n, name in enumerate(names, 1) if name in lenses}
+    of_camera = {n: warps[name] for n, name in enumerate(names, 1) if name in warps}
     for image in model.images.values():
-        lens, points = of_camera[image.camera_id], image.points2D
-        ideal = lens.to_pinhole(np.array([p.xy for p in points]).reshape(-1, 2))
+        warp, points = of_camera[image.camera_id], image.points2D
+        ideal = warp.to_pinhole(np.array([p.xy for p in points]).reshape(-1, 2))
         for point, xy in zip(points, ideal, strict=True):
             point.xy = xy if np.all(np.isfinite(xy)) else np.full(2, -1e6)
-    for number, lens in of_camera.items():
-        camera, pinhole = model.cameras[number], lens.pinhole.colmap
+    for number, warp in of_camera.items():
+        camera, pinhole = model.cameras[number], colmap_pinhole(warp.pinhole)
         camera.model = pinhole.model
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = pinhole.params

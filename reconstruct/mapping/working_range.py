@@ -11,10 +11,13 @@ from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.records import WarpRecord
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import match_descriptors
+from reconstruct.views.range_shift import range_shift
 
 _STATIONS = 24
 """Stations looked at, spread evenly."""
@@ -24,6 +27,10 @@ _LARGEST_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
 """Nearest and farthest distances over the working range, when only the range is known."""
+_LARGEST_CONTRACTION = 0.5
+"""At which warped pictures are stretched by half, or twice as dense; at 1 they fold."""
+_LARGEST_CUT = 0.05
+"""Share of a frame whose loss is worth a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +98,37 @@ def find_distances(
         f"the distance to the sea floor is not known ({len(depths)} points in stereo matches, no "
         "altitude): set working_range_m under [reconstruct] in survey.toml"
     )
+
+
+def warp_record(warp: PinholeWarp, distances: WorkingDistances | None) -> WarpRecord:
+    """How well a pinhole stands in for a camera over distances; None: it has one centre."""
+    contraction = np.zeros(1)
+    if distances is not None:
+        ends = np.array([distances.near_m, distances.far_m])
+        contraction = range_shift(warp).contraction(ends - warp.centre_m[2])
+    return WarpRecord(
+        offset_m=warp.largest_offset_m,
+        contraction=float(contraction.max()),
+        cut_share=warp.cut_share,
+    )
+
+
+def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: WorkingDistances) -> None:
+    """Warn, one line a camera, where a pinhole stands in badly or leaves much of the frame out."""
+    for name, warp in warps.items():
+        found = warp_record(warp, distances)
+        if found.contraction > _LARGEST_CONTRACTION:
+            warn(
+                f"camera {name}: from {distances.near_m:.3g} to {distances.far_m:.3g} m its port "
+                f"shifts neighbouring pixels by up to {found.contraction:.2f} px differently, and "
+                "from 1 on two of them show one spot: centre the pupil behind the port, or keep "
+                "farther from the sea floor"
+            )
+        if found.cut_share > _LARGEST_CUT:
+            warn(
+                f"camera {name}: {found.cut_share:.0%} of its frame, at the edges, lie beyond the "
+                "undistorted picture and are left out: narrow the lens, or crop the pictures"
+            )
 
 
 def stereo_depths(task: _StereoTask) -> Array:

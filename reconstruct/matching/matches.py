@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.matching.features import Features, load_features
-from reconstruct.views.lens import Lens
 
 Matches = NDArray[np.uint32]
 _BLOCK = 1024
@@ -166,7 +166,7 @@ class PairTask:
     ratio: float
     cameras: tuple[dict[str, Any], dict[str, Any]] = field(default_factory=lambda: ({}, {}))
     """COLMAP cameras as `todict` gives them; empty for a coarse look."""
-    lenses: tuple[Lens | None, Lens | None] = (None, None)
+    warps: tuple[PinholeWarp | None, PinholeWarp | None] = (None, None)
     """What takes pixels to those of the cameras, where these are ideal pinholes."""
     seed: int = 0
 
@@ -205,7 +205,7 @@ def match_pair(task: PairTask) -> PairMatches:
     near narrows the search. Where they are near none, all are compared with all.
     """
     a, b = _features(task.first), _features(task.second)
-    seen = as_seen(a.pixels, task.lenses[0]), as_seen(b.pixels, task.lenses[1])
+    seen = as_seen(a.pixels, task.warps[0]), as_seen(b.pixels, task.warps[1])
     probe = min(len(a.pixels), _PROBE_FEATURES) * min(len(b.pixels), _PROBE_FEATURES)
     matches = None
     if len(a.pixels) * len(b.pixels) >= _WORTH_PROBING * probe:
@@ -309,15 +309,15 @@ def _verified(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> Pa
     )
 
 
-def as_seen(pixels: Array, lens: Lens | None) -> Array:
+def as_seen(pixels: Array, warp: PinholeWarp | None) -> Array:
     """Pixels (N, 2) as the camera of the model sees them.
 
     A feature without an ideal pixel, beyond the reach of the lens model, is put at (-1e6, -1e6),
     where no geometry explains it.
     """
-    if lens is None:
+    if warp is None:
         return pixels
-    ideal = lens.to_pinhole(pixels)
+    ideal = warp.to_pinhole(pixels)
     return np.where(np.isfinite(ideal).all(axis=1, keepdims=True), ideal, -1e6)
 
 

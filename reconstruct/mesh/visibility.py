@@ -101,8 +101,7 @@ def vertices_near(
     """Numbers of the vertices in blocks that may reach into a view's frame."""
     centres, radii = spheres
     points = view.world_from_cam.inv().apply(to_world(centres, offset_enu))
-    low = np.array([-view.cx_px / view.fx_px, -view.cy_px / view.fy_px])
-    high = low + np.array([view.width_px / view.fx_px, view.height_px / view.fy_px])
+    low, high = view.pinhole.slopes(np.array([(0, 0), view.pinhole.size_px]))
     reach = _MARGIN * (high - low)
     near = points[:, 2] > -radii
     for axis in range(2):
@@ -168,7 +167,7 @@ def _quality(
         hit = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
         hidden = hit < reach[..., 0]
     seen = np.flatnonzero(facing)[~hidden.any(axis=1)]
-    size = np.array([view.width_px, view.height_px])
+    size = np.array(view.pinhole.size_px)
     inset = np.minimum(p[seen], size - p[seen]).min(axis=(1, 2)) / (0.5 * size.min())
     taper = np.clip(inset, 0.02, 1.0)
     quality = np.sqrt(area_px[seen] / area[seen]) * np.sqrt(taper)

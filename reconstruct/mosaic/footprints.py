@@ -51,8 +51,8 @@ def picture_footprint(view: View, dem: Float32, grid: DemGrid) -> PictureFootpri
         dem: heights, NaN where unknown.
         grid: its cells.
     """
-    x = np.linspace(0.0, view.width_px, _NODES)
-    y = np.linspace(0.0, view.height_px, _NODES)
+    x = np.linspace(0.0, view.pinhole.width_px, _NODES)
+    y = np.linspace(0.0, view.pinhole.height_px, _NODES)
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     met, ranges = surface_points(view, pixels, dem, grid)
     met = met.reshape(_NODES, _NODES, 2)
@@ -62,7 +62,7 @@ def picture_footprint(view: View, dem: Float32, grid: DemGrid) -> PictureFootpri
     cells = 0.5 * np.abs(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
     whole = np.isfinite(cells)
     area = float(cells[whole].sum())
-    pixels_per_cell = view.width_px * view.height_px / (_NODES - 1) ** 2
+    pixels_per_cell = view.pinhole.width_px * view.pinhole.height_px / (_NODES - 1) ** 2
     found = np.isfinite(ranges)
     return PictureFootprint(
         outline=edge[np.isfinite(edge).all(axis=1)],

@@ -83,9 +83,9 @@ def _footprint(
 ) -> tuple[tuple[float, float, float, float], float]:
     """What a view sees between two heights, and its flattest line of sight (ground per height)."""
     camera = enu_from_cam(view, np.zeros(3))
-    w, h = view.width_px, view.height_px
-    corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]) - [view.cx_px, view.cy_px]
-    rays = np.column_stack([corners / [view.fx_px, view.fy_px], np.ones(4)]) @ camera[:, :3].T
+    w, h = view.pinhole.size_px
+    corners = view.pinhole.slopes(np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]))
+    rays = np.column_stack([corners, np.ones(4)]) @ camera[:, :3].T
     if (rays[:, 2] > -0.2 * np.linalg.norm(rays[:, :2], axis=1)).any():
         return (-np.inf, np.inf, -np.inf, np.inf), _FLATTEST_SLOPE
     slope = float((np.linalg.norm(rays[:, :2], axis=1) / -rays[:, 2]).max())
@@ -164,7 +164,7 @@ def mean_pixel(model: SparseModel) -> float:
     for view, points in zip(model.views, points_of_views(model), strict=True):
         if len(points):
             depth = view.world_from_cam.inv().apply(points)[:, 2]
-            sides.append(np.median(depth) / np.sqrt(view.fx_px * view.fy_px))
+            sides.append(np.median(depth) / view.pinhole.focal_px)
     return float(np.median(sides))
 
 

@@ -7,13 +7,12 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from reconstruct.views.range_shift import FAST, KernelLens, Nodes, between_nodes, warped_at
 
 Float32 = NDArray[np.float32]
 
 _TAPS = 8
 _FRACTIONS = 1024
-_MOST_ROUNDS, _STILL_PX = 5, 1e-3
-"""Limits of the fixed-point iteration through a flat port; each round gains two digits or more."""
 
 
 @compiled
@@ -76,25 +75,7 @@ def visible_cells(
     return visible
 
 
-@compiled
-def _at(nodes: Array, across: float, down: float, x: float, y: float) -> tuple[float, float]:
-    """As `field_at`, with the nodes per pixel worked out before."""
-    rows, columns = nodes.shape[0], nodes.shape[1]
-    u = min(max(x * across, 0.0), columns - 1.0)
-    v = min(max(y * down, 0.0), rows - 1.0)
-    column, row = min(int(u), columns - 2), min(int(v), rows - 2)
-    p, q = u - column, v - row
-    d = p * q
-    a, b, c = 1.0 - p - q + d, p - d, q - d
-    return (
-        a * nodes[row, column, 0] + b * nodes[row, column + 1, 0]
-        + c * nodes[row + 1, column, 0] + d * nodes[row + 1, column + 1, 0],
-        a * nodes[row, column, 1] + b * nodes[row, column + 1, 1]
-        + c * nodes[row + 1, column, 1] + d * nodes[row + 1, column + 1, 1],
-    )  # fmt: skip
-
-
-@compiled
+@compiled(error_model="numpy", fastmath=FAST)
 def look_up(
     height: Float32,
     wanted: tuple[NDArray[np.bool_], int],
@@ -102,9 +83,9 @@ def look_up(
     first_cell: tuple[float, float],
     cells_per_pixel: float,
     cam_from_enu: Array,
-    pinhole: Array,
-    shift: tuple[Array, float, float, float],
-    taken_nodes: Array,
+    lens: KernelLens,
+    warped_size: tuple[int, int],
+    taken: Nodes,
     size: tuple[int, int],
     first_enu: tuple[float, float],
     pixel: float,
@@ -112,11 +93,10 @@ def look_up(
 ) -> tuple[Float32, Float32, Float32, Float32]:
     """Where the picture as taken shows each pixel of a tile, and how well.
 
-    A point goes to the ideal pinhole, from there by its depth to the warped picture (as
-    `RangeShift.warped`, exact for a flat port, until it moves by less than `_STILL_PX`) and
-    through the lens to the picture as taken, so that colours are resampled once. The quality is the
-    distance from the rim of the picture (1 in the middle, 0 at the rim) times the cosine of the
-    angle to the vertical over the distance squared, so that the middle of near, steep views wins.
+    A point goes through the port to the warped picture and from there to the picture as taken, so
+    that colours are resampled once. The quality is the distance from the rim of the picture (1 in
+    the middle, 0 at the rim) times the cosine of the angle to the vertical over the distance
+    squared, so that the middle of near, steep views wins.
 
     Args:
         height: (H, W) up at the pixels' centres, NaN where unknown.
@@ -126,10 +106,10 @@ def look_up(
         first_cell: row and column of the first pixel's centre in `visible` (cell centres whole).
         cells_per_pixel: side of a pixel over side of a cell.
         cam_from_enu: (3, 4) transform to the camera.
-        pinhole: (4,) fx, fy, cx, cy, px.
-        shift: `View.shift_arguments`.
-        taken_nodes: (rows, columns, 2) pixels as taken at nodes spread evenly over the warped
-            picture; NaN where there are none.
+        lens: of the view, or of a channel of it.
+        warped_size: width and height of the warped picture, px.
+        taken: pixels as taken at nodes spread evenly over the warped picture; NaN where there are
+            none.
         size: width and height of the picture as taken, px.
         first_enu: east and north of the first pixel's centre.
         pixel: side of a pixel.
@@ -146,16 +126,8 @@ def look_up(
     ranges = np.full((rows, columns), np.nan, np.float32)
     t = cam_from_enu
     half = 0.5 * min(size[0], size[1])
-    nodes, width_px, height_px, inverse_working = shift
     squares, side = wanted
-    shifted = False
-    for row in range(nodes.shape[0]):
-        for column in range(nodes.shape[1]):
-            if nodes[row, column, 0] != 0.0 or nodes[row, column, 1] != 0.0:
-                shifted = True
-    across, down = (nodes.shape[1] - 1) / width_px, (nodes.shape[0] - 1) / height_px
-    taken_across = (taken_nodes.shape[1] - 1) / width_px
-    taken_down = (taken_nodes.shape[0] - 1) / height_px
+    pinhole, field, inverse_working = lens  # out of the loop: taking it apart costs time
     for row in range(rows):
         north = first_enu[1] - row * pixel
         cell_row = math.floor(first_cell[0] + row * cells_per_pixel + 0.5)
@@ -180,20 +152,12 @@ def look_up(
             a = t[0, 0] * east + t[0, 1] * north + t[0, 2] * up + t[0, 3]
             b = t[1, 0] * east + t[1, 1] * north + t[1, 2] * up + t[1, 3]
             inverse = 1.0 / c
-            u0 = pinhole[0] * a * inverse + pinhole[2]
-            v0 = pinhole[1] * b * inverse + pinhole[3]
-            u, v = u0, v0
-            if shifted:
-                step = inverse - inverse_working
-                for _ in range(_MOST_ROUNDS):
-                    du, dv = _at(nodes, across, down, u, v)
-                    moved = abs(u0 - du * step - u) + abs(v0 - dv * step - v)
-                    u, v = u0 - du * step, v0 - dv * step
-                    if not moved > _STILL_PX:
-                        break
-            if u < 0.0 or v < 0.0 or u > width_px or v > height_px:
+            u = pinhole[0] * a * inverse + pinhole[2]
+            v = pinhole[1] * b * inverse + pinhole[3]
+            u, v = warped_at(field, inverse_working, u, v, inverse)
+            if u < 0.0 or v < 0.0 or u > warped_size[0] or v > warped_size[1]:
                 continue
-            u, v = _at(taken_nodes, taken_across, taken_down, u, v)
+            u, v, _, _, _, _ = between_nodes(taken, u, v)
             inset = min(min(u, size[0] - u), min(v, size[1] - v)) - rim
             if not inset > 0.0:  # NaN as well
                 continue

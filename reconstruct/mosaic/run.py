@@ -48,8 +48,7 @@ from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
 from reconstruct.raster import DemGrid, opened_raster, round_cell, small_cache
-from reconstruct.views.lens import FlatPortLens
-from reconstruct.views.model import SparseModel, read_lenses, read_model
+from reconstruct.views.model import SparseModel, read_model, read_warps
 
 _TILE_PX = 1024
 _GROUP = 2
@@ -190,7 +189,7 @@ def _solve(
     """The survey's light from spots that two views see."""
     if wanted == "raw":
         return solve_colour(wanted, joined_samples([]), facts)
-    width = float(np.median([view.width_px for view in model.views]))
+    width = float(np.median([view.pinhole.width_px for view in model.views]))
     step_px = max(CELL_PX, round(width * mean_pixel(model) / blocks[0].grid.cell / _LIGHT_LATTICE))
     compare = [
         LightTask(
@@ -217,14 +216,13 @@ def _dispersion(
     workspace: Path, wanted: str, config: WaterConfig, depth_m: float, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
-    lenses = read_lenses(workspace / "sparse" / "cameras.json").values()
-    ports = any(isinstance(lens, FlatPortLens) and lens.camera.n_water > 1 for lens in lenses)
+    warps = read_warps(workspace / "sparse" / "cameras.json").values()
     about = workspace / "images" / "survey.json"
     reason = ""
     if wanted == "off":
         reason = "switched off"
-    elif not ports:
-        reason = "no flat port"
+    elif all(warp.camera.n_water == 1 for warp in warps):
+        reason = "no port"
     elif grey:
         reason = "grey pictures"
     elif wanted == "auto" and PicturesRecord.read(about).source == "simulated":

@@ -13,7 +13,6 @@ from reconstruct.mosaic.ortho import lanczos_weights
 from reconstruct.mosaic.picture_measures import linear_table, read_small
 from reconstruct.mosaic.visibility import CameraOptics, Water, camera_optics, channel_optics
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.views.lens import FlatPortLens
 from reconstruct.views.model import View
 
 _CACHED_BYTES = 100_000_000
@@ -52,16 +51,16 @@ class Tools:
     def optics(self, view: View) -> CameraOptics:
         """Optics of a view's camera (its green channel)."""
         if view.camera not in self._optics:
-            self._optics[view.camera] = camera_optics(self._pictures.lens(view.image), self._scaled)
+            self._optics[view.camera] = camera_optics(self._pictures.warp(view.image), self._scaled)
         return self._optics[view.camera]
 
     def channels(self, view: View) -> tuple[CameraOptics, ...] | None:
         """Optics of a view's channels, BGR; None where they share one."""
-        lens = self._pictures.lens(view.image)
-        if self._water is None or not isinstance(lens, FlatPortLens) or lens.camera.n_water == 1:
+        warp = self._pictures.warp(view.image)
+        if self._water is None or warp.camera.n_water == 1:
             return None
         if view.camera not in self._channels:
-            self._channels[view.camera] = channel_optics(lens, self._water, self._scaled)
+            self._channels[view.camera] = channel_optics(warp, self._water, self._scaled)
         return self._channels[view.camera]
 
     def usable(self, image: str) -> NDArray[np.bool_] | None:

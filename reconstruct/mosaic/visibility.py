@@ -7,17 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.frames import Array
 from camera_calib.approximation.dispersion import channel_cameras
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.water import CHANNELS
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.pictures.undistorted import taken_nodes
 from reconstruct.raster import DemGrid
-from reconstruct.views.lens import FlatPortLens, Lens
 from reconstruct.views.model import View, enu_from_cam
-from reconstruct.views.range_shift import RangeShift, range_shift
-from reconstruct.views.sight import pinhole_of
+from reconstruct.views.range_shift import Nodes, RangeShift, as_nodes, no_shift, range_shift
 
 _SPACING_PX = 8.0
 """Spacing of nodes between which a lens is bilinear: within 0.001 px for the lenses of such
@@ -40,9 +38,9 @@ class Water:
 class CameraOptics:
     """One camera, or one channel of it, from its pinhole's pixels to the picture as taken."""
 
-    taken_nodes: Array
-    """(rows, columns, 2); see `taken_nodes`."""
-    shift: RangeShift | None
+    taken: Nodes
+    """Pixels as taken; see `taken_nodes`."""
+    shift: RangeShift
     size_px: tuple[int, int]
     """Width and height of the picture as taken."""
 
@@ -189,28 +187,29 @@ def _load_visible(path: Path) -> Visible:
     return Visible(cells=cells.reshape(high, wide), west=west, north=north)
 
 
-def camera_optics(lens: Lens, scaled: bool) -> CameraOptics:
-    """Optics of a lens; without lengths in metres a port's range shift is not known."""
+def camera_optics(warp: PinholeWarp, scaled: bool) -> CameraOptics:
+    """Optics of a camera; without lengths in metres a port's range shift is not known."""
+    size_px = warp.pinhole.size_px
     return CameraOptics(
-        taken_nodes=taken_nodes(lens, _SPACING_PX),
-        shift=range_shift(lens) if scaled and isinstance(lens, FlatPortLens) else None,
-        size_px=lens.size_px,
+        taken=as_nodes(taken_nodes(warp, _SPACING_PX), *size_px),
+        shift=range_shift(warp) if scaled else no_shift(*size_px),
+        size_px=warp.size_px,
     )
 
 
-def channel_optics(lens: FlatPortLens, water: Water, scaled: bool) -> tuple[CameraOptics, ...]:
+def channel_optics(warp: PinholeWarp, water: Water, scaled: bool) -> tuple[CameraOptics, ...]:
     """Optics of the blue, green and red channel of a camera behind a port, in the order of BGR.
 
     All see through the pinhole of green; the rays that they take through port and water differ by
     their indices, at the working range and beyond it.
     """
     cameras = channel_cameras(
-        lens.camera,
+        warp.camera,
         temperature_c=water.temperature_c,
         salinity_psu=water.salinity_psu,
         depth_m=water.depth_m,
     )
-    found = {n: camera_optics(replace(lens, camera=cameras[n]), scaled) for n in CHANNELS}
+    found = {n: camera_optics(replace(warp, camera=cameras[n]), scaled) for n in CHANNELS}
     return found["blue"], found["green"], found["red"]
 
 
@@ -237,7 +236,7 @@ def see(
     east, north = float(grid.east_of(0.5)), float(grid.north_of(0.5))
     rotation = camera[:, :3].T
     cam_from_enu = np.column_stack([rotation, -rotation @ camera[:, 3]])
-    shift = view.shift_arguments if optics.shift is None else optics.shift.arguments
+    lens = replace(view, shift=optics.shift).kernel_lens
     x, y, quality, ranges = look_up(
         surface.height,
         wanted,
@@ -245,9 +244,9 @@ def see(
         ((visible.north - north) / cell - 0.5, (east - visible.west) / cell - 0.5),
         grid.cell / cell,
         np.ascontiguousarray(cam_from_enu),
-        pinhole_of(view),
-        shift,
-        optics.taken_nodes,
+        lens,
+        view.pinhole.size_px,
+        optics.taken,
         optics.size_px,
         (east, north),
         grid.cell,

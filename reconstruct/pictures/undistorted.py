@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ImageError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.records import CamerasRecord
+from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.picture_files import read_pixels
 from reconstruct.pictures.normalise import Grey, normalise
-from reconstruct.views.lens import Lens, lens_from_json
 
 Colour = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -56,31 +57,31 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     return np.asarray(mask > 0)
 
 
-def undistortion_maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def undistortion_maps(warp: PinholeWarp) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where each pixel of the pinhole's picture lies in the picture as taken.
 
     Returns:
         x and y in OpenCV's pixels (the first pixel's centre is 0, 0) for `cv2.remap`; -10 where the
         camera does not see what the pinhole would.
     """
-    width, height = lens.pinhole.width_px, lens.pinhole.height_px
+    width, height = warp.pinhole.size_px
     x = np.empty((height, width), np.float32)
     y = np.empty((height, width), np.float32)
     columns = np.arange(width) + 0.5
     for top in range(0, height, _ROWS):
         rows = np.arange(top, min(top + _ROWS, height)) + 0.5
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        source = _where_invertible(lens, pixels) - 0.5
+        source = _where_invertible(warp, pixels) - 0.5
         source = np.where(np.isfinite(source), source, -10.0).reshape(len(rows), width, 2)
         x[top : top + _ROWS], y[top : top + _ROWS] = source[..., 0], source[..., 1]
     return x, y
 
 
-def taken_nodes(lens: Lens, spacing_px: float) -> Array:
+def taken_nodes(warp: PinholeWarp, spacing_px: float) -> Array:
     """Where nodes of the pinhole's picture lie in the picture as taken.
 
     Args:
-        lens: the lens.
+        warp: of a camera's pictures.
         spacing_px: largest distance of nodes; between them a bilinear value is off by the square
             of it times an eighth of the second derivative of the distortion.
 
@@ -88,21 +89,21 @@ def taken_nodes(lens: Lens, spacing_px: float) -> Array:
         (rows, columns, 2) pixels as taken at nodes spread evenly over the pinhole's picture, the
         first and last on its outer edges; NaN where the camera does not see what the pinhole would.
     """
-    width, height = lens.pinhole.width_px, lens.pinhole.height_px
+    width, height = warp.pinhole.size_px
     x = np.linspace(0.0, width, int(np.ceil(width / spacing_px)) + 1)
     y = np.linspace(0.0, height, int(np.ceil(height / spacing_px)) + 1)
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    return _where_invertible(lens, pixels.reshape(-1, 2)).reshape(pixels.shape)
+    return _where_invertible(warp, pixels.reshape(-1, 2)).reshape(pixels.shape)
 
 
-def _where_invertible(lens: Lens, pixels: Array) -> Array:
+def _where_invertible(warp: PinholeWarp, pixels: Array) -> Array:
     """Pixels as taken; NaN beyond the radius at which a polynomial distortion folds back."""
-    taken = lens.from_pinhole(pixels)
+    taken = warp.from_pinhole(pixels)
     # a little beyond the edges, so that what is between nodes is known up to them
-    margin = np.array(lens.size_px) * _BEYOND
-    inside = np.all((taken >= -margin) & (taken <= np.array(lens.size_px) + margin), axis=1)
+    margin = np.array(warp.size_px) * _BEYOND
+    inside = np.all((taken >= -margin) & (taken <= np.array(warp.size_px) + margin), axis=1)
     back = np.full_like(taken, np.nan)
-    back[inside] = lens.to_pinhole(taken[inside])
+    back[inside] = warp.to_pinhole(taken[inside])
     with np.errstate(invalid="ignore"):
         folded = ~(np.linalg.norm(back - pixels, axis=1) < 0.5)
     return np.where((inside & folded)[:, None], np.nan, taken)
@@ -114,13 +115,15 @@ class Pictures:
     The warps of all cameras are kept (8 bytes a pixel each); pictures are not.
     """
 
-    def __init__(self, images: Path, lenses: dict[str, Lens], cameras: dict[str, str]) -> None:
+    def __init__(
+        self, images: Path, warps: dict[str, PinholeWarp], cameras: dict[str, str]
+    ) -> None:
         """Use `open`; `cameras` names the camera of every picture below the folder `images`."""
         self._images = images
-        self._lenses = lenses
+        self._warps = warps
         self._cameras = cameras
         self._masks: dict[str, str] = {}
-        self._maps = lru_cache(maxsize=None)(lambda camera: undistortion_maps(lenses[camera]))
+        self._maps = lru_cache(maxsize=None)(lambda camera: undistortion_maps(warps[camera]))
         self._inside = lru_cache(maxsize=None)(self._camera_inside)
 
     @classmethod
@@ -138,19 +141,20 @@ class Pictures:
     def from_json(cls, images: Path, cameras_json: Path) -> "Pictures":
         """As `open`, from the folder of the pictures and a file of cameras."""
         stored = CamerasRecord.read(cameras_json)
-        lenses = {name: lens_from_json(lens) for name, lens in stored.cameras.items()}
-        pictures = cls(images, lenses, {name: i.camera for name, i in stored.images.items()})
+        with taken_from(cameras_json):
+            warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
+        pictures = cls(images, warps, {name: i.camera for name, i in stored.images.items()})
         pictures._masks = {name: i.mask for name, i in stored.images.items() if i.mask}
         return pictures
 
-    def lens(self, image: str) -> Lens:
-        """The lens of the camera that took a picture.
+    def warp(self, image: str) -> PinholeWarp:
+        """The camera that took a picture, and its pinhole.
 
         Raises:
             WorkspaceError: no picture of that name is in the model.
         """
         try:
-            return self._lenses[self._cameras[image]]
+            return self._warps[self._cameras[image]]
         except KeyError:
             raise WorkspaceError(f"no picture {image!r} in sparse/cameras.json") from None
 
@@ -160,12 +164,12 @@ class Pictures:
         Raises:
             ImageError: the file is missing, cannot be decoded or is of another size.
         """
-        lens, path = self.lens(image), self._images / image
+        warp, path = self.warp(image), self._images / image
         taken = read_colour(path)
-        if taken.shape[1::-1] != lens.size_px:
+        if taken.shape[1::-1] != warp.size_px:
             raise ImageError(
                 f"{path}: {taken.shape[1]} x {taken.shape[0]} pixels, but its camera has "
-                f"{lens.size_px[0]} x {lens.size_px[1]}"
+                f"{warp.size_px[0]} x {warp.size_px[1]}"
             )
         return taken
 
@@ -177,7 +181,7 @@ class Pictures:
         """
         if image not in self._masks:
             return None
-        return read_mask(self._images / self._masks[image], self.lens(image).size_px)
+        return read_mask(self._images / self._masks[image], self.warp(image).size_px)
 
     def colour(self, image: str) -> Colour:
         """A picture as its pinhole sees it, (H, W, 3) BGR; black where there is nothing.
@@ -207,7 +211,7 @@ class Pictures:
         return mask
 
     def _camera_inside(self, camera: str) -> Mask:
-        width, height = self._lenses[camera].size_px
+        width, height = self._warps[camera].size_px
         x, y = self._maps(camera)
         return np.asarray((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1))
 

@@ -189,9 +189,9 @@ def _expected_in(
     place = point.ned(datum)[None]
     found = []
     for view in model.views:
-        lens = pictures.lens(view.image)
-        x, y = lens.from_pinhole(view.project(place))[0]
-        if 0 <= x < lens.size_px[0] and 0 <= y < lens.size_px[1]:
+        warp = pictures.warp(view.image)
+        x, y = warp.from_pinhole(view.project(place))[0]
+        if 0 <= x < warp.size_px[0] and 0 <= y < warp.size_px[1]:
             found.append((view.image, float(x), float(y)))
     return found
 

@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.placing.control_file import Pick
-from reconstruct.views.lens import FlatPortLens, Lens
 
 _ROBUST_PX = 1.0
 _WRONG_SIGMAS = 5.0
@@ -20,36 +20,26 @@ _LARGEST_CONDITION = 1e8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Camera:
-    """A registered picture: its lens, and where its pinhole stands in the model."""
+class RegisteredPicture:
+    """A registered picture: its camera, and where its pinhole stands in the model."""
 
-    lens: Lens
+    warp: PinholeWarp
     model_from_pinhole: RigidTransform
 
     def project(self, point: Array) -> Array:
         """(2,) pixel of the picture as taken at which a point (3,) of the model is seen."""
-        there = self.model_from_pinhole.inv().apply(point[None])
-        if isinstance(self.lens, FlatPortLens):
-            cam = self.lens.pinhole_from_cam.inv().apply(there)
-            return np.asarray(self.lens.camera.project(cam)[0])
-        if not there[0, 2] > 0:
-            return np.full(2, np.nan)
-        pinhole = self.lens.pinhole
-        ideal = pinhole.focal_px * there[:, :2] / there[:, 2:] + [pinhole.cx_px, pinhole.cy_px]
-        return np.asarray(self.lens.from_pinhole(ideal)[0])
+        seen = self._model_from_cam.inv().apply(point[None])
+        return np.asarray(self.warp.camera.project(seen)[0])
 
     def ray(self, pixel: Array) -> tuple[Array, Array]:
         """Start and unit direction, (3,) each, in the model, of a pixel of the picture as taken."""
-        if isinstance(self.lens, FlatPortLens):
-            start, way = self.lens.camera.unproject(pixel[None])
-            start = self.lens.pinhole_from_cam.apply(start)
-            way = self.lens.pinhole_from_cam.rotation.apply(way)
-        else:
-            pinhole, ideal = self.lens.pinhole, self.lens.to_pinhole(pixel[None])
-            slope = (ideal - [pinhole.cx_px, pinhole.cy_px]) / pinhole.focal_px
-            start, way = np.zeros((1, 3)), np.column_stack([slope, np.ones(1)])
-        way = self.model_from_pinhole.rotation.apply(way[0])
-        return self.model_from_pinhole.apply(start[0]), way / np.linalg.norm(way)
+        start, way = self.warp.camera.unproject(pixel)
+        there = self._model_from_cam
+        return there.apply(start), there.rotation.apply(way)
+
+    @property
+    def _model_from_cam(self) -> RigidTransform:
+        return self.model_from_pinhole * self.warp.pinhole_from_cam
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +58,7 @@ class Spot:
 
 
 def find_spots(
-    picks: Sequence[Pick], cameras: Mapping[str, Camera]
+    picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> tuple[dict[str, Spot], dict[str, str]]:
     """Find every picked point that two or more registered pictures show.
 
@@ -105,7 +95,9 @@ def find_spots(
     return found, lost
 
 
-def _triangulate(name: str, picks: list[Pick], cameras: Mapping[str, Camera]) -> Spot | str:
+def _triangulate(
+    name: str, picks: list[Pick], cameras: Mapping[str, RegisteredPicture]
+) -> Spot | str:
     """The point that fits the picks best, or why there is none."""
     start = _nearest(picks, cameras)
     if isinstance(start, str):
@@ -145,7 +137,7 @@ def _worst(off: Array, picks: Sequence[Pick]) -> float:
 
 
 def _without_one(
-    point: Array, picks: list[Pick], off: Array, cameras: Mapping[str, Camera]
+    point: Array, picks: list[Pick], off: Array, cameras: Mapping[str, RegisteredPicture]
 ) -> list[Pick]:
     """Leave out the pick without which the others agree best; among many, the worst.
 
@@ -157,7 +149,7 @@ def _without_one(
     return choices[int(np.argmin(misses))]
 
 
-def _nearest(picks: Sequence[Pick], cameras: Mapping[str, Camera]) -> Array | str:
+def _nearest(picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> Array | str:
     """The point nearest to all rays, (3,)."""
     rays = [cameras[p.image].ray(np.array([p.x_px, p.y_px])) for p in picks]
     starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
@@ -178,7 +170,7 @@ def nearest_to_rays(starts: Array, ways: Array) -> Array | None:
 
 
 def _fit(
-    start: Array, picks: Sequence[Pick], cameras: Mapping[str, Camera]
+    start: Array, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> tuple[Array, Array, Array]:
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
     picked = np.array([[p.x_px, p.y_px] for p in picks])

@@ -25,9 +25,11 @@ from alice_survey.base.records import (
     PicturesRecord,
     RegistrationRecord,
     ScaleRecord,
+    SimilarityRecord,
 )
 from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, read_rig
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.mapper import model_baseline
@@ -44,7 +46,7 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.georeference import PlacementFit, fit_control, fit_navigation, level
-from reconstruct.placing.picked_points import Camera, find_spots
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.track import (
     TrackRow,
     placed_covariances,
@@ -56,8 +58,7 @@ from reconstruct.placing.track import (
     write_track_geojson,
     write_track_tum,
 )
-from reconstruct.views.lens import Lens
-from reconstruct.views.model import WorldFrame, read_lenses, write_frame
+from reconstruct.views.model import WorldFrame, read_warps, write_frame
 from reconstruct.views.model_files import read_reconstruction
 
 RIG_SCALE_SIGMA = 1e-3
@@ -94,7 +95,7 @@ class Placing:
     """Registered pictures."""
     pinholes: Sequence[RigidTransform]
     """`model_from_pinhole` of these."""
-    lenses: Mapping[str, Lens]
+    warps: Mapping[str, PinholeWarp]
     rig: Rig | None
     datum: Datum | None
     survey: PicturesRecord
@@ -122,7 +123,7 @@ def run_sparse(
     """
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
-    lenses = read_lenses(workspace / "mapping" / "cameras.json")
+    warps = read_warps(workspace / "mapping" / "cameras.json")
     model = read_reconstruction(workspace / "mapping" / "model")
     of_name = {r.image: r for r in inputs.records}
     refined = workspace / "mapping" / "rig.json"  # where the settings refine it
@@ -139,7 +140,7 @@ def run_sparse(
             model=model,
             records=[of_name[name] for name in names],
             pinholes=[poses[name] for name in names],
-            lenses=lenses,
+            warps=warps,
             rig=rig,
             datum=inputs.datum,
             survey=inputs.survey,
@@ -157,7 +158,7 @@ def run_sparse(
     shutil.copyfile(workspace / "mapping" / "cameras.json", folder / "cameras.json")
     write_frame(folder / "frame.json", placed.frame)
     mounts = {} if rig is None else {n: rig.body_from_cam(n).rotation for n in rig.cameras}
-    rows = track_rows(model, of_name, lenses, placed.frame, mounts)
+    rows = track_rows(model, of_name, warps, placed.frame, mounts)
     covariances = _covariances(workspace, folder, placed, rows)
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)
@@ -218,7 +219,12 @@ def _registration(
         baseline=baseline if np.isfinite(baseline) else None,
         rig_factor=mapping.rig_factor,
         scale_source=placed.scale_source,
-        world_per_mapping_unit=placed.world_from_model.scale,
+        gauge=mapping.gauge,
+        world_from_mapping=SimilarityRecord(
+            scale=placed.world_from_model.scale,
+            quaternion_xyzw=tuple(placed.world_from_model.rotation.as_quat().tolist()),
+            translation=tuple(placed.world_from_model.translation.tolist()),
+        ),
         working_range=mapping.distances,
         georeference=None if fit is None else GeoreferenceRecord.model_validate(fit.to_json()),
     )
@@ -279,12 +285,14 @@ def find_place(task: Placing) -> Placed:
     )
 
 
-def body_from_pinhole(rig: Rig | None, lenses: Mapping[str, Lens]) -> dict[str, RigidTransform]:
+def body_from_pinhole(
+    rig: Rig | None, warps: Mapping[str, PinholeWarp]
+) -> dict[str, RigidTransform]:
     """Lever arms of the pinholes, metres; the identity without a rig, when navigation is theirs."""
     if rig is None:
-        return dict.fromkeys(lenses, RigidTransform.identity())
+        return dict.fromkeys(warps, RigidTransform.identity())
     return {
-        name: rig.body_from_cam(name) * lens.pinhole_from_cam.inv() for name, lens in lenses.items()
+        name: rig.body_from_cam(name) * warp.pinhole_from_cam.inv() for name, warp in warps.items()
     }
 
 
@@ -304,7 +312,7 @@ def _fit(
         fit = fit_navigation(
             task.records,
             task.pinholes,
-            body_from_pinhole(task.rig, task.lenses),
+            body_from_pinhole(task.rig, task.warps),
             task.datum,
             levelled,
             known_scale=scale,
@@ -342,7 +350,7 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
     if picked and picked.isdisjoint(r.image for r in task.records):
         raise WorkspaceError(f"no picture of the model is picked; {min(picked)} is not in it")
     cameras = {
-        record.image: Camera(lens=task.lenses[record.camera], model_from_pinhole=pose)
+        record.image: RegisteredPicture(warp=task.warps[record.camera], model_from_pinhole=pose)
         for record, pose in zip(task.records, task.pinholes, strict=True)
     }
     spots, lost = find_spots(picks, cameras)

@@ -59,11 +59,11 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
     model = read_model(sparse)
     pictures = Pictures.open(workspace)
     first, second = (find_point(token, model, pictures) for token in tokens)
-    world_per_unit = RegistrationRecord.read(sparse / "registration.json").world_per_mapping_unit
+    world_from_mapping = RegistrationRecord.read(sparse / "registration.json").world_from_mapping
     distance = float(np.linalg.norm(second - first))
     if not distance > 0:
         raise ReconstructionError(f"the two points are one and the same: {points!r}")
-    metres_per_unit = length_m * world_per_unit / distance
+    metres_per_unit = length_m * world_from_mapping.scale / distance
     ScaleRecord.save(
         workspace / SCALE_FILE,
         {
@@ -116,10 +116,10 @@ def _read_pick(text: str, model: SparseModel, pictures: Pictures) -> tuple[View,
     view = next((v for v in model.views if v.image == name), None)
     if view is None:
         raise ReconstructionError(f"{text!r}: no picture {name} is in the model")
-    width, height = pictures.lens(name).size_px
+    width, height = pictures.warp(name).size_px
     if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
         raise ReconstructionError(f"{text!r} is outside of the picture, {width} x {height} pixels")
-    ideal = pictures.lens(name).to_pinhole(pixel[None] + 0.5)[0]
+    ideal = pictures.warp(name).to_pinhole(pixel[None] + 0.5)[0]
     if not np.isfinite(ideal).all():
         raise ReconstructionError(f"{text!r} is beyond the reach of the lens model")
     return view, ideal
@@ -127,8 +127,7 @@ def _read_pick(text: str, model: SparseModel, pictures: Pictures) -> tuple[View,
 
 def _slope(view: View, pixel: Array) -> Array:
     """The ray of a pixel in the camera's frame, (3,), third component one."""
-    x, y = pixel
-    return np.array([(x - view.cx_px) / view.fx_px, (y - view.cy_px) / view.fy_px, 1.0])
+    return np.append(view.pinhole.slopes(pixel), 1.0)
 
 
 def _on_surface(token: str, view: View, pixel: Array, model: SparseModel) -> Array:

@@ -20,12 +20,12 @@ from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import cross_matrices, observed
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import attitude_axes
-from reconstruct.views.lens import Lens
 from reconstruct.views.model import WorldFrame
 
 _NED = ("north_m", "east_m", "depth_m")
@@ -64,7 +64,7 @@ class TrackRow:
 def track_rows(
     model: Any,
     records: Mapping[str, ImageRecord],
-    lenses: Mapping[str, Lens],
+    warps: Mapping[str, PinholeWarp],
     frame: WorldFrame,
     body_from_cam: Mapping[str, Rotation],
 ) -> list[TrackRow]:
@@ -76,15 +76,15 @@ def track_rows(
     Args:
         model: in world coordinates.
         records: by picture.
-        lenses: by camera.
+        warps: by camera.
         frame: the world.
         body_from_cam: mount of every camera that has one.
     """
     seen = observed(model)
     missed = np.linalg.norm(seen.misses(model), axis=1)
     pupils = {
-        name: lens.pinhole_from_cam if frame.scaled else RigidTransform.identity()
-        for name, lens in lenses.items()
+        name: warp.pinhole_from_cam if frame.scaled else RigidTransform.identity()
+        for name, warp in warps.items()
     }
     rows = []
     for n, number in enumerate(seen.pictures.tolist()):

@@ -19,6 +19,7 @@ from alice_survey.base.artefacts import need_stage, read_json
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.rig import Rig, read_rig
 from camera_calib.triangulate import nearest_to_rays
 from reconstruct.evaluate.elevation import read_elevation
@@ -26,7 +27,6 @@ from reconstruct.pictures.undistorted import Pictures
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
 from reconstruct.station.solve import PairOptics, calibration_slopes, stereo_rig
-from reconstruct.views.lens import FlatPortLens, Lens, lens_from_json
 from reconstruct.views.model import View, read_model, scaled_view
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -203,12 +203,10 @@ def _in_pair(
     about = read_json(folder / "pair.json")
     rig = read_rig(folder / "rig.json")
     with taken_from(folder / "pair.json"):
-        first, second = (lens_from_json(lens) for lens in about["lenses"])
+        first, second = (warp_from_json(warp) for warp in about["lenses"])
         scale, inflation = float(about["scale"]), float(about["inflation"])
         left, pictures = str(about["left"]), [folder / name for name in about["pictures"]]
-    if not isinstance(first, FlatPortLens) or not isinstance(second, FlatPortLens):
-        raise WorkspaceError(f"{folder / 'pair.json'}: its lenses are not those of a rig")
-    optics = PairOptics(rig=stereo_rig(rig), lenses=(first, second))
+    optics = PairOptics(rig=stereo_rig(rig), warps=(first, second))
     for pick in picks:
         if len(pick) > 1 or pick[0].image is not None:
             raise ReconstructionError("points of a pair are x,y in its left picture")
@@ -217,9 +215,7 @@ def _in_pair(
     view, other = (scaled_view(view, scale) for view in optics.views)
     greys = pair_samplers(optics, (pictures[0], pictures[1]), (view, other))
     depth_map = read_depth(folder)
-    ratio = np.array([view.width_px, view.height_px]) / [
-        first.pinhole.width_px, first.pinhole.height_px
-    ]  # fmt: skip
+    ratio = np.array(view.pinhole.size_px) / first.pinhole.size_px
     pixels = first.to_pinhole(taken) * ratio
     found = precise_depth((view, other), greys, depth_map, pixels)
     lost = np.flatnonzero(~np.isfinite(found.depth))
@@ -269,12 +265,12 @@ def _calibration(rig: Rig, pixels: Array, n_water_sigma: float) -> tuple[Array, 
     return slopes, matrix
 
 
-def _check_inside(taken: Array, lens: Lens, name: str) -> None:
+def _check_inside(taken: Array, warp: PinholeWarp, name: str) -> None:
     for x, y in taken:
-        if not (0 <= x <= lens.size_px[0] and 0 <= y <= lens.size_px[1]):
+        if not (0 <= x <= warp.size_px[0] and 0 <= y <= warp.size_px[1]):
             raise ReconstructionError(
                 f"pixel {x - 0.5:g},{y - 0.5:g} is outside of {name} "
-                f"({lens.size_px[0]} x {lens.size_px[1]})"
+                f"({warp.size_px[0]} x {warp.size_px[1]})"
             )
 
 
@@ -297,9 +293,9 @@ def _in_workspace(
                     f"{spot.image!r} is no registered picture: name one of {len(views)}, such as "
                     f"{next(iter(views))}:100,100"
                 )
-            lens = pictures.lens(spot.image)
-            _check_inside(np.array([[spot.x, spot.y]]), lens, spot.image)
-            rays.append((views[spot.image], lens, np.array([spot.x, spot.y])))
+            warp = pictures.warp(spot.image)
+            _check_inside(np.array([[spot.x, spot.y]]), warp, spot.image)
+            rays.append((views[spot.image], warp, np.array([spot.x, spot.y])))
         if len(rays) == 2:
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
@@ -318,19 +314,19 @@ def _in_workspace(
     )
 
 
-def _ray(view: View, lens: Lens, taken: Array) -> tuple[Array, Array]:
+def _ray(view: View, warp: PinholeWarp, taken: Array) -> tuple[Array, Array]:
     """A point and the unit direction of the straight ray in water of one pixel as taken."""
-    pixel = lens.to_pinhole(taken[None])
+    pixel = warp.to_pinhole(taken[None])
     near, far = (view.at_depth(pixel, np.array([depth]))[0] for depth in (1.0, 2.0))
     direction: Array = (far - near) / np.linalg.norm(far - near)
     return near, direction
 
 
-def _crossed(rays: list[tuple[View, Lens, Array]], sigma_px: float) -> tuple[Array, Array]:
+def _crossed(rays: list[tuple[View, PinholeWarp, Array]], sigma_px: float) -> tuple[Array, Array]:
     """The point nearest to two rays, and its covariance."""
 
     def solve(taken: list[Array]) -> Array:
-        ends = [_ray(v, lens, t) for (v, lens, _), t in zip(rays, taken, strict=True)]
+        ends = [_ray(v, warp, t) for (v, warp, _), t in zip(rays, taken, strict=True)]
         start, direction = (np.stack([e[k] for e in ends])[:, None] for k in range(2))
         solved: Array = nearest_to_rays(start, direction)[0]
         return solved
@@ -381,9 +377,9 @@ class _Surface:
 
 
 def _on_surface(
-    surface: _Surface, view: View, lens: Lens, taken: Array, sigma_px: float
+    surface: _Surface, view: View, warp: PinholeWarp, taken: Array, sigma_px: float
 ) -> tuple[Array, Array]:
-    start, direction = _ray(view, lens, taken)
+    start, direction = _ray(view, warp, taken)
     point = surface.hit(start, direction)
     if point is None:
         raise ReconstructionError(
@@ -394,7 +390,7 @@ def _on_surface(
     raised = surface.hit(start, direction, lift=sigma)
     moves = [raised - point if raised is not None else sigma * direction]
     for axis in range(2):
-        aside_point = surface.hit(*_ray(view, lens, taken + np.eye(2)[axis]))
+        aside_point = surface.hit(*_ray(view, warp, taken + np.eye(2)[axis]))
         if aside_point is not None:
             moves.append((aside_point - point) * sigma_px)
     covariance = sum((np.outer(m, m) for m in moves), np.zeros((3, 3)))

@@ -140,15 +140,17 @@ def reconstruct_pair(
         "pictures": [f"left{left.suffix.lower()}", f"right{right.suffix.lower()}"],
         "cameras": list(optics.rig.names),
         "rig_source": calibrated.source,
-        "lenses": [lens.to_json() for lens in optics.lenses],
-        "scale": found.view.width_px / optics.views[0].width_px,
+        "lenses": [warp.to_json() for warp in optics.warps],
+        "scale": found.view.pinhole.width_px / optics.warps[0].pinhole.width_px,
         "match_sigma_px": found.match_sigma_px,
         "inflation": found.inflation,
         "matches": len(matches),
         "depth_share": round(float(known.mean()), 4),
         "distance_m": [round(float(d), 4) for d in np.percentile(found.depth[known], [2, 50, 98])],
         "sigma_m": round(float(np.median(found.sigma[known])), 6),
-        "ground_pixel_m": round(float(np.median(found.depth[known])) / optics.views[0].fx_px, 6),
+        "ground_pixel_m": round(
+            float(np.median(found.depth[known])) / optics.warps[0].pinhole.fx_px, 6
+        ),
         "points": points,
         "triangles": len(mesh.triangles),
         "axes": list(AXES),
@@ -241,12 +243,12 @@ def dense_pair(
     names = [str(path.absolute()) for path in pictures]
     opened = Pictures(
         Path(),
-        dict(zip(optics.rig.names, optics.lenses, strict=True)),
+        dict(zip(optics.rig.names, optics.warps, strict=True)),
         dict(zip(names, optics.rig.names, strict=True)),
     )
     colours, looks = [], []
     for name, view in zip(names, views, strict=True):
-        colour, valid = shrunk(opened, name, (view.width_px, view.height_px))
+        colour, valid = shrunk(opened, name, view.pinhole.size_px)
         colours.append(colour)
         looks.append((normalise(colour), valid))
     maps = []
@@ -280,8 +282,8 @@ def pair_samplers(
 ) -> tuple[Sampler, Sampler]:
     """What both views show, for precise matches."""
     first, second = (
-        sampler(read_colour(path), lens, view)
-        for path, lens, view in zip(pictures, optics.lenses, views, strict=True)
+        sampler(read_colour(path), warp, view)
+        for path, warp, view in zip(pictures, optics.warps, views, strict=True)
     )
     return first, second
 
@@ -415,7 +417,7 @@ def depth_mesh(
     triangles = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
     triangles = triangles[(triangles >= 0).all(axis=1)]
     z = thinned[rows, columns][triangles]
-    side = z.mean(axis=1) * step / np.sqrt(view.fx_px * view.fy_px)
+    side = z.mean(axis=1) * step / view.pinhole.focal_px
     triangles = triangles[np.ptp(z, axis=1) <= _STEEPEST * side]
     triangles = without_folds(vertices, triangles)
     if not len(triangles):
@@ -443,7 +445,7 @@ def write_station_mesh(
     page = folder / "texture_0.jpg"
     write_jpeg(page, colour)
     pixels = view.project(mesh.vertices)
-    size = np.array([view.width_px, view.height_px], dtype=np.float64)
+    size = np.array(view.pinhole.size_px, dtype=np.float64)
     uv = np.clip(pixels / size, 0.0, 1.0)
     uv[:, 1] = 1.0 - uv[:, 1]
     count = len(mesh.vertices)
@@ -490,7 +492,7 @@ def plot_pair(
     figure = new_figure(1.1 + 5.4 * height / width, 12.0)
     first, second = figure.subplots(1, 2)
     middle = float(np.nanmedian(depth))
-    ground = middle / np.sqrt(view.fx_px * view.fy_px)
+    ground = middle / view.pinhole.focal_px
     first.imshow(np.ascontiguousarray(colour[..., ::-1]), interpolation="antialiased")
     bar = max((b for b in _BARS_M if b <= 0.3 * width * ground), default=_BARS_M[0])
     left, low = 0.06 * width, 0.92 * height

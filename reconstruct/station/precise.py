@@ -18,8 +18,8 @@ from scipy import ndimage
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mesh.texture import remapped
-from reconstruct.views.lens import Lens
 from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
@@ -170,7 +170,7 @@ def _sigma_px(before: Array, rest: Array, after: Array, bend: Array, weight: Arr
     return sigma
 
 
-def sampler(taken: NDArray[np.uint8], lens: Lens, view: View) -> Sampler:
+def sampler(taken: NDArray[np.uint8], warp: PinholeWarp, view: View) -> Sampler:
     """What a view, perhaps shrunk, shows at pixels (N, 2): grey levels (N,), NaN beyond it.
 
     The picture is read as taken, by a quintic spline, once: an undistorted copy would be read
@@ -179,13 +179,11 @@ def sampler(taken: NDArray[np.uint8], lens: Lens, view: View) -> Sampler:
     grey = cv2.cvtColor(taken, cv2.COLOR_BGR2GRAY).astype(np.float64)
     find: Any = ndimage
     spline = find.spline_filter(grey, order=_SPLINE, mode="mirror")
-    ratio = np.array(
-        [lens.pinhole.width_px / view.width_px, lens.pinhole.height_px / view.height_px]
-    )
-    size = np.array(lens.size_px)
+    ratio = np.array(warp.pinhole.size_px) / view.pinhole.size_px
+    size = np.array(warp.size_px)
 
     def at(pixels: Array) -> Array:
-        place = lens.from_pinhole(pixels * ratio)
+        place = warp.from_pinhole(pixels * ratio)
         with np.errstate(invalid="ignore"):
             inside = ((place >= 0) & (place <= size)).all(axis=1)
         found = np.full(len(place), np.nan)

@@ -10,12 +10,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
 from camera_calib.freedom import POSE
 from camera_calib.rig import Rig
 from camera_calib.triangulate import triangulate
 from reconstruct.mapping.working_range import ray_passes
-from reconstruct.views.lens import FlatPortLens, flat_port_lens
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift
 
@@ -74,27 +74,21 @@ class PairOptics:
     """A stereo rig as the pinholes that stand in for it at its working range."""
 
     rig: StereoRig
-    lenses: tuple[FlatPortLens, FlatPortLens]
+    warps: tuple[PinholeWarp, PinholeWarp]
 
     @cached_property
     def views(self) -> tuple[View, View]:
         """Both views, in the world of the rig."""
         views = []
-        for name, lens, pose in zip(self.rig.names, self.lenses, self.rig.poses, strict=True):
-            p = lens.pinhole
+        for name, warp, pose in zip(self.rig.names, self.warps, self.rig.poses, strict=True):
             views.append(
                 View(
                     image=name,
                     camera=name,
                     station=0,
-                    width_px=p.width_px,
-                    height_px=p.height_px,
-                    fx_px=p.focal_px,
-                    fy_px=p.focal_px,
-                    cx_px=p.cx_px,
-                    cy_px=p.cy_px,
-                    world_from_cam=pose.inv() * lens.pinhole_from_cam.inv(),
-                    shift=range_shift(lens),
+                    pinhole=warp.pinhole,
+                    world_from_cam=pose.inv() * warp.pinhole_from_cam.inv(),
+                    shift=range_shift(warp),
                 )
             )
         return views[0], views[1]
@@ -102,8 +96,8 @@ class PairOptics:
 
 def optics_for(rig: StereoRig, near_m: float, far_m: float) -> PairOptics:
     """The best pinholes for distances between near and far."""
-    first, second = (flat_port_lens(camera, near_m, far_m) for camera in rig.cameras)
-    return PairOptics(rig=rig, lenses=(first, second))
+    first, second = (best_warp(camera, near_m, far_m) for camera in rig.cameras)
+    return PairOptics(rig=rig, warps=(first, second))
 
 
 def matched_points(rig: StereoRig, pixels: tuple[Array, Array]) -> Array:

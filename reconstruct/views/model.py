@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import CamerasRecord, FrameRecord, PlaceRecord
-from reconstruct.views.lens import Lens, lens_from_json
-from reconstruct.views.range_shift import RangeShift, no_shift, range_shift
+from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, warp_from_json
+from reconstruct.views.range_shift import KernelLens, RangeShift, no_shift, range_shift
 
 _ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -52,44 +52,31 @@ class View:
     """Name in the manifest."""
     camera: str
     station: int
-    width_px: int
-    height_px: int
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
+    pinhole: Pinhole
     world_from_cam: RigidTransform
-    shift: RangeShift | None = None
-    """What the warp of the picture leaves of the port's refraction; None without a port."""
+    shift: RangeShift
+    """What the warp of the picture leaves of the port's refraction."""
 
     def project(self, points_world: Array) -> Array:
         """Pixels (N, 2) at which the warped picture shows points (N, 3); NaN behind the camera."""
-        ideal = self.project_ideal(points_world)
-        if self.shift is None:
-            return ideal
-        return self.shift.warped(ideal, self.world_from_cam.inv().apply(points_world)[:, 2])
+        points = self.world_from_cam.inv().apply(points_world)
+        return self.shift.warped(self.pinhole.project(points), points[:, 2])
 
     def project_ideal(self, points_world: Array) -> Array:
         """Pixels (N, 2) at which the ideal pinhole sees points (N, 3); NaN behind the camera."""
-        points = self.world_from_cam.inv().apply(points_world)
-        z = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
-        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
-        pixels: Array = focal * points[:, :2] / z + centre
-        return pixels
+        return self.pinhole.project(self.world_from_cam.inv().apply(points_world))
 
     def at_depth(self, pixels: Array, depth: Array) -> Array:
         """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
-        ideal = pixels if self.shift is None else self.shift.ideal(pixels, depth)
-        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
-        sideways = (ideal - centre) / focal * depth[:, None]
-        points: Array = self.world_from_cam.apply(np.column_stack([sideways, depth]))
-        return points
+        slopes = self.pinhole.slopes(self.shift.ideal(pixels, depth))
+        points = np.column_stack([slopes * depth[:, None], depth])
+        found: Array = self.world_from_cam.apply(points)
+        return found
 
     @property
-    def shift_arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
-        """What kernels that look through the port take; a field of zeros without one."""
-        shift = self.shift or no_shift(self.width_px, self.height_px)
-        return shift.arguments
+    def kernel_lens(self) -> KernelLens:
+        """Pinhole and shift as kernels take them."""
+        return self.pinhole.numbers, self.shift.field, self.shift.inverse_working
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,13 +132,15 @@ def datum_of(place: PlaceRecord) -> Datum:
     return Datum(place.latitude_deg, place.longitude_deg, place.height_m)
 
 
-def read_lenses(path: Path) -> dict[str, Lens]:
-    """The lenses of `cameras.json`, by camera.
+def read_warps(path: Path) -> dict[str, PinholeWarp]:
+    """The cameras of a `cameras.json` and their pinholes, by name.
 
     Raises:
         WorkspaceError: it is missing, or a camera is wrong.
     """
-    return {name: lens_from_json(lens) for name, lens in CamerasRecord.read(path).cameras.items()}
+    stored = CamerasRecord.read(path).cameras
+    with taken_from(path):
+        return {name: warp_from_json(warp) for name, warp in stored.items()}
 
 
 def read_model(sparse: str | Path) -> SparseModel:
@@ -177,32 +166,29 @@ def read_model(sparse: str | Path) -> SparseModel:
 
 
 def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
-    cameras = stored.images
-    shifts = _shifts(stored, frame)
+    warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
+    # Without lengths in metres a port's shift is not known.
+    shifts = {
+        name: range_shift(warp) if frame.scaled else no_shift(*warp.pinhole.size_px)
+        for name, warp in warps.items()
+    }
     images = sorted(
         (i for i in model.images.values() if i.has_pose), key=lambda image: str(image.name)
     )
     views = []
     for image in images:
-        camera = model.cameras[image.camera_id]
-        fx, fy, cx, cy = camera.params
-        cam_from_world = image.cam_from_world()
+        cam_from_world, record = image.cam_from_world(), stored.images[image.name]
         pose = RigidTransform.from_components(
             cam_from_world.translation, Rotation.from_quat(cam_from_world.rotation.quat)
         )
         views.append(
             View(
                 image=image.name,
-                camera=cameras[image.name].camera,
-                station=cameras[image.name].station,
-                width_px=camera.width,
-                height_px=camera.height,
-                fx_px=fx,
-                fy_px=fy,
-                cx_px=cx,
-                cy_px=cy,
+                camera=record.camera,
+                station=record.station,
+                pinhole=warps[record.camera].pinhole,
                 world_from_cam=pose.inv(),
-                shift=shifts.get(cameras[image.name].camera),
+                shift=shifts[record.camera],
             )
         )
     view_of = {image.image_id: index for index, image in enumerate(images)}
@@ -220,17 +206,6 @@ def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
     )
 
 
-def _shifts(stored: CamerasRecord, frame: WorldFrame) -> dict[str, RangeShift]:
-    """Range shift by camera; none without a port, and none where lengths are not known."""
-    if not frame.scaled:
-        return {}
-    return {
-        name: range_shift(lens_from_json(lens))
-        for name, lens in stored.cameras.items()
-        if lens["kind"] == "flat_port"
-    }
-
-
 def points_of_views(model: SparseModel) -> list[Array]:
     """World coordinates (N, 3) of the sparse points that each view observed."""
     order = np.argsort(model.observations[:, 1], kind="stable")
@@ -243,17 +218,12 @@ def scaled_view(view: View, scale: float) -> View:
     """The same view in a picture shrunk by a factor (1 keeps it)."""
     if scale == 1.0:
         return view
-    width, height = round(view.width_px * scale), round(view.height_px * scale)
-    sx, sy = width / view.width_px, height / view.height_px
+    old = view.pinhole
+    width, height = (round(side * scale) for side in old.size_px)
     return replace(
         view,
-        width_px=width,
-        height_px=height,
-        fx_px=view.fx_px * sx,
-        cx_px=view.cx_px * sx,
-        fy_px=view.fy_px * sy,
-        cy_px=view.cy_px * sy,
-        shift=None if view.shift is None else view.shift.scaled(sx, sy),
+        pinhole=old.resized(width, height),
+        shift=view.shift.scaled(width / old.width_px, height / old.height_px),
     )
 
 

@@ -14,10 +14,11 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig, load_config
 from alice_survey.cli.main import app, main
 from alice_survey.stages import names
 from alice_survey.survey import init_survey
+from camera_calib.rig import design_rig, write_rig
 
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
@@ -74,6 +75,29 @@ def test_every_command_explains_itself_with_examples(path: tuple[str, ...]) -> N
         parser = parser.commands[name]
     for example in examples:
         parser.make_context(path[-1], shlex.split(example)[len(path) :])  # it parses
+
+
+def examples_of(*path: str) -> list[list[str]]:
+    shown = CliRunner().invoke(app, [*path, "--help"])
+    found = re.findall(rf"^ +alice-survey ({' '.join(path)}.*)$", shown.output, re.MULTILINE)
+    return [shlex.split(example) for example in found]
+
+
+@pytest.mark.parametrize("command", ["target", "fov", "init"])
+def test_the_examples_of_help_work(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that need nothing but the command."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "calibration").mkdir()
+    write_rig(tmp_path / "calibration" / "rig.json", design_rig(CameraConfig(), WaterConfig()))
+    area = {"type": "Polygon", "coordinates": [[[35, 32], [35.0002, 32], [35, 32.0002], [35, 32]]]}
+    (tmp_path / "reef.geojson").write_text(json.dumps(area))
+    for i, example in enumerate(examples_of(command)):
+        (tmp_path / f"{i}").mkdir()
+        words = [f"{i}/reef" if word == "reef" else word for word in example]
+        done = CliRunner().invoke(app, words, catch_exceptions=False)
+        assert done.exit_code == 0, (example, done.output)
 
 
 def test_all_commands_are_known() -> None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
-from shapely.geometry import LineString, Polygon
+from shapely.geometry import LineString, Polygon, box
 from shapely.ops import unary_union
 
 from alice_survey.base.config import CameraConfig, WaterConfig
@@ -33,18 +33,36 @@ IDEAL = design_rig(CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0), Wat
 ]
 
 
-def test_size_through_a_port_is_the_sum_of_three_tangents() -> None:
-    across, along = footprint_size_m(LEFT, 2.0)
-
-    for size, half_mm in ((across, 3384 * 3.69e-3 / 2), (along, 2710 * 3.69e-3 / 2)):
-        sine = math.sin(math.atan(half_mm / 12.5))
+def test_size_through_a_port_is_that_between_the_corners() -> None:
+    """The corner's ray, by three tangents: its reach splits as the corner's pixel does."""
+    halves_mm = (3384 * 3.69e-3 / 2, 2710 * 3.69e-3 / 2)
+    for camera, layers_m in ((LEFT, (0.02, 0.01, 2.0)), (IDEAL, (0.0, 0.0, 2.0))):
+        sine = math.sin(math.atan(math.hypot(*halves_mm) / 12.5))
         angles = [math.asin(sine / n) for n in (1.0, 1.52, 1.34)]
-        parts = [d * math.tan(a) for d, a in zip((0.02, 0.01, 2.0), angles, strict=True)]
-        assert size == pytest.approx(2 * sum(parts), rel=1e-12)
+        reach = sum(d * math.tan(a) for d, a in zip(layers_m, angles, strict=True))
+        sides = [2 * reach * half / math.hypot(*halves_mm) for half in halves_mm]
+        assert footprint_size_m(camera, 2.0) == pytest.approx(sides, rel=1e-12)
 
 
-def test_size_of_an_ideal_port_is_the_known_one() -> None:
-    assert footprint_size_m(IDEAL, 2.0) == pytest.approx((1.415, 1.154), abs=6e-4)
+@given(k1=st.floats(-0.25, 0.25), altitude_m=st.floats(0.5, 6.0), tilt=st.floats(-0.05, 0.05))
+def test_the_size_is_of_the_largest_upright_rectangle_that_is_seen(
+    k1: float, altitude_m: float, tilt: float
+) -> None:
+    """Also where a lens makes the sides hollow, or a tilted port makes them lean."""
+    normal = (math.sin(tilt), 0.0, math.cos(tilt))
+    camera = changed(LEFT, k1=k1, normal=normal)
+    across, along = footprint_size_m(camera, altitude_m)
+
+    floor_z = camera.front_cam[2] + altitude_m
+    seen = camera.at_depth(camera.border(400), floor_z)[:, :2]
+    top, right, bottom, left = (
+        np.vstack([seen, seen[:1]])[400 * k : 400 * k + 401] for k in range(4)
+    )
+    low, high = (left[:, 0].max(), top[:, 1].max()), (right[:, 0].min(), bottom[:, 1].min())
+    assert (across, along) == pytest.approx((high[0] - low[0], high[1] - low[1]), rel=1e-3)
+    assert Polygon(seen).buffer(1e-3 * along).covers(box(*low, *high))
+    assert not Polygon(seen).covers(box(low[0], low[1], high[0] + 0.01 * across, high[1]))
+    assert not Polygon(seen).covers(box(low[0], low[1], high[0], high[1] + 0.01 * along))
 
 
 @given(
@@ -108,14 +126,14 @@ def test_a_camera_that_looks_up_sees_no_sea_floor() -> None:
 
 
 def test_a_footprint_bulges() -> None:
-    """Refraction draws the corners in: the middle row is the widest."""
+    """Refraction draws the corners in: the middle row is 3 % wider than what is surely seen."""
     polygon = footprint_polygon(LEFT, level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.0), 15.0)
     across, along = footprint_size_m(LEFT, 2.0)
-    box = polygon.bounds
+    south, west, north, east = polygon.bounds
 
-    assert box[3] - box[1] == pytest.approx(across, rel=1e-9)
-    assert box[2] - box[0] == pytest.approx(along, rel=1e-9)
-    assert 0.95 * across * along < polygon.area < 0.995 * across * along
+    assert 1.03 * across < east - west < 1.035 * across
+    assert 1.04 * along < north - south < 1.055 * along
+    assert polygon.buffer(1e-6).covers(box(-along / 2, -across / 2, along / 2, across / 2))
 
 
 def leaning(rig: Rig) -> Rig:

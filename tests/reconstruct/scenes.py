@@ -1,6 +1,6 @@
 """A synthetic survey whose every ray is known: stereo stations over relief, through flat ports."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
+from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, design_rig
 from reconstruct.matching.matches import PairMatches
 
@@ -45,6 +46,7 @@ def make_scene(
     bias_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     port_distance_m: float = 0.02,
     port_tilt_deg: tuple[float, float] = (0.0, 0.0),
+    port: PortValues | None = None,
     scale: int = 4,
     relief_m: float = 0.16,
     seed: int = 5,
@@ -54,11 +56,14 @@ def make_scene(
     Relief reaches `relief_m` above and below the mean; pixels are `scale` times those of the
     camera, which noise in pixels refers to.
 
-    Navigation is the truth plus a constant bias and 0.1 degrees of attitude noise.
+    `port` stands in for the flat one of the design. Navigation is the truth plus a constant bias
+    and 0.1 degrees of attitude noise.
     """
     rng = np.random.default_rng(seed)
     camera = CameraConfig(port_distance_m=port_distance_m, port_tilt_deg=port_tilt_deg)
     rig = design_rig(camera, WaterConfig(), scale=scale)
+    if port is not None:
+        rig = replace(rig, cameras={n: replace(c, port=port) for n, c in rig.cameras.items()})
     length = 0.55 * stations
     north = rng.uniform(-1.5, length + 1.5, points)
     east = rng.uniform(-1.5, lines + 0.5, points)

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Datum
-from reconstruct.views.lens import lens_from_json
-from reconstruct.views.model import WorldFrame, read_frame, write_frame
+from reconstruct.views.model import WorldFrame, read_frame, read_warps, write_frame
 from reconstruct.views.model_files import read_reconstruction
 from tests.reconstruct.scenes import make_scene
 from tests.reconstruct.true_models import near_truth, warped_scene
@@ -78,6 +78,8 @@ def test_a_frame_that_was_changed_names_its_file(tmp_path: Path, old: str, new: 
         read_frame(path)
 
 
-def test_a_lens_that_lacks_a_value_names_its_file() -> None:
-    with pytest.raises(WorkspaceError, match=r"cameras\.json"):
-        lens_from_json({"kind": "flat_port"})
+def test_a_camera_that_lacks_a_value_names_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    write_json(path, {"cameras": {"left": {"pinhole": {}}}, "images": {}})
+    with pytest.raises(WorkspaceError, match=r"cameras\.json.*centre_m"):
+        read_warps(path)

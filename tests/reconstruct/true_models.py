@@ -7,10 +7,9 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
-from reconstruct.mapping.database import Observations, as_transform, rigid3d
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from reconstruct.mapping.database import Observations, as_transform, colmap_pinhole, rigid3d
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.matching.matches import as_seen
-from reconstruct.views.lens import Lens, flat_port_lens
 from tests.reconstruct.scenes import Scene
 
 POSE_ERROR = (2e-3, 5e-3)
@@ -19,26 +18,25 @@ POSE_ERROR = (2e-3, 5e-3)
 
 def warped_scene(
     scene: Scene, near_m: float = 1.75, far_m: float = 2.35
-) -> tuple[Observations, dict[str, Lens]]:
+) -> tuple[Observations, dict[str, PinholeWarp]]:
     """A scene as pinholes see it that are exact at one working depth."""
-    lenses: dict[str, Lens] = {
-        name: flat_port_lens(camera, near_m, far_m) for name, camera in scene.rig.cameras.items()
+    warps: dict[str, PinholeWarp] = {
+        name: best_warp(camera, near_m, far_m) for name, camera in scene.rig.cameras.items()
     }
     seen = Observations(
         images=scene.records,
-        cameras={name: lens.pinhole.colmap for name, lens in lenses.items()},
-        pixels=[
-            as_seen(p, lenses[r.camera]) for p, r in zip(scene.pixels, scene.records, strict=True)
-        ],
+        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()},
+        taken=scene.pixels,
         pairs=(),
+        warps=warps,
     )
-    return seen, lenses
+    return seen, warps
 
 
 def near_truth(
     scene: Scene,
     seen: Observations,
-    lenses: Mapping[str, Lens],
+    warps: Mapping[str, PinholeWarp],
     rng: np.random.Generator,
     error: tuple[float, float] = POSE_ERROR,
 ) -> Mapped:
@@ -47,14 +45,14 @@ def near_truth(
     Point i of the scene has the id i + 1. Stereo rigs are as given by the scene.
     """
     pinhole_from_rig = {
-        name: lenses[name].pinhole_from_cam * pose for name, pose in scene.rig.cam_from_rig.items()
+        name: warps[name].pinhole_from_cam * pose for name, pose in scene.rig.cam_from_rig.items()
     }
     model = _without_poses(scene, seen, pinhole_from_rig)
     reference = scene.rig.reference
     for number, record in enumerate(scene.records, 1):
         if record.camera != reference:
             continue
-        true = scene.ned_from_cam[number - 1] * lenses[reference].pinhole_from_cam.inv()
+        true = scene.ned_from_cam[number - 1] * warps[reference].pinhole_from_cam.inv()
         moved = true * RigidTransform.from_exp_coords(
             np.concatenate([rng.normal(0, error[0], 3), rng.normal(0, error[1], 3)])
         )
@@ -77,7 +75,7 @@ def near_truth(
         )
     return Mapped(
         model=model,
-        lenses=lenses,
+        warps=warps,
         models=(len(seen.images),),
         scaled=True,
         baseline=model_baseline_of(pinhole_from_rig),
@@ -125,7 +123,7 @@ def _without_poses(
 def true_stations(scene: Scene, mapped: Mapped) -> list[RigidTransform]:
     """`ned_from_rig` of every station, at the reference pinhole."""
     reference = scene.rig.reference
-    rig_from_cam = mapped.lenses[reference].pinhole_from_cam
+    rig_from_cam = mapped.warps[reference].pinhole_from_cam
     return [
         pose * rig_from_cam.inv()
         for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
@@ -143,8 +141,8 @@ def pupils_and_points(mapped: Mapped, scene: Scene) -> tuple[Array, Array, Array
     """Entrance pupils found and true, (N, 3), and points found and true, (P, 3)."""
     found, true = [], []
     for number, image in sorted(mapped.model.images.items()):
-        lens = mapped.lenses[scene.records[number - 1].camera]
-        pose = as_transform(image.cam_from_world()).inv() * lens.pinhole_from_cam
+        warp = mapped.warps[scene.records[number - 1].camera]
+        pose = as_transform(image.cam_from_world()).inv() * warp.pinhole_from_cam
         found.append(pose.translation)
         true.append(scene.ned_from_cam[number - 1].translation)
     ids = sorted(mapped.model.points3D)

@@ -88,10 +88,28 @@ def test_without_a_port_water_magnifies_a_pinhole_n_times(
     )
 
 
+@given(lens_mm=st.floats(3.0, 50.0), altitude_m=st.floats(0.3, 10.0))
+def test_the_sure_rectangle_lies_between_the_corners(lens_mm: float, altitude_m: float) -> None:
+    """Its corners are where the picture's corners see the floor, by three tangents."""
+    row = fov_table([lens_mm], [altitude_m], 1.34, PORT)[0]
+    halves = np.array([3384, 2710]) * 3.69e-3 / 2
+    sine = math.sin(math.atan(np.hypot(*halves) / lens_mm))
+    layers = (
+        (PORT.port.port_distance_m, 1.0),
+        (PORT.port.glass_thickness_m, 1.52),
+        (altitude_m, 1.34),
+    )
+    reach = sum(thick * math.tan(math.asin(sine / n)) for thick, n in layers)
+    sure = (row.sure_horizontal_m, row.sure_vertical_m)
+    assert sure == pytest.approx(2 * reach * halves / np.hypot(*halves), rel=1e-9)
+    assert sure[0] < row.horizontal_m and sure[1] < row.vertical_m
+
+
 def test_in_air_it_is_a_pinhole() -> None:
     row = fov_table([12.5], [2.0], 1.0, NO_PORT)[0]
 
     assert row.horizontal_m == pytest.approx(2 * 3384 * 3.69e-3 / 12.5)
+    assert row.sure_horizontal_m == pytest.approx(row.horizontal_m)
     assert row.pixel_centre_mm == pytest.approx(row.pixel_mean_mm)
     assert row.pixel_corner_mm == pytest.approx(row.pixel_centre_mm)
     assert row.diagonal_water_deg == pytest.approx(row.diagonal_air_deg)

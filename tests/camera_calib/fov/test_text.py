@@ -43,6 +43,18 @@ def test_what_does_not_exist_is_neither_nan_nor_inf(
     assert fov_tables([]) == []
 
 
+@pytest.mark.parametrize(("lens_mm", "fisheye"), [(12.5, False), (7.0, False), (3.0, True)])
+def test_a_lens_wider_than_straight_ones_are_made_is_called_a_fisheye(
+    lens_mm: float, fisheye: bool
+) -> None:
+    """65, 97 and 139 degrees."""
+    rows = fov_table([12.5, lens_mm], [2.0], 1.34, PORT)
+    text = as_text(fov_tables(rows))
+    assert ("fisheye" in text) == fisheye
+    assert ("139 deg" in text) == fisheye
+    assert f"{rows[1].sure_horizontal_m:.3f} x {rows[1].sure_vertical_m:.3f} m" in text
+
+
 def test_markdown_is_a_table_with_bars_escaped() -> None:
     table = TextTable(title="T", header=("a", "b"), cells=(("1|2", "3"),), notes=("note",))
     assert as_markdown([table]).splitlines() == [

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_calib.approximation.virtual_pinhole import best_pinhole
+from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.calibration import TargetView
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.homography import homography_residuals, homography_test
@@ -27,10 +27,12 @@ def test_through_the_true_model_a_board_is_a_homography(view: int) -> None:
     made = synthetic_views(rig, 8, 0.0, 2)
     pixels = made.views[view].pixels["left"]
     seen = np.isfinite(pixels[:, 0])
-    pinhole = best_pinhole(rig.cameras["left"], 0.6, 2.2)
 
     left, freedom = homography_residuals(
-        rig.cameras["left"], pinhole, made.points[seen], pixels[seen], made.rig_from_target[view]
+        best_warp(rig.cameras["left"], 0.6, 2.2),
+        made.points[seen],
+        pixels[seen],
+        made.rig_from_target[view],
     )
 
     assert np.abs(left).max() < 1e-8
@@ -43,12 +45,11 @@ def test_an_error_of_the_pose_hardly_matters() -> None:
     made = synthetic_views(rig, 4, 0.0, 2)
     pixels = made.views[1].pixels["left"]
     seen = np.isfinite(pixels[:, 0])
-    pinhole = best_pinhole(rig.cameras["left"], 0.6, 2.2)
     near = made.rig_from_target[1]
     off = type(near).from_translation([0.0, 0.0, 0.01]) * near
 
     left, _ = homography_residuals(
-        rig.cameras["left"], pinhole, made.points[seen], pixels[seen], off
+        best_warp(rig.cameras["left"], 0.6, 2.2), made.points[seen], pixels[seen], off
     )
 
     assert np.abs(left).max() < 2e-3
@@ -64,7 +65,7 @@ def test_residuals_are_those_of_opencvs_homography() -> None:
     board, pixels = made.points[seen], pixels[seen]
 
     found, _ = homography_residuals(
-        bare, best_pinhole(bare, 0.6, 2.2), board, pixels, made.rig_from_target[0]
+        best_warp(bare, 0.6, 2.2), board, pixels, made.rig_from_target[0]
     )
 
     matrix, _ = cv2.findHomography(board[:, :2] / SQUARE_M, pixels, 0)

@@ -116,13 +116,14 @@ def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
         ports = (*of_ports(DESIGN), *pose_names(DESIGN))
         freedom = Freedom(free=ports, prior=prior)
         first, second = (
-            adjusted(found.views[i::2], found.target_points, found.rig, freedom).rig
-            for i in range(2)
+            adjusted(found.views[i::2], found.target_points, found.rig, freedom) for i in range(2)
         )
+        alone = Freedom(free=freedom.names(found.rig))
         for name, camera in found.rig.cameras.items():
             pixels, anchors = camera.frame_grid(9, 7), anchors_cam(found, name)
-            shared = halves_difference((first, second), name, pixels, 1.5, anchors, prior)
-            apart = halves_difference((first, second), name, pixels, 1.5, anchors)
+            shared = halves_difference((first, second), name, pixels, 1.5, anchors)
+            unaware = (replace(first, freedom=alone), replace(second, freedom=alone))
+            apart = halves_difference(unaware, name, pixels, 1.5, anchors)
             ratios.append(shared.rms_px / shared.expected_rms_px)
             independent.append(apart.rms_px / apart.expected_rms_px)
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.3
@@ -140,8 +141,9 @@ def test_the_same_calibration_twice_does_not_differ() -> None:
         },
     )
     anchors, pixels = anchors_cam(found, "left"), found.rig.cameras["left"].frame_grid(5, 5)
-    same = halves_difference((found.rig, found.rig), "left", pixels, 2.0, anchors)
-    moved = halves_difference((found.rig, turned), "left", pixels, 2.0, anchors)
+    other = replace(found, rig=turned)
+    same = halves_difference((found, found), "left", pixels, 2.0, anchors)
+    moved = halves_difference((found, other), "left", pixels, 2.0, anchors)
     assert same.rms_px < 1e-6
     assert 0.0 < moved.rms_px < 0.005
     assert same.expected_rms_px > 0.05

@@ -166,6 +166,22 @@ def test_wrong_wishes_give_one_clear_line(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_the_description_of_another_target_is_kept(tmp_path: Path) -> None:
+    """A printed board must not go with the JSON file of another."""
+    board, other = parse_target(KINDS[1]), parse_target(KINDS[0])
+    described, _ = write_sheet(board, tmp_path / "b.pdf")
+    write_sheet(board, tmp_path / "b.svg")  # another page of the same target
+    with pytest.raises(CalibrationError, match=r"b\.json describes charuco 7x5"):
+        write_sheet(other, tmp_path / "b.png")
+    assert parse_target(str(described)) == board
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.json", "b.pdf", "b.svg"]
+
+    (tmp_path / "own.json").write_text('{"mine": 1}')
+    with pytest.raises(CalibrationError, match=r"own\.json"):
+        write_sheet(other, tmp_path / "own.svg")
+    assert (tmp_path / "own.json").read_text() == '{"mine": 1}'
+
+
 @pytest.mark.parametrize(
     ("text", "ambiguous"), [("chessboard 8x6 25mm", True), ("chessboard 9x6 25mm", False)]
 )

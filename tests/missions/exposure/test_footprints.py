@@ -1,11 +1,13 @@
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from alice_survey.base.errors import PlanError
+from camera_calib.camera import Camera
 from missions.exposure.footprints import (
     altitude_for_pixel_m,
     footprint_range,
@@ -19,27 +21,37 @@ from tests.oracles_imaging import traced_footprint, traced_spot
 STEP_M = 0.3
 
 
-def overlap_of_middle_row(first: Polygon, second: Polygon) -> float:
-    """Share of the first footprint's middle row that lies in the second."""
-    row = Polygon([(-9, -1e-4), (9, -1e-4), (9, 1e-4), (-9, 1e-4)])
+def sure_half_m(camera: Camera, altitude_m: float) -> tuple[float, float]:
+    """Half the width and length of the rectangle between a footprint's corners."""
+    corner = traced_spot(camera, float(camera.width_px), float(camera.height_px), altitude_m)
+    return float(corner[0]), float(corner[1])
+
+
+def overlap_of_row(first: Polygon, second: Polygon, along_m: float) -> float:
+    """Share of one row of the first footprint that lies in the second."""
+    row = Polygon([(-9, along_m - 1e-4), (9, along_m - 1e-4), (9, along_m), (-9, along_m)])
     strip = first.intersection(row)
     return strip.intersection(second).area / strip.area
 
 
-def test_one_metre_lines_at_two_metres_overlap_by_29_percent_not_45() -> None:
+def test_one_metre_lines_at_two_metres_surely_overlap_by_27_percent_not_45() -> None:
+    """And by 29 % on the middle row, where a footprint is widest."""
     rig, config = survey(ideal_port=True, plan={"line_spacing_m": 1.0})
     spacing = line_spacing(rig, config.plan, STEP_M)
 
-    half = math.atan(3384 * 3.69e-3 / 2 / 12.5)
-    width = 2 * 2.0 * math.tan(math.asin(math.sin(half) / 1.34))
+    halves = 3384 * 3.69e-3 / 2, 2710 * 3.69e-3 / 2
+    reach = 2.0 * math.tan(math.asin(math.sin(math.atan(math.hypot(*halves) / 12.5)) / 1.34))
+    width = 2 * reach * halves[0] / math.hypot(*halves)
     assert spacing.mean_overlap == pytest.approx(1 - 1 / width, abs=1e-9)
-    assert round(100 * spacing.mean_overlap, 1) == 29.3
+    assert round(100 * spacing.mean_overlap, 1) == 27.1
+    here, there = (traced_footprint(rig.cameras["left"], 2.0, x) for x in (0.0, 1.0))
+    assert overlap_of_row(here, there, 0.0) == pytest.approx(0.293, abs=1e-3)
 
 
 @pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])
-def test_through_real_ports_they_overlap_by_30_to_32_percent(distance_m: float) -> None:
+def test_through_real_ports_they_overlap_by_28_to_29_percent(distance_m: float) -> None:
     rig, config = survey(plan={"line_spacing_m": 1.0}, camera={"port_distance_m": distance_m})
-    assert 0.30 <= line_spacing(rig, config.plan, STEP_M).mean_overlap <= 0.32
+    assert 0.279 <= line_spacing(rig, config.plan, STEP_M).mean_overlap <= 0.29
 
 
 @pytest.mark.parametrize("ideal", [False, True])
@@ -51,12 +63,16 @@ def test_the_spacing_yields_the_overlap_on_traced_footprints(ideal: bool, wanted
     there = traced_footprint(rig.cameras["left"], 2.0, spacing.spacing_m)
 
     assert spacing.bound_by == "side_overlap"
-    assert overlap_of_middle_row(here, there) == pytest.approx(wanted, abs=1e-3)
+    # Every row that both pictures surely show is shared as requested, that of the corners just so.
+    rows = np.linspace(0.0, 1.0 - 1e-6, 6) * sure_half_m(rig.cameras["left"], 2.0)[1]
+    shares = [overlap_of_row(here, there, float(row)) for row in rows]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] == pytest.approx(wanted, abs=1e-3)
+    assert shares[0] < wanted + 0.025
     by_area = here.intersection(there).area / here.area
     assert spacing.area_overlap == pytest.approx(by_area, abs=2e-3)
-    # Sides bulge: corners share less than the middle row.
-    assert wanted - 0.02 < by_area < wanted
-    assert by_area - 1e-3 < spacing.swath_overlap < wanted
+    assert wanted < by_area < shares[0]
+    assert wanted < spacing.swath_overlap < shares[0]
 
 
 @settings(max_examples=40, deadline=None)
@@ -82,15 +98,15 @@ def test_neighbours_off_their_lines_still_overlap_as_requested(
     ground_m = altitude_m - 0.2 if over_relief else altitude_m
     here = traced_footprint(rig.cameras["left"], ground_m, -track_error_m)
     there = traced_footprint(rig.cameras["left"], ground_m, spacing.spacing_m + track_error_m)
-    edge = traced_spot(rig.cameras["left"], 3384.0, 1355.0, ground_m)[0]
-    row = Polygon([(-99, -1e-4), (99, -1e-4), (99, 1e-4), (-99, 1e-4)])
+    half_m, corner_m = sure_half_m(rig.cameras["left"], ground_m)
+    row = Polygon([(-99, corner_m - 2e-4), (99, corner_m - 2e-4), (99, corner_m), (-99, corner_m)])
     shared = here.intersection(there).intersection(row).area / 2e-4
 
     reached = spacing.off_track_overlap
     if not over_relief:
         across_m = footprint_size_m(rig.cameras["left"], altitude_m)[0]
         reached = overlap(across_m, spacing.spacing_m + 2 * track_error_m)
-    assert shared / (2 * edge) == pytest.approx(reached, abs=2e-3)
+    assert shared / (2 * half_m) == pytest.approx(reached, abs=2e-3)
     assert reached >= wanted - 1e-9
     if spacing.bound_by.startswith("side_overlap"):
         assert reached == pytest.approx(wanted, abs=1e-9)
@@ -109,11 +125,11 @@ def test_footprints_over_the_relief_grow_with_the_way_down() -> None:
     prints = footprint_range(rig, config.plan, STEP_M)
     assert [p.altitude_m for p in (prints.top, prints.mean, prints.bottom)] == [1.65, 2.0, 2.35]
     for p in (prints.top, prints.mean, prints.bottom):
-        edge = traced_spot(rig.cameras["left"], 3384.0, 1355.0, p.altitude_m)[0]
-        assert p.across_m == pytest.approx(2 * edge, rel=1e-9)
-        # A tenth of a metre of baseline is not seen by both, on either side.
-        assert p.stereo_across_m < p.across_m - 0.1 + 1e-9
-        assert p.stereo_across_m > p.across_m - 0.13
+        half_m, along_m = sure_half_m(rig.cameras["left"], p.altitude_m)
+        assert (p.across_m, p.along_m) == pytest.approx((2 * half_m, 2 * along_m), rel=1e-9)
+        # A tenth of a metre of baseline is not seen by both, on either side; between the corners
+        # lines see more than one picture surely does.
+        assert p.across_m - 0.1 < p.stereo_across_m < p.across_m - 0.1 + 0.06
 
 
 @given(pixel_mm=st.floats(0.05, 3.0))

@@ -14,15 +14,15 @@ from tests.missions.exposure.surveys import survey
 def test_settings_of_the_papers_mission() -> None:
     planned = imaging_settings(*survey(plan={"line_spacing_m": 1.0}))
 
-    assert planned.footprint_across_m == pytest.approx(1.441, abs=1e-3)
-    assert planned.footprint_along_m == pytest.approx(1.175, abs=1e-3)
+    assert planned.footprint_across_m == pytest.approx(1.398, abs=1e-3)
+    assert planned.footprint_along_m == pytest.approx(1.119, abs=1e-3)
     assert planned.pixel_m == pytest.approx(0.448e-3, abs=1e-6)
     assert planned.line_spacing_m == 1.0
-    assert planned.spacing.mean_overlap == pytest.approx(0.306, abs=1e-3)
-    assert 1 / planned.interval_s == pytest.approx(0.43, abs=0.005)
+    assert planned.spacing.mean_overlap == pytest.approx(0.2845, abs=1e-3)
+    assert 1 / planned.interval_s == pytest.approx(0.447, abs=0.003)
     assert planned.forward_overlap == pytest.approx(0.6, abs=1e-3)
     assert planned.strobe_pulse_s == pytest.approx(planned.exposure_s + 2 * 0.2e-3)
-    assert planned.paper_rule.forward_overlap == pytest.approx(0.319, abs=1e-3)
+    assert planned.paper_rule.forward_overlap == pytest.approx(0.285, abs=1e-3)
     assert planned.focus.focus_mean_air_m == pytest.approx(1.52, abs=0.005)
     # Speed alone allows 2.24 ms at the centre; the corners and the attitude rates take their share.
     assert 1.5e-3 < planned.exposure_s < 2.24e-3
@@ -115,8 +115,8 @@ def test_exposures_and_pulses_that_do_not_fit_are_refused(
         ({"plan": {"altitude_m": 1.2}}, "camera.f_number"),
         ({"plan": {"altitude_m": 1.2}}, "0.85 m"),
         ({"water": {"jerlov": "9C"}}, "allowed_blur_px"),
-        ({"plan": {"line_spacing_m": 1.4}}, "0.21 m"),
-        ({"plan": {"forward_overlap": 0.0}}, "0.20 m"),
+        ({"plan": {"line_spacing_m": 1.4}}, "0.24 m"),
+        ({"plan": {"forward_overlap": 0.0}}, "0.19 m"),
         ({"plan": {"forward_overlap": 0.9, "speed_mps": 1.0}}, "cable"),
     ],
 )

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -5,11 +7,10 @@ from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.depth import count_witnesses, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
-from reconstruct.views.range_shift import no_shift
-from reconstruct.views.sight import KernelLens, lens_of, pinhole_of, slopes_of
+from reconstruct.views.range_shift import KernelLens, no_shift, slopes_of
 from tests.oracles_dense import merged, plane_depth, port_view
 
-LENS = (np.array([50.0, 50.0, 10.0, 8.0]), no_shift(20, 16).arguments)
+LENS = (np.array([50.0, 50.0, 10.0, 8.0]), no_shift(20, 16).field, 0.0)
 NOWHERE = np.full((16, 20), np.nan, np.float32)
 
 
@@ -82,7 +83,7 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
     there += rng.normal(0, 0.05, there.shape).astype(np.float32)
     sigma = np.full(depth.shape, 0.01, np.float32)
     move = other.world_from_cam.inv() * one.world_from_cam
-    rows, columns = np.mgrid[: one.height_px, : one.width_px]
+    rows, columns = np.mgrid[: one.pinhole.height_px, : one.pinhole.width_px]
     pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
     points = one.at_depth(pixels, depth.ravel().astype(float))
     seen = in_frame(other, points).reshape(depth.shape)
@@ -101,6 +102,6 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
         return float(agree.mean())
 
     assert seen.mean() > 0.4
-    assert right(lens_of(one), lens_of(other)) > 0.999
-    bare = [(pinhole_of(v), no_shift(v.width_px, v.height_px).arguments) for v in (one, other)]
+    assert right(one.kernel_lens, other.kernel_lens) > 0.999
+    bare = [replace(v, shift=no_shift(*v.pinhole.size_px)).kernel_lens for v in (one, other)]
     assert right(*bare) < 0.95

@@ -62,4 +62,5 @@ def test_grainy_pictures_are_matched_at_a_lower_resolution_with_a_larger_sigma(s
 def test_large_pictures_are_halved_until_they_fit():
     view = stereo_views(np.zeros(1), np.zeros(1))[0]
     assert matching_scale(view) == 1.0
-    assert matching_scale(replace(view, width_px=3384, height_px=2710)) == 0.5
+    large = replace(view, pinhole=view.pinhole.resized(3384, 2710))
+    assert matching_scale(large) == 0.5

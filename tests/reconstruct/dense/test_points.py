@@ -5,6 +5,7 @@ import pytest
 
 from reconstruct.dense.points import block_bounds, joined, points_in_box
 from reconstruct.views.model import enu_from_cam
+from reconstruct.views.range_shift import no_shift
 from tests.oracles_dense import (
     Scene,
     hits,
@@ -25,7 +26,7 @@ OFFSET = np.array([3.0, -2.0, -12.0])
 
 def depth_of(view, scene=SCENE) -> np.ndarray:
     cam = view.world_from_cam.inv().apply(hits(view, scene).reshape(-1, 3))
-    return cam[:, 2].reshape(view.height_px, view.width_px).astype(np.float32)
+    return cam[:, 2].reshape(view.pinhole.height_px, view.pinhole.width_px).astype(np.float32)
 
 
 def gathered(view, box=EVERYWHERE, factors=None, depth=None):
@@ -107,7 +108,7 @@ def test_unknown_depth_gives_no_point_and_no_normal_next_to_it():
     depth[100:110, 50:60] = np.nan
     points = gathered(view, depth=depth)
     assert len(points.enu) == depth.size - 100
-    rim = 4 * (view.width_px + view.height_px) - 16
+    rim = 4 * (view.pinhole.width_px + view.pinhole.height_px) - 16
     assert (~np.isfinite(points.normals[:, 0])).sum() == pytest.approx(rim + 80, abs=2)
 
 
@@ -115,10 +116,12 @@ def test_colours_take_the_factors_of_their_place():
     view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
     factors = np.ones((2, 2, 3), np.float32)
     factors[:, 1] = 2.0
-    colours = gathered(view, factors=factors).colours.reshape(view.height_px, view.width_px, 3)
+    colours = gathered(view, factors=factors).colours.reshape(
+        view.pinhole.height_px, view.pinhole.width_px, 3
+    )
     np.testing.assert_allclose(colours[:, 0, 2], 100, atol=1)
     np.testing.assert_allclose(colours[:, -1, 2], 200, atol=1)
-    np.testing.assert_allclose(colours[:, view.width_px // 2, 0], 30, atol=1)
+    np.testing.assert_allclose(colours[:, view.pinhole.width_px // 2, 0], 30, atol=1)
 
 
 def test_joined_keeps_order_and_nothing_joins_to_nothing():
@@ -151,9 +154,9 @@ def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():
     depth = plane_depth(view, 1.6)  # far from the range at which the picture is exact
     points = gathered(view, depth=depth).enu + OFFSET
     np.testing.assert_allclose(points[:, 2], -1.6, atol=1e-6)
-    rows, columns = np.mgrid[: view.height_px, : view.width_px]
+    rows, columns = np.mgrid[: view.pinhole.height_px, : view.pinhole.width_px]
     pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
     back = view.project(points[:, [1, 0, 2]] * [1, 1, -1])
     np.testing.assert_allclose(back, pixels, atol=2e-3)
-    bare = gathered(replace(view, shift=None), depth=depth).enu + OFFSET
+    bare = gathered(replace(view, shift=no_shift(*view.pinhole.size_px)), depth=depth).enu + OFFSET
     assert 5e-4 < np.abs(bare - points).max() < 0.05

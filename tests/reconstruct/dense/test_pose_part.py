@@ -1,11 +1,12 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import heard
+from alice_survey.base.records import MappingRecord, RegistrationRecord, SimilarityRecord
 from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
 from reconstruct.mapping.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.views.model import SparseModel, read_model
@@ -24,20 +25,14 @@ def small_model() -> SparseModel:
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Points whose heights poses shift by 3 mm, known in a gauge that is turned and half as big."""
     folder = write(tmp_path_factory.mktemp("poses"), small_model(), SCENE)
-    mapping = folder / "mapping" / "model"
-    mapping.mkdir(parents=True)
-    colmap = pycolmap.Reconstruction(folder / "sparse" / "model")
-    ids = np.array(sorted(colmap.points3D))
-    back = TURN.inv()
-    move = pycolmap.Sim3d(1 / SCALE, pycolmap.Rotation3d(back.as_quat()), np.array([3.0, 4.0, 5.0]))
-    colmap.transform(move)
-    colmap.write(str(mapping))
+    (folder / "mapping").mkdir()
+    ids = np.arange(1, 1 + len(read_model(folder / "sparse").points_world))
     noise = np.zeros((len(ids), 3, 3))
     noise[:, 2, 2] = np.random.default_rng(1).uniform(0.001, 0.01, len(ids)) ** 2
     world = noise.copy()
     world[:, 0, 0] += 1.0  # what is unsure along north must not count
     world[:, 2, 2] += 0.003**2
-    turn = back.as_matrix()
+    turn = TURN.inv().as_matrix()
     found = Uncertainty(
         frames=np.arange(4),
         stations=np.arange(4),
@@ -49,6 +44,12 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         sigma_px=0.2,
     )
     write_uncertainty(folder / "mapping" / "covariance.npz", found)
+    MappingRecord(gauge="this model").write(folder / "mapping" / "mapping.json")
+    placed = SimilarityRecord(scale=SCALE, quaternion_xyzw=tuple(TURN.as_quat().tolist()))
+    RegistrationRecord(
+        registered=4, total=4, points=len(ids), mean_reprojection_px=0.1, mean_track_length=2.0,
+        scale_source=None, gauge="this model", world_from_mapping=placed,
+    ).write(folder / "sparse" / "registration.json")  # fmt: skip
     return folder
 
 
@@ -64,14 +65,16 @@ def test_what_pixels_do_is_taken_out_and_the_gauge_does_not_matter(workspace: Pa
 
 def test_a_covariance_of_another_model_is_not_taken(workspace: Path):
     model = read_model(workspace / "sparse")
-    moved = model.points_world.copy()
-    moved[7] += [0.0, 0.0, 0.01]
-    other = SparseModel(
-        frame=model.frame, views=model.views, points_world=moved, observations=model.observations
-    )
+    fewer = replace(model, points_world=model.points_world[:-1])
     with heard() as warnings:
-        assert find_pose_part(workspace, other) is None
+        assert find_pose_part(workspace, fewer) is None
     assert len(warnings) == 1
+    path = workspace / "mapping" / "mapping.json"
+    MappingRecord(gauge="another model").write(path)
+    with heard() as warnings:
+        assert find_pose_part(workspace, model) is None
+    assert len(warnings) == 1
+    MappingRecord(gauge="this model").write(path)
 
 
 def test_nodes_take_the_median_of_the_points_around_and_cells_lie_between():

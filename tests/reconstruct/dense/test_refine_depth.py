@@ -5,7 +5,6 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruct.dense.refine_depth import ComparedView, compare, pixel_lines, prepared, refine
-from reconstruct.views.sight import lens_of
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
 SCENE = Scene(
@@ -28,7 +27,7 @@ def looks() -> list[ComparedView]:
 def true_depth() -> np.ndarray:
     one = VIEWS[0]
     points = one.world_from_cam.inv().apply(hits(one, SCENE).reshape(-1, 3))
-    return points[:, 2].reshape(one.height_px, one.width_px)
+    return points[:, 2].reshape(one.pinhole.size_px[::-1])
 
 
 def test_compare_equals_its_slow_twin():
@@ -38,10 +37,10 @@ def test_compare_equals_its_slow_twin():
     rest, slope, speed = compare(
         (1 / depth).astype(np.float32),
         one.contrast,
-        pixel_lines(lens_of(one.view), *depth.shape),
+        pixel_lines(one.view.kernel_lens, *depth.shape),
         other.spline,
         other.valid,
-        lens_of(other.view),
+        other.view.kernel_lens,
         np.ascontiguousarray(move.as_matrix()[:3]),
     )
     rows, columns = np.nonzero(np.isfinite(rest))

@@ -62,7 +62,7 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     scene, mapped = block(), block_mapped()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     good = check_mapping(mapped.model, scene.records, positions, sigmas, 0.0, SURE)
     assert good.notes() == []
     assert good.far == ()
@@ -189,14 +189,14 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     scene, mapped = block(), block_mapped()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
-    rotations = navigation_rotations(scene.records, scene.rig, mapped.lenses)
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
+    rotations = navigation_rotations(scene.records, scene.rig, mapped.warps)
     straight = measure_doming(mapped.model, positions, sigmas, rotations)
     assert straight.notes() == []
     assert not capsys.readouterr().err
     assert straight.along is not None
     assert abs(straight.along.sag_m) < 5e-3
-    focal = mapped.lenses["left"].pinhole.focal_px
+    focal = mapped.warps["left"].pinhole.focal_px
     assert straight.pixel_m == pytest.approx(ALTITUDE_M / focal, rel=0.1)
     bent = positions.copy()
     north = positions[:, 0] - positions[:, 0].mean()

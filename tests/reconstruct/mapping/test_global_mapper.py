@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -7,7 +8,6 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL, local_executor
-from reconstruct.mapping.database import Observations
 from reconstruct.mapping.global_mapper import average_poses, station_groups
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
 from reconstruct.mapping.stations import StationLink, link_stations, stereo_points
@@ -28,12 +28,11 @@ def station_poses(scene: Scene) -> dict[int, RigidTransform]:
 
 
 def mapped_by(scene: Scene, method: str, threads: int = 1) -> Mapped:
-    seen, lenses = seen_by_pinholes(scene)
+    seen = seen_by_pinholes(scene)
     with TemporaryDirectory() as folder:
         return map_calibrated(
             seen,
             scene.rig.cam_from_rig,
-            lenses,
             Path(folder),
             1,
             method=method,  # type: ignore[arg-type]
@@ -110,8 +109,8 @@ def test_groups_without_a_link_stay_apart() -> None:
 
 def test_stereo_points_lie_where_the_floor_is() -> None:
     scene = make_scene(lines=1, stations=2, points=2500)
-    seen, lenses = seen_by_pinholes(scene)
-    found = stereo_points(seen, pinhole_rig(scene, lenses))
+    seen = seen_by_pinholes(scene)
+    found = stereo_points(seen, pinhole_rig(scene, seen.warps))
     poses = station_poses(scene)
     for record, points, ids in zip(scene.records, found, scene.ids, strict=True):
         known = np.isfinite(points[:, 0])
@@ -123,8 +122,8 @@ def test_stereo_points_lie_where_the_floor_is() -> None:
 
 def test_links_are_the_true_relative_poses() -> None:
     scene = make_scene(lines=2, stations=4, points=5000, noise_px=0.1)
-    seen, lenses = seen_by_pinholes(scene)
-    links = link_stations(seen, pinhole_rig(scene, lenses), 1, SERIAL)
+    seen = seen_by_pinholes(scene)
+    links = link_stations(seen, pinhole_rig(scene, seen.warps), 1, SERIAL)
     poses = station_poses(scene)
     assert {(k.first, k.second) for k in links} | {(k.second, k.first) for k in links} >= {
         (k, k + 1) for k in range(3)
@@ -204,11 +203,11 @@ def test_the_scale_is_the_rigs_whatever_the_first_guess() -> None:
 
 def test_pictures_without_matches_are_left_out_and_counted() -> None:
     scene = make_scene(lines=1, stations=6, points=3500, noise_px=0.2)
-    seen, lenses = seen_by_pinholes(scene)
+    seen = seen_by_pinholes(scene)
     alone = {10, 11}
     pairs = [p for p in seen.pairs if not (alone & {p[0], p[1]}) or {p[0], p[1]} == alone]
-    cut = Observations(images=seen.images, cameras=seen.cameras, pixels=seen.pixels, pairs=pairs)
+    cut = replace(seen, pairs=pairs)
     with TemporaryDirectory() as folder:
-        mapped = map_calibrated(cut, scene.rig.cam_from_rig, lenses, Path(folder), 1)
+        mapped = map_calibrated(cut, scene.rig.cam_from_rig, Path(folder), 1)
     assert mapped.models[0] == 10
     assert "2 of 12" in mapped.notes[0]

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,7 +9,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
-from reconstruct.mapping.database import Observations, rigid3d, write_database
+from camera_calib.approximation.pinhole_warp import best_warp
+from reconstruct.mapping.database import Observations, colmap_pinhole, rigid3d, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
     Method,
@@ -25,33 +27,29 @@ from reconstruct.mapping.mapper import (
 from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
-from reconstruct.matching.matches import as_seen
 from reconstruct.placing.alignment import align_rigid, align_similarity
-from reconstruct.views.lens import flat_port_lens
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 
-def seen_by_pinholes(scene: Scene) -> tuple[Observations, dict]:
-    lenses = {name: flat_port_lens(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()}
-    seen = Observations(
+def seen_by_pinholes(scene: Scene) -> Observations:
+    warps = {name: best_warp(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()}
+    return Observations(
         images=scene.records,
-        cameras={name: lens.pinhole.colmap for name, lens in lenses.items()},
-        pixels=[
-            as_seen(p, lenses[r.camera]) for p, r in zip(scene.pixels, scene.records, strict=True)
-        ],
+        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()},
+        taken=scene.pixels,
         pairs=scene.pairs,
+        warps=warps,
     )
-    return seen, lenses
 
 
 def mapped_scene(scene: Scene, rig_scale: float = 1.0, method: Method = "auto") -> Mapped:
-    seen, lenses = seen_by_pinholes(scene)
+    seen = seen_by_pinholes(scene)
     poses = {
         name: RigidTransform.from_components(rig_scale * pose.translation, pose.rotation)
         for name, pose in scene.rig.cam_from_rig.items()
     }
     with TemporaryDirectory() as folder:
-        return map_calibrated(seen, poses, lenses, Path(folder), 1, method=method)
+        return map_calibrated(seen, poses, Path(folder), 1, method=method)
 
 
 def pupils(mapped: Mapped, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +58,7 @@ def pupils(mapped: Mapped, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         if image.has_pose:
             record = scene.records[number - 1]
             pose = as_transform(image.cam_from_world()).inv()
-            lens = mapped.lenses[record.camera]
+            lens = mapped.warps[record.camera]
             found.append((pose * lens.pinhole_from_cam).translation)
             true.append(scene.ned_from_cam[number - 1].translation)
     return np.array(found), np.array(true)
@@ -119,7 +117,7 @@ def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
         right = as_transform(model.images[number + 1].cam_from_world())
         np.testing.assert_allclose((right * left.inv()).translation, [-0.1, 0, 0], atol=1e-9)
     for name, number in (("left", 1), ("right", 2)):
-        expected = mapped.lenses[name].pinhole
+        expected = mapped.warps[name].pinhole
         focal, _, cx, cy = model.cameras[number].params
         assert (focal, cx, cy) == (expected.focal_px, expected.cx_px, expected.cy_px)
 
@@ -136,7 +134,7 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
     seen = Observations(
         images=scene.records,
         cameras={"left": start, "right": pycolmap.Camera(start.todict())},
-        pixels=scene.pixels,
+        taken=scene.pixels,
         pairs=scene.pairs,
     )
     with TemporaryDirectory() as folder:
@@ -145,9 +143,9 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
     assert not mapped.scaled
     assert mapped.baseline == 1.0
     assert model_baseline(mapped.model) == pytest.approx(1.0, rel=1e-9)
-    for lens in mapped.lenses.values():
-        assert lens.params[0] == pytest.approx(760, rel=0.01)
-        assert lens.params[4] == pytest.approx(-0.08, abs=0.02)
+    for warp in mapped.warps.values():
+        assert warp.camera.fx_px == pytest.approx(760, rel=0.01)
+        assert warp.camera.k1 == pytest.approx(-0.08, abs=0.02)
     found, true = pupils(mapped, scene)
     fit = align_similarity(found, true)
     misses = np.linalg.norm(fit.apply(found) - true, axis=1)
@@ -255,10 +253,9 @@ def test_scaling_moves_rig_and_points_alike() -> None:
 
 def test_pictures_that_share_nothing_give_one_clear_line(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=3, points=300)
-    seen, lenses = seen_by_pinholes(scene)
-    alone = Observations(images=seen.images, cameras=seen.cameras, pixels=seen.pixels, pairs=[])
+    seen = seen_by_pinholes(scene)
     with pytest.raises(ReconstructionError, match="6 pictures"):
-        map_calibrated(alone, scene.rig.cam_from_rig, lenses, tmp_path, 1)
+        map_calibrated(replace(seen, pairs=[]), scene.rig.cam_from_rig, tmp_path, 1)
 
 
 @cache
@@ -269,10 +266,10 @@ def strip() -> tuple[Scene, Mapped]:
 
 def test_pinholes_follow_from_navigation() -> None:
     scene, mapped = strip()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     true = np.stack(
         [
-            (pose * mapped.lenses[r.camera].pinhole_from_cam.inv()).translation
+            (pose * mapped.warps[r.camera].pinhole_from_cam.inv()).translation
             for pose, r in zip(scene.ned_from_cam, scene.records, strict=True)
         ]
     )
@@ -285,7 +282,7 @@ def test_pinholes_follow_from_navigation() -> None:
 @pytest.mark.parametrize("jump_m", [0.0, 8.0])
 def test_positions_straighten_a_long_line_but_leave_its_scale(jump_m: float) -> None:
     scene, mapped = strip()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     stated = positions + np.array([0.4, -0.3, 0.05])
     stated[6:8] += [jump_m, 0.0, 0.0]  # one station whose position is wrong
     stated = stated.mean(axis=0) + 1.02 * (stated - stated.mean(axis=0))  # 2 % too long
@@ -299,7 +296,7 @@ def test_positions_straighten_a_long_line_but_leave_its_scale(jump_m: float) -> 
 
 def test_positions_that_contradict_the_pictures_are_not_used() -> None:
     scene, mapped = strip()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     wrong = positions + np.repeat(np.random.default_rng(1).normal(0, 2.0, (30, 3)), 2, axis=0)
     refined = refine_with_positions(mapped, scene.records, wrong, sigmas * 1e-3)
     assert camera_rms(refined, scene) < 2 * camera_rms(mapped, scene)
@@ -329,8 +326,8 @@ def test_models_that_share_stations_become_one(
     assert found is not None
     np.testing.assert_allclose(found.as_matrix(), move.as_matrix(), atol=1e-9)
 
-    seen, lenses = seen_by_pinholes(scene)
-    rig = {n: lenses[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+    seen = seen_by_pinholes(scene)
+    rig = {n: seen.warps[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
     write_database(tmp_path / "d.db", seen, rig)
     joined = merge_models([first, second], tmp_path / "d.db", _options(rig, 1, "nothing"))
     assert [m.num_reg_images() for m in joined] == [18]
@@ -358,7 +355,7 @@ def test_vague_positions_do_not_spoil_a_model_of_precise_pixels() -> None:
     scene = make_scene(lines=2, stations=5, points=6000, noise_px=0.05, seed=8)
     mapped = adjust_freely(mapped_scene(scene))
     assert 0.8 * 0.05 < pixel_sigma(mapped.model) < 1.4 * 0.05
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     station = np.array([r.station for r in scene.records])
     noise = np.random.default_rng(1).normal(0, 0.1, (station.max() + 1, 3))[station]
     vague = np.full_like(sigmas, 0.1)

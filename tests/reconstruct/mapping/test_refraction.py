@@ -9,9 +9,11 @@ import pycolmap
 import pytest
 
 from alice_survey.base.frames import Array
+from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
+from reconstruct.mapping.working_range import WorkingDistances, warp_record
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift
 from tests.cameras import changed
@@ -39,8 +41,8 @@ def scene_at(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> Scene:
 @cache
 def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapped, object]:
     scene = scene_at(port_m, tilt_deg, noise_px)
-    seen, lenses = warped_scene(scene)
-    return near_truth(scene, seen, lenses, np.random.default_rng(1)), seen
+    seen, warps = warped_scene(scene)
+    return near_truth(scene, seen, warps, np.random.default_rng(1)), seen
 
 
 def exact(scene: Scene, start: tuple[Mapped, object], folder: Path) -> tuple[Mapped, Convergence]:
@@ -68,6 +70,36 @@ def test_without_noise_nothing_is_left_of_the_port(
     assert rigid_rms(bent, true_points) > 0.05e-3, "what was to be corrected was there"
 
 
+@pytest.mark.parametrize(
+    ("offset_m", "corrected_px", "contraction"),
+    [
+        ((0.0, 0.0, 0.0), 0.0, 0.0),
+        ((0.0, 0.0, 0.005), 1.8e-4, 2.3e-6),
+        ((0.012, -0.01, 0.02), 0.026, 1.7e-4),
+    ],
+)
+def test_without_noise_nothing_is_left_of_a_dome(
+    offset_m: tuple[float, float, float], corrected_px: float, contraction: float, tmp_path: Path
+) -> None:
+    """A dome of 50 mm before a pupil at its centre, 5 mm behind it, and strongly off it."""
+    x, y, z = offset_m
+    dome = DomePort(
+        dome_x_m=x, dome_y_m=y, dome_z_m=z, outer_radius_m=0.05, glass_thickness_m=0.005
+    )
+    scene = make_scene(lines=2, stations=4, points=900, port=dome, scale=1, relief_m=0.3)
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
+    mapped, found = refract(start, seen, tmp_path)
+    pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
+    assert rigid_rms(points, true_points) < 0.01e-3
+    assert rigid_rms(pupils, true_pupils) < 0.01e-3
+    assert found.settled
+    assert found.corrected_px == pytest.approx(corrected_px, rel=0.2)
+    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
+    record = warp_record(warps["left"], distances)
+    assert record.contraction == pytest.approx(contraction, rel=0.2)
+
+
 @pytest.mark.parametrize(("port_m", "tilt_deg"), PORTS)
 def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
     port_m: float, tilt_deg: float, tmp_path: Path
@@ -93,7 +125,7 @@ def test_keypoints_end_where_the_field_of_the_lens_says(tmp_path: Path) -> None:
     scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
     mapped, _ = exact(scene, start, tmp_path)
     for number, image in mapped.model.images.items():
-        shift = range_shift(mapped.lenses[scene.records[number - 1].camera])
+        shift = range_shift(mapped.warps[scene.records[number - 1].camera])
         at = image.get_observation_point2D_idxs()
         warped = start[1].pixels[number - 1][at]
         points = [mapped.model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()]
@@ -115,8 +147,8 @@ def test_a_camera_in_plain_air_is_left_as_it_is(tmp_path: Path) -> None:
         for r, pose, ids in zip(scene.records, scene.ned_from_cam, scene.ids, strict=True)
     ]
     scene = replace(scene, pixels=pixels)
-    seen, lenses = warped_scene(scene)
-    start = near_truth(scene, seen, lenses, np.random.default_rng(1))
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
     mapped, found = refract(start, seen, tmp_path)
     assert max(found.moved_px) < 1e-6
     assert found.corrected_px < 1e-6
@@ -134,8 +166,8 @@ def test_wrong_matches_go_and_right_ones_stay(tmp_path: Path) -> None:
         rows[bad] += rng.choice([-1.0, 1.0], (2, 2)) * rng.uniform(25, 40, (2, 2))
         spoiled += 2
     wrong = replace(scene, pixels=pixels)
-    seen, lenses = warped_scene(wrong)
-    start = near_truth(wrong, seen, lenses, np.random.default_rng(1))
+    seen, warps = warped_scene(wrong)
+    start = near_truth(wrong, seen, warps, np.random.default_rng(1))
     mapped, found = refract(start, seen, tmp_path)
     total = start.model.compute_num_observations()
     assert spoiled <= found.removed < spoiled + 0.25 * total
@@ -163,7 +195,7 @@ def test_with_matches_lost_observations_come_back(tmp_path: Path) -> None:
 
 def test_navigation_takes_part_and_the_rig_keeps_the_scale(tmp_path: Path) -> None:
     scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
-    adjust = NavigationAdjuster(scene.records, scene.rig, start[0].lenses, DATUM)
+    adjust = NavigationAdjuster(scene.records, scene.rig, start[0].warps, DATUM)
     assert adjust.sigmas is None
     mapped, found = refract(start[0], start[1], tmp_path, adjust)
     assert found.settled

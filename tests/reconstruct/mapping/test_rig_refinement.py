@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig, read_rig
 from reconstruct.mapping.arrays import observed
@@ -31,7 +32,6 @@ from reconstruct.mapping.rig_refinement import (
 )
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid
-from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
 from tests.cameras import changed
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
@@ -55,8 +55,8 @@ def noisy(seed: int) -> Scene:
 def modelled(scene: Scene, rig: Rig, folder: Path) -> tuple[Mapped, Observations]:
     """The model that pictures of a scene give to who believes in another rig."""
     believed = replace(scene, rig=rig)
-    seen, lenses = warped_scene(believed)
-    start = near_truth(believed, seen, lenses, np.random.default_rng(1))
+    seen, warps = warped_scene(believed)
+    start = near_truth(believed, seen, warps, np.random.default_rng(1))
     return refract(start, seen, folder)[0], seen
 
 
@@ -195,7 +195,7 @@ def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     scene = noisy(6)
     wrong = nearer(scene.rig, 0.01)
     mapped, seen = modelled(scene, wrong, tmp_path)
-    adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, DATUM)
+    adjust = NavigationAdjuster(scene.records, wrong, mapped.warps, DATUM)
     mapped = adjust(mapped)
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     found = refine_rig(mapped, seen, wrong, distances, adjust, DATUM, tmp_path, PORT)
@@ -211,8 +211,7 @@ def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     said = json.loads((tmp_path / "port.json").read_text())
     assert said["parameters"][0] == "left.port_distance_m"
     assert written.cameras["left"].port.port_distance_m == pytest.approx(said["after"][0])
-    left = refined.lenses["left"]
-    assert isinstance(left, FlatPortLens)
+    left = refined.warps["left"]
     assert left.camera == written.cameras["left"]
     assert np.diag(said["correlation"]) == pytest.approx(1.0)
     _, _, points, true_points = pupils_and_points(refined, scene)
@@ -230,7 +229,7 @@ def test_points_that_took_no_part_move_along(
     scene = replace(clean(), pixels=pixels)
     wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
     mapped, seen = modelled(scene, wrong, tmp_path)
-    adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
+    adjust = NavigationAdjuster(scene.records, wrong, mapped.warps, None)
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     models = []
     for most in (200_000, mapped.model.compute_num_observations() // 4):
@@ -249,7 +248,7 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
     sigmas = [*[TURN_SIGMA] * 3, 1e-5, 1e-4, 1e-4]
     wrong = right_turned(scene.rig, 1.5 * TURN_SIGMA, sigmas)
     mapped, seen = modelled(scene, wrong, tmp_path)
-    adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
+    adjust = NavigationAdjuster(scene.records, wrong, mapped.warps, None)
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
 
     def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> RefinedSurvey | str:
@@ -281,7 +280,7 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
 
 
 def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
-    """New lenses of an unchanged rig: nothing moves."""
+    """New warps of an unchanged rig: nothing moves."""
     scene = noisy(7)
     mapped, seen = modelled(scene, scene.rig, tmp_path)
     frames = sorted(mapped.model.frames)
@@ -297,16 +296,16 @@ def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
         observations=0,
         stations=tuple(
             as_transform(mapped.model.frames[f].rig_from_world).inv()
-            * mapped.lenses["left"].pinhole_from_cam
+            * mapped.warps["left"].pinhole_from_cam
             for f in frames
         ),
         points=np.array([mapped.model.points3D[int(i)].xyz for i in ids]),
         point_ids=ids,
     )
-    lenses: dict[str, Lens] = {
-        name: flat_port_lens(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()
+    warps: dict[str, PinholeWarp] = {
+        name: best_warp(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()
     }
-    same, warped = on_rig(mapped, seen, fit, lenses)
+    same, warped = on_rig(mapped, seen, fit, warps)
     for before, after in zip(seen.pixels, warped.pixels, strict=True):
         np.testing.assert_allclose(after, before, atol=1e-6)
     for number, image in mapped.model.images.items():
@@ -320,7 +319,7 @@ def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
 def test_one_camera_is_refused(tmp_path: Path) -> None:
     scene = noisy(0)
     mapped, seen = modelled(scene, scene.rig, tmp_path)
-    adjust = NavigationAdjuster(scene.records, scene.rig, mapped.lenses, None)
+    adjust = NavigationAdjuster(scene.records, scene.rig, mapped.warps, None)
     alone = replace(mapped, scaled=False)
     with pytest.raises(ReconstructionError):
         refine_rig(alone, seen, scene.rig, None, adjust, None, tmp_path, PORT)

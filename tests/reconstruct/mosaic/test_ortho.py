@@ -3,7 +3,7 @@ import pytest
 
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.views.model import View, enu_from_cam
-from reconstruct.views.sight import pinhole_of
+from reconstruct.views.range_shift import as_nodes
 from tests.oracles_dense import sees, stereo_views
 
 
@@ -54,7 +54,7 @@ def test_unknown_cells_are_neither_seen_nor_in_the_way():
 
 def straight_nodes(view: View) -> np.ndarray:
     """A lens that changes nothing."""
-    x, y = np.linspace(0, view.width_px, 5), np.linspace(0, view.height_px, 4)
+    x, y = np.linspace(0, view.pinhole.width_px, 5), np.linspace(0, view.pinhole.height_px, 4)
     return np.stack(np.meshgrid(x, y), axis=-1)
 
 
@@ -67,7 +67,6 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     height[40, 50] = np.nan
     seen = np.ones((200, 200), bool)
     pixel, first = 0.02, (-1.0, 0.9)
-    nodes = straight_nodes(view)
     x, y, quality, ranges = look_up(
         height,
         (np.ones((1, 1), bool), 1),
@@ -75,10 +74,10 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
         (0.0, 0.0),
         1.0,
         cam_from_enu,
-        pinhole_of(view),
-        view.shift_arguments,
-        nodes,
-        (view.width_px, view.height_px),
+        view.kernel_lens,
+        view.pinhole.size_px,
+        as_nodes(straight_nodes(view), *view.pinhole.size_px),
+        view.pinhole.size_px,
         first,
         pixel,
         2.0,
@@ -94,7 +93,7 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     away = np.linalg.norm(world - view.world_from_cam.translation, axis=-1)
     np.testing.assert_allclose(ranges[inside], away[inside], rtol=1e-6)
     assert np.isnan(ranges[~inside]).all()
-    border = np.minimum(pixels, [view.width_px, view.height_px] - pixels).min(axis=-1)
+    border = np.minimum(pixels, view.pinhole.size_px - pixels).min(axis=-1)
     expected = (border > 2.0) & np.isfinite(height)
     np.testing.assert_array_equal(inside, expected)
     assert 0.2 < inside.mean() < 1.0

@@ -11,11 +11,11 @@ from alice_survey.base.config import CameraConfig, ReconstructConfig, SurveyConf
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
+from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
 from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
-from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
 from tests.engines import PicklingThreads
 from tests.oracles_dense import (
@@ -201,9 +201,9 @@ def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corre
     """A camera calibrated in water as a plain pinhole has no dispersion to correct."""
     camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
     bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": n_water}
-    lens = flat_port_lens(replace(camera, **bare), 1.5, 2.5)
+    warp = best_warp(replace(camera, **bare), 1.5, 2.5)
     write_json(
-        tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}, "images": {}}
+        tmp_path / "sparse" / "cameras.json", {"cameras": {"left": warp.to_json()}, "images": {}}
     )
     write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
     water, stated = _dispersion(tmp_path, "auto", CONFIG.water, 2.0, grey=False)

@@ -7,31 +7,26 @@ import pytest
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ImageError, WorkspaceError
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
 from camera_calib.camera import flat_port_camera
+from reconstruct.mapping.database import colmap_pinhole
+from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
-from reconstruct.views.lens import (
-    ColmapLens,
-    FlatPortLens,
-    Lens,
-    flat_port_lens,
-    lens_from_json,
-    self_calibrated_lens,
-)
 
 WIDTH, HEIGHT = 320, 240
 
 
-def port_lens() -> FlatPortLens:
+def port_lens() -> PinholeWarp:
     camera = flat_port_camera(
         width_px=WIDTH, height_px=HEIGHT, fx_px=300.0, fy_px=301.0, cx_px=158.0, cy_px=121.0,
         k1=-0.15, k2=0.05, p1=1e-3, p2=-5e-4, port_distance_m=0.02, glass_thickness_m=0.01,
         normal=(np.sin(0.02), 0.0, np.cos(0.02)),
     )  # fmt: skip
-    return flat_port_lens(camera, 1.5, 2.5)
+    return best_warp(camera, 1.5, 2.5)
 
 
-def opencv_lens(k1: float = -0.3) -> ColmapLens:
-    return self_calibrated_lens(
+def opencv_lens(k1: float = -0.3) -> PinholeWarp:
+    return self_calibrated_warp(
         pycolmap.Camera(
             model="OPENCV", width=WIDTH, height=HEIGHT,
             params=[280.0, 282.0, 161.0, 118.0, k1, 0.1, 1e-3, 5e-4],
@@ -43,28 +38,28 @@ LENSES = pytest.mark.parametrize("lens", [port_lens(), opencv_lens()], ids=["por
 
 
 @LENSES
-def test_pixels_come_back(lens: Lens) -> None:
+def test_pixels_come_back(lens: PinholeWarp) -> None:
     x, y = np.meshgrid(np.linspace(20, WIDTH - 20, 9), np.linspace(20, HEIGHT - 20, 7))
     taken = np.stack([x, y], axis=-1).reshape(-1, 2)
     np.testing.assert_allclose(lens.from_pinhole(lens.to_pinhole(taken)), taken, atol=1e-6)
 
 
 @LENSES
-def test_a_lens_survives_json(lens: Lens) -> None:
+def test_a_lens_survives_json(lens: PinholeWarp) -> None:
     import json
 
-    again = lens_from_json(json.loads(json.dumps(lens.to_json())))
+    again = warp_from_json(json.loads(json.dumps(lens.to_json())))
     assert again == lens
 
 
 def test_the_port_lens_sees_points_at_the_working_range_as_its_pinhole() -> None:
     lens = port_lens()
     rng = np.random.default_rng(1)
-    z = lens.virtual.working_range_m
+    z = lens.working_range_m
     points = np.column_stack([rng.uniform(-0.6, 0.6, (50, 2)), np.full(50, z)])
     ideal = lens.to_pinhole(lens.camera.project(points))
     moved = lens.pinhole_from_cam.apply(points)
-    expected = lens.pinhole.colmap.img_from_cam(moved)
+    expected = colmap_pinhole(lens.pinhole).img_from_cam(moved)
     np.testing.assert_allclose(ideal, expected, atol=1e-6)
 
 
@@ -77,7 +72,7 @@ def test_a_barrel_lens_keeps_its_field_of_view() -> None:
 
 
 @LENSES
-def test_warped_pictures_carry_their_own_coordinates(lens: Lens, tmp_path: Path) -> None:
+def test_warped_pictures_carry_their_own_coordinates(lens: PinholeWarp, tmp_path: Path) -> None:
     """A picture whose grey levels are its coordinates shows where every warped pixel came from."""
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     coded = np.stack([x * 0.75, y, np.zeros_like(x)], axis=-1).astype(np.float32)
@@ -99,7 +94,7 @@ def test_pixels_beyond_the_fold_of_a_polynomial_are_not_valid() -> None:
     camera = pycolmap.Camera(
         model="RADIAL", width=WIDTH, height=HEIGHT, params=[200.0, 160.0, 120.0, -0.35, 0.02]
     )
-    lens = self_calibrated_lens(camera)
+    lens = self_calibrated_warp(camera)
     x, y = undistortion_maps(lens)
     seen = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
     rows, columns = np.nonzero(seen)
@@ -113,7 +108,9 @@ def test_pixels_beyond_the_fold_of_a_polynomial_are_not_valid() -> None:
     assert fold - 5 * pixel < radius.max() < fold + pixel
 
 
-def workspace_of(tmp_path: Path, lens: Lens, picture: np.ndarray, mask: str = "") -> Pictures:
+def workspace_of(
+    tmp_path: Path, lens: PinholeWarp, picture: np.ndarray, mask: str = ""
+) -> Pictures:
     (tmp_path / "images" / "camera").mkdir(parents=True)
     (tmp_path / "sparse").mkdir()
     cv2.imwrite(str(tmp_path / "images" / "camera" / "a.png"), picture)

@@ -11,13 +11,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
-from reconstruct.placing.picked_points import Camera, find_spots
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.run import body_from_pinhole
-from reconstruct.views.lens import Lens, flat_port_lens
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
 KNOWN = np.array(
@@ -32,9 +32,9 @@ def site() -> Scene:
 
 
 @cache
-def lenses() -> dict[str, Lens]:
+def warps() -> dict[str, PinholeWarp]:
     return {
-        name: flat_port_lens(camera, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
+        name: best_warp(camera, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
         for name, camera in site().rig.cameras.items()
     }
 
@@ -44,7 +44,7 @@ class Gauge:
     """A model in a gauge of its own."""
 
     ned_from_model: Similarity
-    cameras: dict[str, Camera]
+    cameras: dict[str, RegisteredPicture]
 
     def points(self, ned: np.ndarray) -> np.ndarray:
         place = self.ned_from_model
@@ -58,9 +58,9 @@ def in_gauge(seed: int) -> Gauge:
     place = RigidTransform.from_components(shift, turn)
     cameras = {}
     for record, pose in zip(site().records, site().ned_from_cam, strict=True):
-        lens = lenses()[record.camera]
-        pinhole = place.inv() * pose * lens.pinhole_from_cam.inv()
-        cameras[record.image] = Camera(lens=lens, model_from_pinhole=pinhole)
+        warp = warps()[record.camera]
+        pinhole = place.inv() * pose * warp.pinhole_from_cam.inv()
+        cameras[record.image] = RegisteredPicture(warp=warp, model_from_pinhole=pinhole)
     return Gauge(
         ned_from_model=Similarity(scale=1.0, rotation=turn, translation=shift), cameras=cameras
     )
@@ -206,7 +206,7 @@ def test_control_and_navigation_place_together_within_their_sigmas(tmp_path: Pat
     ties = tied(path, gauge, picks_of(KNOWN, 0.2))
     poses = [c.model_from_pinhole for c in gauge.cameras.values()]
     centres = np.stack([p.translation for p in poses])
-    levers = body_from_pinhole(site().rig, lenses())
+    levers = body_from_pinhole(site().rig, warps())
     levelled = level(gauge.points(site().points_ned), centres)
     alone, both = (
         fit_navigation(

@@ -7,12 +7,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import AliceError, ReconstructionError
 from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.base.manifest import read_manifest, write_manifest
+from alice_survey.base.records import RegistrationRecord
 from alice_survey.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
@@ -71,14 +73,28 @@ def test_points_are_seen_where_the_model_says(drone: Path) -> None:
     patches: dict[int, list[np.ndarray]] = {}
     for index, view in enumerate(model.views):
         grey = pictures.grey(view.image)
-        assert grey.shape == (view.height_px, view.width_px)
+        assert grey.shape == (view.pinhole.height_px, view.pinhole.width_px)
         seen = model.observations[model.observations[:, 1] == index, 0]
         for point, (x, y) in zip(seen, view.project(model.points_world[seen]), strict=True):
-            if 12 < x < view.width_px - 12 and 12 < y < view.height_px - 12:
+            if 12 < x < view.pinhole.width_px - 12 and 12 < y < view.pinhole.height_px - 12:
                 patch = cv2.getRectSubPix(grey, (3, 3), (float(x) - 0.5, float(y) - 0.5))
                 patches.setdefault(int(point), []).append(patch.mean())
     pairs = np.array([p[:2] for p in patches.values() if len(p) > 1], dtype=float)
     assert np.corrcoef(pairs.T)[0, 1] > 0.8
+
+
+def test_the_place_is_written_as_it_moved_the_mapping(drone: Path) -> None:
+    """Points of `mapping/` through the similarity of `registration.json` are those of `sparse/`."""
+    move = RegistrationRecord.read(drone / "sparse" / "registration.json").world_from_mapping
+    mapped = pycolmap.Reconstruction(drone / "mapping" / "model").points3D
+    points = np.array([mapped[i].xyz for i in sorted(mapped)])
+    turned = Rotation.from_quat(move.quaternion_xyzw).apply(points)
+    np.testing.assert_allclose(
+        move.scale * turned + move.translation,
+        read_model(drone / "sparse").points_world,
+        atol=1e-6,
+    )
+    assert abs(move.scale - 1.0) > 0.1
 
 
 def test_the_track_agrees_with_the_model(drone: Path) -> None:
@@ -154,9 +170,9 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
         marks = []
         for other in scaled.views:
             pixel = (
-                Pictures.open(nowhere).lens(other.image).from_pinhole(other.project(point[None]))[0]
+                Pictures.open(nowhere).warp(other.image).from_pinhole(other.project(point[None]))[0]
             )
-            if np.all((pixel > 5) & (pixel < [other.width_px - 20, other.height_px - 20])):
+            if np.all((pixel > 5) & (pixel < np.array(other.pinhole.size_px) - 20)):
                 marks.append(f"{other.image}:{pixel[0] - 0.5:.4f},{pixel[1] - 0.5:.4f}")
         picks.append("+".join(marks))
     assert all("+" in pick for pick in picks)
@@ -189,7 +205,7 @@ def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
     seen = model.observations[model.observations[:, 1] == 1, 0]
     misses = []
     for point in model.points_world[seen[::10]]:
-        pixel = pictures.lens(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
+        pixel = pictures.warp(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
         found = find_point(f"{view.image}:{pixel[0]},{pixel[1]}", model, pictures)
         misses.append(np.linalg.norm(found - point))
     height = np.median(view.world_from_cam.inv().apply(model.points_world[seen])[:, 2])
@@ -221,7 +237,7 @@ def test_real_stereo_without_calibration_gets_one_rigid_rig(
     np.testing.assert_allclose(np.linalg.norm(shifts, axis=1), 1.0, rtol=1e-6)
     np.testing.assert_allclose(shifts - shifts[0], 0, atol=1e-6)
     view = next(v for v in read_model(folder / "sparse").views if v.camera == "left")
-    assert 600 < view.fx_px < 1100  # of 680 pixels width
+    assert 600 < view.pinhole.fx_px < 1100  # of 680 pixels width
 
 
 def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None:

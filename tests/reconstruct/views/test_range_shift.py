@@ -1,5 +1,6 @@
 """The shift with distance that a warp to one pinhole leaves."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,45 +10,75 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.lenses.values import LensValues
+from camera_calib.ports.dome import DomePort
 from camera_calib.rig import design_rig
-from reconstruct.views.lens import FlatPortLens, flat_port_lens
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import (
     RangeShift,
-    field_of,
     no_shift,
     range_shift,
 )
 from tests.cameras import changed
 
 
-def lens_of(distance_m: float, tilt_deg: float) -> FlatPortLens:
+def warp_of(distance_m: float, tilt_deg: float) -> PinholeWarp:
 
     camera = design_rig(CameraConfig(port_distance_m=distance_m), WaterConfig(), scale=4)
     left = camera.cameras[camera.reference]
     tilt = np.deg2rad(tilt_deg)
-    return flat_port_lens(changed(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
+    return best_warp(changed(left, normal=(np.sin(tilt), 0.0, np.cos(tilt))), 1.5, 2.5)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 2.0])
-@pytest.mark.parametrize("distance_m", [0.0, 0.02, 0.1])
-def test_the_shift_is_exact_at_every_distance(distance_m: float, tilt_deg: float) -> None:
+def behind_dome(x_m: float, y_m: float, z_m: float, lens: LensValues | None = None) -> PinholeWarp:
+    left = warp_of(0.02, 0.0).camera
+    dome = DomePort(
+        dome_x_m=x_m, dome_y_m=y_m, dome_z_m=z_m, outer_radius_m=0.05, glass_thickness_m=0.005
+    )
+    return best_warp(replace(left, port=dome, lens=left.lens if lens is None else lens), 1.5, 2.5)
+
+
+FISHEYE = FisheyeLens(fx_px=450.0, fy_px=450.0, cx_px=420.0, cy_px=340.0, k1=-0.02)
+WARPS = {
+    **{f"flat {d} m, {t} deg": warp_of(d, t) for d in (0.0, 0.02, 0.1) for t in (0.0, 2.0)},
+    "centred dome": behind_dome(0.0, 0.0, 0.0),
+    "dome 5 mm ahead": behind_dome(0.0, 0.0, 0.005),
+    "dome off its axis": behind_dome(0.012, -0.01, 0.02),
+    "fisheye behind a dome": behind_dome(0.003, 0.0, -0.004, FISHEYE),
+}
+
+
+@pytest.mark.parametrize("warp", WARPS.values(), ids=WARPS)
+def test_the_shift_is_exact_at_every_distance(warp: PinholeWarp) -> None:
     """Against points traced through the port: the field is linear in inverse depth."""
-    lens = lens_of(distance_m, tilt_deg)
-    shift = range_shift(lens)
+    shift = range_shift(warp)
     rng = np.random.default_rng(3)
-    size = [lens.camera.width_px, lens.camera.height_px]
-    taken = rng.uniform(0.02, 0.98, (500, 2)) * size
-    warped = lens.to_pinhole(taken)
+    taken = rng.uniform(0.02, 0.98, (500, 2)) * warp.size_px
+    warped = warp.to_pinhole(taken)
+    inside = ((warped > 0) & (warped < warp.pinhole.size_px)).all(axis=1)
+    assert inside.mean() > 0.9
+    taken, warped = taken[inside], warped[inside]
     for depth_m in (0.6, 1.5, 2.0, 2.5, 6.0):
-        spots = lens.camera.at_depth(taken, depth_m)
-        ideal = lens.virtual.project(spots)
-        depth = lens.pinhole_from_cam.apply(spots)[:, 2]
-        exact = field_of(lens, warped) * (1 / depth - shift.inverse_working)[:, None]
+        spots = warp.camera.at_depth(taken, depth_m)
+        points = warp.pinhole_from_cam.apply(spots)
+        ideal, depth = warp.pinhole.project(points), points[:, 2]
+        field = warp.lines(taken)[1] * warp.pinhole.focal_px
+        exact = field * (1 / depth - 1 / warp.working_depth_m)[:, None]
         np.testing.assert_allclose(warped + exact, ideal, atol=1e-8)
+        np.testing.assert_allclose(warp.to_pinhole(taken, depth_m), ideal, atol=1e-8)
         moved = np.abs(ideal - warped).max()
         np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=2e-3 * moved + 1e-9)
         np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=3e-3 * moved + 1e-9)
+
+
+def test_rays_through_a_dome_that_is_centred_on_the_pupil_meet_there() -> None:
+    warp = behind_dome(0.0, 0.0, 0.0)
+    np.testing.assert_allclose(warp.centre_m, 0.0, atol=1e-12)
+    assert warp.largest_offset_m == 0.0
+    assert not range_shift(warp).nodes.any()
+    assert warp.pinhole.fx_px == pytest.approx(warp.camera.fx_px)
 
 
 def test_without_a_port_nothing_shifts() -> None:
@@ -58,7 +89,7 @@ def test_without_a_port_nothing_shifts() -> None:
 
 @cache
 def tilted_shift() -> RangeShift:
-    return range_shift(lens_of(0.1, 2.0))
+    return range_shift(warp_of(0.1, 2.0))
 
 
 @given(x=st.floats(0, 846), y=st.floats(0, 677), depth=st.floats(0.8, 10.0))
@@ -73,27 +104,57 @@ def test_kernels_and_scales_agree(x: float, y: float, depth: float) -> None:
 
 def test_a_view_sees_points_through_its_port() -> None:
     """A view's pixel of a point is that of the exact camera, carried to the warped picture."""
-    lens = lens_of(0.1, 2.0)
+    warp = warp_of(0.1, 2.0)
     rng = np.random.default_rng(5)
-    size = [lens.camera.width_px, lens.camera.height_px]
+    size = [warp.camera.width_px, warp.camera.height_px]
     taken = rng.uniform(0.05, 0.95, (200, 2)) * size
-    spots = lens.camera.at_depth(taken, rng.uniform(1.2, 3.0, 200))
-    pinhole = lens.pinhole
+    spots = warp.camera.at_depth(taken, rng.uniform(1.2, 3.0, 200))
     view = View(
         image="a",
         camera="left",
         station=0,
-        width_px=pinhole.width_px,
-        height_px=pinhole.height_px,
-        fx_px=pinhole.focal_px,
-        fy_px=pinhole.focal_px,
-        cx_px=pinhole.cx_px,
-        cy_px=pinhole.cy_px,
+        pinhole=warp.pinhole,
         world_from_cam=RigidTransform.identity(),
-        shift=range_shift(lens),
+        shift=range_shift(warp),
     )
-    points = lens.pinhole_from_cam.apply(spots)
-    np.testing.assert_allclose(view.project(points), lens.to_pinhole(taken), atol=5e-3)
-    assert np.abs(view.project_ideal(points) - lens.to_pinhole(taken)).max() > 0.2
+    points = warp.pinhole_from_cam.apply(spots)
+    np.testing.assert_allclose(view.project(points), warp.to_pinhole(taken), atol=5e-3)
+    assert np.abs(view.project_ideal(points) - warp.to_pinhole(taken)).max() > 0.2
     depth = points[:, 2]
     np.testing.assert_allclose(view.at_depth(view.project(points), depth), points, atol=1e-6)
+
+
+@given(
+    matrix=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
+    largest=st.floats(0.01, 0.9),
+    depth=st.sampled_from([0.5, 1.0, 4.0, np.inf]),
+)
+def test_the_contraction_is_the_fields_own_and_below_one_the_inverse_exists(
+    matrix: list[float], largest: float, depth: float
+) -> None:
+    """A field that is linear in the pixel: its slopes and the inverse map are known."""
+    slopes = np.array(matrix).reshape(2, 2)
+    size = np.linalg.norm(slopes, ord=2)
+    if size < 1e-3:
+        return
+    step = 1.0 / depth - 0.5
+    slopes = slopes / size * largest / abs(step)
+    x, y = np.linspace(-400, 400, 33), np.linspace(-300, 300, 25)
+    nodes = np.stack(np.meshgrid(x, y), axis=-1) @ slopes.T
+    shift = RangeShift(nodes=nodes, width_px=800.0, height_px=600.0, inverse_working=0.5)
+    assert shift.contraction(np.array([2.0, depth])) == pytest.approx([0.0, largest], rel=1e-6)
+    warped = np.random.default_rng(0).uniform([100, 100], [700, 500], (40, 2))
+    ideal = warped + step * (warped - [400, 300]) @ slopes.T
+    np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=1e-9)
+    np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=1e-4)
+
+
+def test_from_a_contraction_of_one_two_pixels_show_one_spot() -> None:
+    x, y = np.linspace(-400, 400, 33), np.linspace(-300, 300, 25)
+    nodes = np.stack(np.meshgrid(-3.0 * x, 0.0 * y), axis=-1)
+    shift = RangeShift(nodes=nodes, width_px=800.0, height_px=600.0, inverse_working=0.5)
+    far, near = shift.contraction(np.array([1.25, 1.2])).tolist()
+    assert far == pytest.approx(0.9)
+    assert near == pytest.approx(1.0)
+    shown = shift.ideal(np.array([[350.0, 300.0], [450.0, 300.0]]), 1.2)
+    np.testing.assert_allclose(shown[0], shown[1], atol=1e-6)

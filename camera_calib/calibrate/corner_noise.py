@@ -1,0 +1,219 @@
+"""Correlated errors of measured corners, and the covariance that they give a calibration.
+
+Corners of one picture err together (light, blur, water), and so does one place of a board in all
+pictures (print, paste). Counted as independent they make a calibration look better than it is. The
+residuals show how much: their covariance is taken as a sum of a few known matrices, each times an
+unknown variance, found from the residuals' products by least squares with no variance below 0
+(C. R. Rao 1971, "Estimation of variance and covariance components - MINQUE theory"). What pose,
+rig and shape take up of every matrix is taken off exactly. The covariance of the estimate is then
+A^-1 B A^-1, with A the information that independent errors would give and B that of the slopes
+under the errors as found (P. J. Huber 1967, "The behavior of maximum likelihood estimates under
+nonstandard conditions").
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+from scipy.spatial.distance import cdist
+
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.adjust import Adjustment
+from camera_calib.calibrate.normal_equations import CalibrationProblem
+from camera_calib.calibration import CornerNoise, CornerSpread
+from camera_calib.rig import Covariance
+
+_REACHES = (0.12, 0.3, 0.8)
+"""Lengths over the target's diagonal at which errors in one picture may go together."""
+_AXES = (slice(0, 2), slice(2, 3))
+"""Components of a place's offset with a variance of their own: in the target's plane, across it."""
+_LEAST_ALONE = 0.05
+"""Least share of the noise's variance that is independent."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """Errors that go together within a picture, or in all pictures of a view."""
+
+    kernel: Array
+    """(N, N) correlation of an axis between points."""
+    in_all: bool
+    """Whether all cameras of a view err alike: the board bends in a hand, or moves."""
+
+    def smoothed(self, values: Array, seen: Array) -> Array:
+        """The correlation applied to (V, C, N, 2, m), with (V, C, N) of 0 where unseen."""
+        base = values.sum(axis=1, keepdims=True) if self.in_all else values
+        spread = self.kernel @ base.reshape(*base.shape[:3], -1)
+        out: Array = spread.reshape(base.shape) * seen[..., None, None]
+        return out
+
+
+class _CornerRows:
+    """Weighted slopes and residuals of all views; 0 where unseen."""
+
+    def __init__(self, problem: CalibrationProblem, found: Adjustment) -> None:
+        state = problem.state(found.rig, found.rig_from_target, found.shape.values)
+        views, cameras, count = problem.seen.shape
+        size = len(problem.names)
+        weights = np.nan_to_num(found.weights)
+        slope = np.mean(np.where(weights < 1.0, 0.5 * weights, 1.0)[problem.seen])
+        self.seen = problem.seen.astype(np.float64)
+        self.by_rig = np.zeros((views, cameras, count, 2, size))
+        self.by_place = np.zeros((views, cameras, count, 2, 3))
+        self.missed = np.zeros((views, cameras, count, 2))
+        by_pose = np.zeros((views, cameras, count, 2, 6))
+        for slopes in problem.slopes(state):
+            c, v, p = slopes.camera, slopes.views, len(slopes.at)
+            use = np.where(problem.seen[v, c], 1.0, 0.0) / (found.noise_px * found.blur[v, c, None])
+            rows = np.where(use[..., None, None] > 0, slopes.rows, 0.0) * use[..., None, None]
+            self.by_rig[v[:, None, None, None], c, np.arange(count)[:, None, None],
+                        np.arange(2)[:, None], slopes.at] = rows[..., :p]  # fmt: skip
+            self.by_place[v, c] = np.where(use > 0, 1.0, 0.0)[..., None, None] * (
+                np.nan_to_num(slopes.by_place) * use[..., None, None]
+            )
+            by_pose[v, c] = rows[..., p:-1]
+            self.missed[v, c] = rows[..., -1] * (weights[v, c] / slope)[..., None]
+        self.poses = np.linalg.qr(by_pose.reshape(views, -1, 6))[0].reshape(by_pose.shape)
+        taken = np.einsum("vcnak,vcnap->vkp", self.poses, self.by_rig)
+        self.by_rig -= np.einsum("vcnak,vkp->vcnap", self.poses, taken)
+        taken_px = np.einsum("vcnak,vcna->vk", self.poses, self.missed)
+        self.missed -= np.einsum("vcnak,vk->vcna", self.poses, taken_px)
+
+
+def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
+    """Estimate the noise from the residuals of an adjustment, and propagate it.
+
+    Args:
+        problem: whose pixels and parameters were adjusted.
+        found: the result.
+    """
+    rows = _CornerRows(problem, found)
+    diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
+    squares = cdist(problem.points, problem.points, "sqeuclidean")
+    parts = [_Part(kernel=np.eye(len(problem.points)), in_all=False)]
+    for in_all in (False, True)[: len(problem.rig.cameras)]:
+        for reach in _REACHES:
+            kernel = np.exp(-0.5 * squares / (reach * diagonal_m) ** 2)
+            parts.append(_Part(kernel=kernel, in_all=in_all))
+    inverse = found.covariance.matrix
+    products = _Products(rows, parts, inverse)
+    theta = products.variances()
+    pictures, places = theta[: len(parts)], theta[len(parts) :]
+    pictures[0] = max(pictures[0], _LEAST_ALONE)
+    meat = np.einsum("k,kpq->pq", pictures, products.by_rig)
+    prior_at = problem.prior_at
+    shared = [
+        inverse @ products.by_place[:, axes].reshape(-1, len(inverse)).T * np.sqrt(variance)
+        for axes, variance in zip(_AXES, places, strict=True)
+    ]
+    if prior_at.size:
+        shared.append(inverse[:, prior_at] @ np.linalg.cholesky(problem.prior_information))
+    factor = np.concatenate(shared, axis=1)
+    matrix = inverse @ meat @ inverse + factor @ factor.T
+    return CornerSpread(
+        noise=CornerNoise(
+            alone=float(pictures[0]),
+            together=pictures[1:],
+            place_sigmas_m=(float(np.sqrt(places[0])), float(np.sqrt(places[1]))),
+        ),
+        covariance=Covariance(parameters=problem.names, matrix=0.5 * (matrix + matrix.T)),
+        shared=factor,
+        of_places=products.of_places,
+    )
+
+
+class _Products:
+    """Products of residuals by every part of the noise, and what each part would make of them.
+
+    With M what is left of the residuals after all unknowns were fitted, r = M e, and K_j the parts'
+    matrices, the mean of r^T K_i r is the sum of v_j tr(K_i M K_j M).
+    """
+
+    def __init__(self, rows: _CornerRows, parts: list[_Part], inverse: Array) -> None:
+        views, size = len(rows.seen), len(inverse)
+        self.rows, self.parts, self.inverse = rows, parts, inverse
+        self.smoothed = [part.smoothed(rows.by_rig, rows.seen) for part in parts]
+        self.poses = [part.smoothed(rows.poses, rows.seen) for part in parts]
+        flat = rows.by_rig.reshape(-1, size)
+        self.by_rig = np.stack([flat.T @ s.reshape(-1, size) for s in self.smoothed])
+        """(K, P, P) slopes' products under every part within pictures."""
+        self.by_place = np.einsum("vcnai,vcnap->nip", rows.by_place, rows.by_rig, optimize=True)
+        """(N, 3, P)."""
+        self.place_of_pose = np.einsum("vcnai,vcnak->vnik", rows.by_place, rows.poses)
+        self.crossed = [
+            np.einsum("vcnak,vcnap->vkp", rows.poses, s, optimize=True) for s in self.smoothed
+        ]
+        self.overlap = [
+            rows.poses.reshape(views, -1, 6).transpose(0, 2, 1) @ p.reshape(views, -1, 6)
+            for p in self.poses
+        ]
+
+        self.of_places = self._of_places()
+
+    def variances(self) -> Array:
+        """Variances of the parts within pictures, then of places by axes (square metres)."""
+        count = len(self.parts)
+        size = count + len(_AXES)
+        table, seen = np.zeros((size, size)), np.zeros(size)
+        for i in range(count):
+            for j in range(i + 1):
+                table[i, j] = table[j, i] = self._of_pictures(i, j)
+            for j, axes in enumerate(_AXES):
+                table[i, count + j] = table[count + j, i] = self._of_both(i, axes)
+            smooth = self.parts[i].smoothed(self.rows.missed[..., None], self.rows.seen)
+            seen[i] = float((self.rows.missed * smooth[..., 0]).sum())
+        pulled = np.einsum("vcnai,vcna->ni", self.rows.by_place, self.rows.missed)
+        for i, axes in enumerate(_AXES):
+            seen[count + i] = float((pulled[:, axes] ** 2).sum())
+            for j, others in enumerate(_AXES):
+                table[count + i, count + j] = float(
+                    (self.of_places[:, axes][..., others] ** 2).sum()
+                )
+        scale = 1.0 / np.sqrt(np.diag(table))
+        # Under independent errors the products' covariance is twice the table.
+        root = np.linalg.cholesky(table * np.outer(scale, scale) + 1e-12 * np.eye(size))
+        found = nnls(root.T, solve_triangular(root, seen * scale, lower=True))[0]
+        variances: Array = found * scale
+        return variances
+
+    def _of_pictures(self, i: int, j: int) -> float:
+        seen, inverse = self.rows.seen, self.inverse
+        both = self.parts[i].kernel * self.parts[j].kernel
+        if self.parts[i].in_all and self.parts[j].in_all:
+            seen = seen.sum(axis=1, keepdims=True)
+        total = 2.0 * float(np.einsum("vcn,nm,vcm->", seen, both, seen, optimize=True))
+        total -= 2.0 * float((self.poses[i] * self.poses[j]).sum())
+        total += float((self.overlap[i] * self.overlap[j]).sum())
+        size = len(inverse)
+        through = self.smoothed[j].reshape(-1, size).T @ self.smoothed[i].reshape(-1, size)
+        through -= np.einsum("vkp,vkq->pq", self.crossed[j], self.crossed[i])
+        total -= 2.0 * float((inverse * through).sum())
+        return total + float(np.trace(inverse @ self.by_rig[j] @ inverse @ self.by_rig[i]))
+
+    def _of_both(self, i: int, axes: slice) -> float:
+        rows, inverse = self.rows, self.inverse
+        places = rows.by_place[..., axes]
+        posed = self.place_of_pose[:, :, axes]
+        alike = places.sum(axis=1) if self.parts[i].in_all else places
+        total = float((alike**2).sum())
+        returned = np.einsum("vcnai,vnik->vcnak", places, posed)
+        total -= 2.0 * float((self.poses[i] * returned).sum())
+        total += float((self.overlap[i] * np.einsum("vnik,vnil->vkl", posed, posed)).sum())
+        through = np.einsum("vcnai,vcnap->nip", places, self.smoothed[i], optimize=True)
+        through -= np.einsum("vnik,vkp->nip", posed, self.crossed[i], optimize=True)
+        by_place = self.by_place[:, axes].reshape(-1, len(inverse))
+        total -= 2.0 * float((inverse * (by_place.T @ through.reshape(by_place.shape))).sum())
+        square = by_place.T @ by_place
+        return total + float(np.trace(inverse @ square @ inverse @ self.by_rig[i]))
+
+    def _of_places(self) -> Array:
+        """(N, 3, N, 3) products of places' slopes, after all unknowns were fitted."""
+        rows, count = self.rows, self.by_place.shape[0]
+        posed = self.place_of_pose.transpose(1, 2, 0, 3).reshape(3 * count, -1)
+        by_place = self.by_place.reshape(3 * count, -1)
+        left = -(posed @ posed.T) - by_place @ self.inverse @ by_place.T
+        blocks: Array = left.reshape(count, 3, count, 3)
+        own = np.einsum("vcnai,vcnaj->nij", rows.by_place, rows.by_place)
+        blocks[np.arange(count), :, np.arange(count)] += own
+        return blocks
