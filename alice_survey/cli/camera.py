@@ -136,14 +136,17 @@ def convert(
         ),
     ] = None,
     image_size: Annotated[
-        tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN states none.")
+        tuple[int, int] | None,
+        typer.Option(metavar="W H", help="Pixels, when IN states none; of a lens profile, others."),
     ] = None,
     extrinsics: Annotated[Path | None, typer.Option(help="OpenCV file of R and T.")] = None,
     unit_m: Annotated[float, typer.Option(help="Metres in one unit of IN's translations.")] = 1.0,
     camera: Annotated[str | None, typer.Option(help="Convert this camera alone.")] = None,
     lens: Annotated[
         str | None,
-        typer.Option(help="fisheye or opencv, when an OpenCV file does not say what its 4 are."),
+        typer.Option(
+            help="fisheye or opencv: of an OpenCV file of 4 coefficients that does not say."
+        ),
     ] = None,
     names: Annotated[str | None, typer.Option(help="New names, such as left,right.")] = None,
     port_distance: Annotated[
@@ -157,13 +160,20 @@ def convert(
         typer.Option(metavar="X Y Z", help="The dome's, from the pupil: right, down, forward, mm."),
     ] = None,
     glass: Annotated[float | None, typer.Option(min=0.0, help="Thickness, mm.")] = None,
-    n_glass: Annotated[float | None, typer.Option(min=1.0, help="Index; 1.52 if new.")] = None,
+    n_glass: Annotated[
+        float | None, typer.Option(min=1.0, help="Index; if new 1.52, of a dome 1.49.")
+    ] = None,
     n_water: Annotated[float | None, typer.Option(min=1.0, help="Index of the water.")] = None,
     water: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="NEAR FAR", help="m: fit cameras without port for these distances."),
     ] = None,
-    model: Annotated[str, typer.Option(help="Model to fit: OPENCV or FULL_OPENCV.")] = "OPENCV",
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="To fit: OPENCV, FULL_OPENCV or OPENCV_FISHEYE; as the lens if not given."
+        ),
+    ] = None,
     drop_port: Annotated[bool, typer.Option("--drop-port", help="Cameras as in air.")] = False,
     drop_covariance: Annotated[
         bool, typer.Option("--drop-covariance", help="Leave it out where OUT cannot hold it.")

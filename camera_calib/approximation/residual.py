@@ -25,6 +25,7 @@ COLMAP_PARAMETERS = {
     "FULL_OPENCV": (
         "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
     ),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }  # fmt: skip
 """COLMAP's camera models that are judged here, their parameters in COLMAP's order."""
 
@@ -130,12 +131,13 @@ def approximations(
     distances_m: Sequence[float] | None = None,
     working_range_m: float | None = None,
     turned: bool = True,
+    models: Sequence[str] = FITTED,
 ) -> list[Residual]:
     """The usual stand-ins for a flat-port camera over an interval of distances.
 
-    Two pinholes after a warp, at the entrance pupil and at the point that rays miss least;
-    then COLMAP's SIMPLE_RADIAL, OPENCV and FULL_OPENCV, fitted by least squares to exact rays, with
-    the centre along the port's normal.
+    Two pinholes after a warp, at the entrance pupil and at the point that rays miss least; then
+    some of COLMAP's models, fitted by least squares to exact rays, with the centre along the port's
+    normal.
 
     Args:
         camera: exact.
@@ -145,6 +147,7 @@ def approximations(
             given.
         working_range_m: where warped pictures are exact; the harmonic mean when not given.
         turned: let the fitted cameras' axes turn, as bundle adjustment does with a tilted port.
+        models: to fit, keys of `COLMAP_PARAMETERS`.
 
     Raises:
         ConfigError: the interval is empty or reaches into the port.
@@ -163,7 +166,7 @@ def approximations(
     stand_ins = [
         _warped("pinhole at the pupil, warped", at_pupil),
         _warped("pinhole at the best point, warped", best),
-        *(_fitted(model, camera, pixels, points, turned) for model in FITTED),
+        *(_fitted(model, camera, pixels, points, turned) for model in models),
     ]
     return [residual(camera, one, distances) for one in stand_ins]
 
@@ -206,10 +209,16 @@ def colmap_pixels(model: str, params: Sequence[float] | Array, points: Array) ->
     value = dict(zip(COLMAP_PARAMETERS[model], np.asarray(params), strict=True))
     fx, fy = value.get("fx", value.get("f")), value.get("fy", value.get("f"))
     u, v = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    if model == "OPENCV_FISHEYE":  # tangents as long as the angle from the axis
+        tangent = np.hypot(u, v)
+        bend = np.divide(np.arctan(tangent), tangent, out=np.ones_like(u), where=tangent > 0)
+        u, v = u * bend, v * bend
     k1, k2, k3, k4, k5, k6 = (value.get(f"k{i}", 0.0) for i in range(1, 7))
     p1, p2 = value.get("p1", 0.0), value.get("p2", 0.0)
     r2 = u * u + v * v
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    if model == "OPENCV_FISHEYE":
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
     x = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
     y = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
     pixels: Array = np.stack([fx * x + value["cx"], fy * y + value["cy"]], axis=-1)

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError, warn
@@ -32,13 +33,14 @@ from camera_calib.formats.rigs import (
     renamed,
     with_port,
 )
+from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
 
 _TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
-MODELS = ("OPENCV", "FULL_OPENCV")
+MODELS = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +65,8 @@ class Conversion:
     n_water: float | None = None
     water: tuple[float, float] | None = None
     """Nearest and farthest distance, m, over which a camera without port stands in for one with."""
-    model: str = "OPENCV"
-    """COLMAP's name of the model that stands in."""
+    model: str | None = None
+    """COLMAP's name of the model that stands in; `_best_model` when None."""
     drop_port: bool = False
     drop_covariance: bool = False
     overwrite: bool = False
@@ -129,7 +131,8 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
         if task.drop_port:
             raise CalibrationError("--water and --drop-port: one of them, cameras in water or air")
         _may_lose_covariance(rig, task, f"{task.target}: cameras fitted in water have no longer")
-        rig, prices = in_water(rig, *task.water, task.model)
+        models = {n: task.model or _best_model(c, target) for n, c in rig.cameras.items()}
+        rig, prices = in_water(rig, *task.water, models)
     for name in rig.cameras:  # they become names of files and folders
         if camera_name(task.source, name) != name:
             raise CalibrationError(f"{task.source}: camera name {name!r} has a slash: give --names")
@@ -256,7 +259,15 @@ def _summary(
     return "\n".join(lines), data
 
 
-def in_water(rig: Rig, near_m: float, far_m: float, model: str) -> tuple[Rig, Mapping[str, Price]]:
+def _best_model(camera: Camera, target: CalibrationFormat) -> str:
+    if not is_fisheye(camera):
+        return "OPENCV"
+    return "OPENCV_FISHEYE" if FISHEYE in target.holds else "FULL_OPENCV"
+
+
+def in_water(
+    rig: Rig, near_m: float, far_m: float, models: Mapping[str, str]
+) -> tuple[Rig, Mapping[str, Price]]:
     """The rig for other software under water that has no port model.
 
     Each camera is the best fit, over the frame and the interval of distances, of a camera with
@@ -267,45 +278,51 @@ def in_water(rig: Rig, near_m: float, far_m: float, model: str) -> tuple[Rig, Ma
         rig: exact.
         near_m: nearest distance from the entrance pupil along the axis.
         far_m: farthest.
-        model: one of `MODELS`.
+        models: by camera, each one of `MODELS`.
 
     Returns:
         The rig, whose cameras are as in air and without covariance, and the price by camera.
 
     Raises:
-        CalibrationError: the model is none of these, or a part of a frame sees nothing.
+        CalibrationError: the model is none of these, a part of a frame sees nothing, or the fit is
+            no lens over the whole frame.
         ConfigError: the interval is empty or reaches into a port.
     """
-    if model not in MODELS:
-        raise CalibrationError(f"model {model}: {' or '.join(MODELS)} expected")
+    for model in models.values():
+        if model not in MODELS:
+            raise CalibrationError(f"model {model}: {' or '.join(MODELS)} expected")
     found = {
-        name: _of_model(approximations(camera, near_m, far_m), model)
+        name: approximations(camera, near_m, far_m, models=(models[name],))[-1]
         for name, camera in rig.cameras.items()
     }
     cameras = {name: _stand_in(rig.cameras[name], fit) for name, fit in found.items()}
+    for name, one in cameras.items():
+        if not np.isfinite(one.unproject(one.border())[1]).all():
+            raise CalibrationError(
+                f"the best {models[name]} of {name} folds back inside the frame: give another "
+                "--model, or a format that holds fisheyes"
+            )
     poses = {name: _from_cam(fit) * rig.cam_from_rig[name] for name, fit in found.items()}
     prices = {
-        name: Price(model=model, near_m=near_m, far_m=far_m, rms_px=fit.rms_px, max_px=fit.max_px)
+        name: Price(
+            model=models[name], near_m=near_m, far_m=far_m, rms_px=fit.rms_px, max_px=fit.max_px
+        )
         for name, fit in found.items()
     }
-    source = f"{rig.source}; best {model} in water, {near_m:g} to {far_m:g} m"
+    words = ", ".join(dict.fromkeys(models.values()))
+    source = f"{rig.source}; best {words} in water, {near_m:g} to {far_m:g} m"
     return (
         replace(rig, cameras=cameras, cam_from_rig=poses, source=source, covariance=None),
         prices,
     )
 
 
-def _of_model(every: list[Residual], model: str) -> Residual:
-    unwarped = (fit for fit in every if fit.stand_in.warped_at_m is None)
-    return next(fit for fit in unwarped if fit.stand_in.model == model)
-
-
 def _stand_in(camera: Camera, fit: Residual) -> Camera:
     stand_in = fit.stand_in
     values = dict(zip(COLMAP_PARAMETERS[stand_in.model], stand_in.params, strict=True))
-    fx, fy, cx, cy = (values.pop(name) for name in ("fx", "fy", "cx", "cy"))
-    lens = OpenCVLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, **values)
-    return replace(camera, lens=lens, port=NO_PORT)
+    focal = {f"{name}_px": values.pop(name) for name in ("fx", "fy", "cx", "cy")}
+    kind = FisheyeLens if stand_in.model == "OPENCV_FISHEYE" else OpenCVLens
+    return replace(camera, lens=kind(**focal, **values), port=NO_PORT)
 
 
 def _from_cam(fit: Residual) -> RigidTransform:

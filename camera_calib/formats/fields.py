@@ -21,6 +21,8 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 
 _LARGEST_BYTES = 1 << 20
+_LARGEST_SKIPPED_BYTES = 1 << 26
+"""Of files with what was measured for a calibration, or poses of all pictures, next to it."""
 _MOST_PARTS = 5000
 """Lists, mappings and tags. Parsers recurse: this bounds how deep (OpenCV's exhausts memory at some
 hundred thousand levels, and handles 20,000)."""
@@ -170,28 +172,43 @@ def read_bytes(path: Path, largest: int = _LARGEST_BYTES) -> bytes:
         raise CalibrationError(f"{path}: no such file") from None
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
+    _check_size(path, content, largest)
+    return content
+
+
+def _check_size(path: Path, content: bytes, largest: int) -> None:
     if len(content) > largest:
         raise CalibrationError(
             f"{path}: more than {largest >> 20} MiB: no calibration file is that large"
         )
-    return content
 
 
-def read_text(path: Path) -> str:
+def _without(content: bytes, start: bytes, end: bytes) -> bytes:
+    kept, at = [], 0
+    while (first := content.find(start, at)) >= 0:
+        last = content.find(end, first + len(start))
+        if last < 0:
+            break
+        kept.append(content[at:first])
+        at = last + len(end)
+    return b"".join([*kept, content[at:]])
+
+
+def read_text(path: Path, skipped: tuple[bytes, bytes] | None = None) -> str:
     """The text of a file that parsers can take without harm.
 
-    Raises:
-        CalibrationError: no such file, too large, or refused by `safe_text`.
-    """
-    return safe_text(path, read_bytes(path))
-
-
-def safe_text(path: Path, content: bytes) -> str:
-    """The content of a file as text that parsers can take without harm.
+    Args:
+        path: of the file.
+        skipped: marks; all between them is left out, and may be long.
 
     Raises:
-        CalibrationError: no UTF-8, too many parts, or a document type (XML entities).
+        CalibrationError: no such file, too large, no UTF-8, too many parts, or a document type (XML
+            entities).
     """
+    content = read_bytes(path, _LARGEST_BYTES if skipped is None else _LARGEST_SKIPPED_BYTES)
+    if skipped is not None:
+        content = _without(content, *skipped)
+        _check_size(path, content, _LARGEST_BYTES)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -240,14 +257,15 @@ class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
         return values
 
 
-def read_yaml(path: Path, text: str | None = None) -> Fields:
-    """A YAML file whose top is a mapping; `text` is its content where that was read already.
+def read_yaml(path: Path, skipped: tuple[bytes, bytes] | None = None) -> Fields:
+    """A YAML file whose top is a mapping; `skipped` as for `read_text`.
 
     Raises:
         CalibrationError: the file is missing, not YAML, or not a mapping of text keys.
     """
+    text = read_text(path, skipped)
     try:
-        value = yaml.load(read_text(path) if text is None else text, Loader=_PlainLoader)  # noqa: S506 - a SafeLoader
+        value = yaml.load(text, Loader=_PlainLoader)  # noqa: S506 - a SafeLoader
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""

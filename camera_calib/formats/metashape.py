@@ -28,6 +28,8 @@ from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
 from camera_calib.rig import Rig
 
+PICTURES = (b"<cameras", b"</cameras>")
+"""Marks around the poses of all pictures."""
 _FRAME = {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p2", "p2": "p1"}
 """Names here by Metashape's."""
 _FISHEYE = {name: name for name in ("k1", "k2", "k3", "k4")}
@@ -51,7 +53,7 @@ def read_metashape(path: Path, reading: ReadOptions) -> Rig:
         CalibrationError: the file is malformed, has several sensors and none is chosen, or
             parameters that no lens here has.
     """
-    text = read_text(path)
+    text = read_text(path, PICTURES)
     try:
         top = ET.fromstring(text)  # noqa: S314 - without a document type
     except (ET.ParseError, ValueError) as error:

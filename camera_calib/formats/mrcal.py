@@ -6,7 +6,6 @@ and OpenCV's coefficients, pixels counted from the centre of the first one. `ext
 rotation vector and a translation that take points of the reference to the camera.
 """
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import Fields, read_bytes, read_yaml, safe_text
+from camera_calib.formats.fields import Fields, read_yaml
 from camera_calib.formats.opencv_model import camera_matrix, counted_from_centre, distortion
 from camera_calib.formats.rigs import ReadOptions, assemble, file_each
 from camera_calib.lenses.opencv import OpenCVLens
@@ -24,9 +23,8 @@ from camera_calib.rig import Rig
 SUFFIX = ".cameramodel"
 _COUNTS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{count}": count for count in (4, 5, 8, 12)}
 """Distortion coefficients by model."""
-_PACKED = re.compile(rb"\bb'[^'\n]*'")
-_LARGEST_BYTES = 1 << 26
-"""Of a file with all that was measured for its calibration."""
+_PACKED = (b": b'", b"'")
+"""Marks around all that was measured for a calibration."""
 
 
 def read_mrcal(path: Path, reading: ReadOptions) -> Rig:
@@ -38,7 +36,7 @@ def read_mrcal(path: Path, reading: ReadOptions) -> Rig:
     files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
     if not files:
         raise CalibrationError(f"{path}: holds no {SUFFIX}")
-    every = [read_yaml(file, _text(file)) for file in files]
+    every = [read_yaml(file, _PACKED) for file in files]
     return assemble(
         path,
         reading,
@@ -74,10 +72,6 @@ def write_mrcal(path: Path, rig: Rig) -> list[Path]:
 def mrcal_files(path: Path, rig: Rig) -> list[Path]:
     """The files that writing a rig would replace."""
     return file_each(path, rig, SUFFIX)
-
-
-def _text(path: Path) -> str:
-    return safe_text(path, _PACKED.sub(b"0", read_bytes(path, _LARGEST_BYTES)))
 
 
 def _camera(fields: Fields) -> Camera:

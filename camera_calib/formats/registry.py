@@ -17,7 +17,7 @@ from camera_calib.formats.colmap import (
 from camera_calib.formats.fields import read_text, read_yaml
 from camera_calib.formats.gyroflow import KEY, read_gyroflow
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
-from camera_calib.formats.metashape import is_metashape, read_metashape, write_metashape
+from camera_calib.formats.metashape import PICTURES, is_metashape, read_metashape, write_metashape
 from camera_calib.formats.mrcal import SUFFIX, mrcal_files, read_mrcal, write_mrcal
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions, file_each
@@ -203,7 +203,7 @@ def _of_file(path: Path) -> str | None:
         return "refractive" if ports else "colmap"
     if suffix == SUFFIX:  # may be larger than others
         return "mrcal"
-    text = read_text(path)
+    text = read_text(path, PICTURES if suffix == ".xml" else None)
     if suffix == ".json":
         other = "gyroflow" if f'"{KEY}"' in text else "rig"
         return "colmap" if text.lstrip().startswith("[") else other

@@ -34,6 +34,39 @@ def _in_air() -> Rig:
     return replace(rig, cameras=dict.fromkeys(rig.cameras, lens))
 
 
+def _domes() -> Rig:
+    """Two fisheyes behind domes."""
+    from dataclasses import replace
+
+    from camera_calib.camera import Camera
+    from camera_calib.lenses.fisheye import FisheyeLens
+    from camera_calib.ports.dome import DomePort
+
+    lens = FisheyeLens(fx_px=300.0, fy_px=301.0, cx_px=320.0, cy_px=240.0, k1=0.02, k4=0.001)
+    port = DomePort(dome_z_m=0.005, outer_radius_m=0.06, glass_thickness_m=0.006)
+    camera = Camera(width_px=640, height_px=480, lens=lens, port=port)
+    rig = small_rig()
+    return replace(rig, cameras=dict.fromkeys(rig.cameras, camera))
+
+
+def _one() -> Rig:
+    """One fisheye in air."""
+    from camera_calib.formats.rigs import in_air, only
+
+    return only(in_air(_domes()), "left")
+
+
+def _profile(folder: Path) -> None:
+    import json
+
+    lens = {
+        "camera_matrix": [[300.0, 0.0, 320.0], [0.0, 301.0, 240.0], [0.0, 0.0, 1.0]],
+        "distortion_coeffs": [0.02, 0.0, 0.0, 0.001],
+    }
+    profile = {"camera_model": "HERO", "calib_dimension": {"w": 640, "h": 480}}
+    (folder / "a.json").write_text(json.dumps(profile | {"fisheye_params": lens}))
+
+
 def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], None]:
     def build(folder: Path) -> None:
         from camera_calib.formats.registry import FORMATS
@@ -224,6 +257,21 @@ TARGETS = (
         "FLATPORT cameras.bin", "binary", "m/cameras.bin",
         _write("refractive", "m/cameras.bin", small_rig), read=_read_folder,
     ),
+    _calibration(
+        "DOMEPORT cameras.txt", "text", "m/cameras.txt", _write("refractive", "m", _domes),
+        read=_read_folder,
+    ),
+    _calibration(
+        "DOMEPORT cameras.bin", "binary", "m/cameras.bin",
+        _write("refractive", "m/cameras.bin", _domes), read=_read_folder,
+    ),
+    _calibration("OpenCV YAML, fisheye", "text", "a.yaml", _write("opencv", "a.yaml", _domes)),
+    _calibration("Metashape XML", "text", "a.xml", _write("metashape", "a.xml", _one)),
+    _calibration(
+        "mrcal cameramodel", "text", "m/left.cameramodel", _write("mrcal", "m", _in_air),
+        read=_read_folder,
+    ),
+    _calibration("Gyroflow profile", "json", "a.json", _profile),
     _calibration("target JSON", "json", "board.json", _board, read=read_board),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
     _image("JPEG, CMYK", "a.jpg", partial(_picture, name="a.jpg", mode="CMYK")),

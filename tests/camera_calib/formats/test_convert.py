@@ -14,9 +14,12 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.cli.main import main
+from camera_calib.camera import Camera
 from camera_calib.formats.convert import Conversion, convert, in_water
 from camera_calib.formats.registry import FORMATS, detect
 from camera_calib.formats.rigs import ReadOptions, in_air, only, renamed, with_port
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.ports.dome import DomePort
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
 from tests.cameras import changed
 from tests.strategies_formats import assert_same_geometry, covariance_of
@@ -27,6 +30,24 @@ BENT = replace(
     cameras={
         "left": changed(DESIGN.cameras["left"], k1=-0.1, p2=1e-3),
         "right": changed(DESIGN.cameras["right"], k1=-0.12),
+    },
+)
+FISHEYE = Camera(
+    width_px=846,
+    height_px=677,
+    lens=FisheyeLens(fx_px=500, fy_px=501, cx_px=423, cy_px=340, k1=0.02),
+)
+DOMES = replace(
+    DESIGN,
+    cameras={
+        name: changed(
+            replace(
+                FISHEYE,
+                port=DomePort(dome_z_m=0.004, outer_radius_m=0.06, glass_thickness_m=0.006),
+            ),
+            k1=k1,
+        )
+        for name, k1 in (("left", 0.02), ("right", 0.03))
     },
 )
 FULL = replace(BENT, covariance=covariance_of(BENT, np.random.default_rng(4)))
@@ -65,7 +86,7 @@ def refused(source: Path, target: Path, **options: Any) -> str:
     return shown
 
 
-@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
+@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros", "mrcal"])
 def test_a_port_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
     shown = refused(own, tmp_path / CHANNELS[name], target_format=name, drop_covariance=True)
     assert "--drop-port" in shown and "--water" in shown
@@ -79,18 +100,90 @@ def test_a_covariance_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) 
 
 
 @pytest.mark.parametrize(
-    ("name", "term"), [("kalibr", "k3"), ("kalibr", "k5"), ("ros", "s1"), ("colmap", "s4"),
-                       ("refractive", "s2")],
+    ("name", "term"),
+    [("kalibr", "k3"), ("kalibr", "k5"), ("metashape", "k4"), ("ros", "s1"), ("colmap", "s4"),
+     ("refractive", "s2")],
 )  # fmt: skip
 def test_distortion_is_never_lost(tmp_path: Path, name: str, term: str) -> None:
     rig = replace(IN_AIR, cameras={**IN_AIR.cameras})
     cameras = {**rig.cameras, "right": changed(rig.cameras["right"], **{term: 1e-3})}
     write_rig(tmp_path / "rig.json", replace(rig, cameras=cameras))
-    shown = refused(tmp_path / "rig.json", tmp_path / CHANNELS[name], target_format=name)
+    target = tmp_path / CHANNELS.get(name, "a.xml")
+    shown = refused(tmp_path / "rig.json", target, target_format=name)
     assert term in shown and "right" in shown
 
 
 @pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
+def test_a_dome_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
+    write_rig(own, DOMES)
+    shown = refused(own, tmp_path / CHANNELS[name], target_format=name)
+    assert "dome of 60 mm" in shown and "--drop-port" in shown and "--water" in shown
+
+
+def test_a_fisheye_goes_only_where_its_lens_is_known(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.json", in_air(DOMES))
+    shown = refused(tmp_path / "rig.json", tmp_path / "m", target_format="mrcal")
+    assert "fisheye" in shown and "left, right" in shown and "--water" in shown
+    for name, target in CHANNELS.items():
+        if name != "mrcal":
+            convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name)
+            assert_same_geometry(
+                FORMATS[name].read(tmp_path / target, ReadOptions()), in_air(DOMES)
+            )
+
+
+def test_metashape_takes_one_camera(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.json", in_air(DOMES))
+    target = tmp_path / "a.xml"
+    assert "--camera" in refused(tmp_path / "rig.json", target, target_format="metashape")
+    convert_files(tmp_path / "rig.json", target, target_format="metashape", camera="right")
+    (camera,) = FORMATS["metashape"].read(target, ReadOptions()).cameras.values()
+    assert camera.parameter("k1") == 0.03
+    write_rig(tmp_path / "rig.json", IN_AIR)
+    shown = refused(tmp_path / "rig.json", tmp_path / "a.json", target_format="gyroflow")
+    assert "read only" in shown
+
+
+@pytest.mark.parametrize("name", ["colmap", "kalibr"])
+def test_a_fisheye_behind_a_dome_has_a_stand_in_at_a_stated_price(
+    tmp_path: Path, name: str
+) -> None:
+    write_rig(tmp_path / "rig.json", DOMES)
+    target = tmp_path / CHANNELS[name]
+    _, data = convert_files(tmp_path / "rig.json", target, target_format=name, water=(1.0, 3.0))
+    after = FORMATS[name].read(target, ReadOptions()).cameras["left"]
+    assert data["price"]["left"]["model"] == "OPENCV_FISHEYE"
+    assert 1e-6 < data["price"]["left"]["rms_px"] < data["price"]["left"]["max_px"] < 0.02
+    before = DOMES.cameras["left"]
+    # Far away, where the centre matters least, the lens alone must agree with the exact camera.
+    pixels = before.frame_grid(5, 5)
+    missed = after.project(before.at_depth(pixels, 3.0)) - pixels
+    assert np.abs(missed).max() < 1.5
+
+
+def test_a_stand_in_that_folds_back_inside_the_frame_is_refused(tmp_path: Path) -> None:
+    """No fraction of polynomials stands in for 120 degrees across the corners of a fisheye."""
+    write_rig(tmp_path / "rig.json", only(DOMES, "left"))
+    shown = refused(
+        tmp_path / "rig.json", tmp_path / "a.cameramodel", target_format="mrcal", water=(1.0, 3.0)
+    )
+    assert "FULL_OPENCV" in shown and "left" in shown and "folds" in shown
+
+
+def test_a_dome_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
+    FORMATS["kalibr"].write(tmp_path / "c.yaml", in_air(DOMES))
+    convert_files(
+        tmp_path / "c.yaml", tmp_path / "rig.json", dome_radius_mm=60.0,
+        dome_centre_mm=(0.0, 0.0, 4.0), glass_mm=6.0, n_glass=1.49, n_water=1.34,
+    )  # fmt: skip
+    assert_same_geometry(read_rig(tmp_path / "rig.json"), DOMES)
+    shown = refused(tmp_path / "rig.json", tmp_path / "b.json", port_distance_mm=5.0)
+    assert "port_distance_m" in shown and "--drop-port" in shown
+    convert_files(tmp_path / "rig.json", tmp_path / "sea.json", n_water=1.342)
+    assert read_rig(tmp_path / "sea.json").cameras["left"].n_water == 1.342
+
+
+@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros", "mrcal"])
 def test_a_dropped_port_leaves_the_cameras_in_air_and_a_warning(
     own: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,7 +215,7 @@ def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
     opened = pycolmap.Reconstruction(tmp_path / "model")
     (sensors,) = opened.rigs.values()
     after = FORMATS["colmap"].read(tmp_path / "model", ReadOptions())
-    mount, _ = in_water(FULL, 1.5, 3.0, model)
+    mount, _ = in_water(FULL, 1.5, 3.0, dict.fromkeys(FULL.cameras, model))
     for i, (name, camera) in enumerate(BENT.cameras.items(), start=1):
         colmap = opened.cameras[i]
         assert colmap.model.name == model
@@ -147,7 +240,7 @@ def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
 
 
 def test_centres_follow_the_fit_onto_the_vehicle() -> None:
-    fitted, _ = in_water(FULL, 1.5, 3.0, "OPENCV")
+    fitted, _ = in_water(FULL, 1.5, 3.0, dict.fromkeys(FULL.cameras, "OPENCV"))
     for name in FULL.cameras:
         moved = (FULL.body_from_cam(name).inv() * fitted.body_from_cam(name)).translation
         # Through this port the best centre is some 7 mm behind the pupil.

@@ -98,6 +98,11 @@ def test_one_sensor_of_a_document_is_chosen(tmp_path: Path) -> None:
     camera = rig.cameras["HERO_11__3_mm_"]
     assert (camera.lens.model, camera.fx_px, camera.cx_px) == ("fisheye", 2000, 2003)
     assert (camera.parameter("k1"), camera.parameter("k4")) == (0.02, 0.01)
+    pictures = "<camera id='0'><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>\n"
+    many = DOCUMENT.replace("</chunk>", f"<cameras>{pictures * 20_000}</cameras></chunk>")
+    path.write_text(many.format(one))
+    assert detect(path).name == "metashape"
+    assert read_metashape(path, ReadOptions()).cameras == rig.cameras
     path.write_text(DOCUMENT.format(one + SENSOR.format(id=1, label="b", kind="frame", k4=0)))
     assert "HERO 11 (3 mm), b" in fault(path)
     assert "HERO 11 (3 mm), b" in fault(path, None, ReadOptions(camera="c"))

@@ -76,6 +76,7 @@ def test_what_was_measured_for_a_model_is_skipped_however_long(tmp_path: Path) -
     noise = base64.b85encode(np.random.default_rng(2).bytes(2_000_000))
     path.write_text(f"{SAMPLE.rstrip()[:-1]} 'optimization_inputs': {noise!r},\n\n}}\n")
     assert read_mrcal(path, ReadOptions()).cameras == plain.cameras
+    assert "1 MiB" in fault(path, SAMPLE + "#" * (1 << 20))
 
 
 @pytest.mark.parametrize(
