@@ -16,9 +16,10 @@ from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import LinearObservations
+from reconstruct.views.model_files import as_transform
 
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
