@@ -54,7 +54,7 @@ class CornerNoise:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Spread:
+class CornerSpread:
     """Covariance of a calibration under the noise that its residuals show."""
 
     noise: CornerNoise
@@ -63,6 +63,9 @@ class Spread:
     shared: Array
     """(P, M) factor of the part of it that other views of the same target have in common: errors of
     the priors' means and of the places of corners. The product with its transpose is that part."""
+    of_places: Array
+    """(N, 3, N, 3) information of the views, over that of independent noise, on offsets of the
+    target's points, with poses, rig and shape adjusted to them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,7 +98,7 @@ class Calibration:
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
-    spread: Spread | None = None
+    spread: CornerSpread | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 
     def __post_init__(self) -> None:
@@ -114,8 +117,9 @@ class Calibration:
 
     @property
     def shared(self) -> Array:
-        """(P, M) factor of the part of the rig's covariance that other views of the same target
-        have in common: by errors of the priors' means and of the places of its corners.
+        """(P, M) factor of what the rig's covariance has in common with other views of the target.
+
+        That is by errors of the priors' means and of the places of the target's corners.
         """
         covariance = self.rig.covariance
         if covariance is None:

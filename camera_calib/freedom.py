@@ -6,20 +6,25 @@ vector (`rx_rad, ry_rad, rz_rad`) and the translation (`x_m, y_m, z_m`). Small c
 sigmas, of the rotation are turns about the camera's own axes: R becomes exp(r) R.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.block_solver import Indices, inverse_of
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
+from camera_calib.ports.values import lowest
 from camera_calib.rig import Rig
 
 POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 """Pose parameters of a camera that is not the reference; its rotation first."""
+_TURN, _SHIFT = POSE[:3], POSE[3:]
 PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
 _ONE_WATER = ".n_water"
 _SAME = 1.0 - 0.5e-6
@@ -76,6 +81,56 @@ def value(rig: Rig, name: str) -> float:
     return float(vector[POSE.index(field)])
 
 
+def wanted_slopes(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
+    """Which slopes of a camera's pixels are by one of the names, and which name that is.
+
+    The slopes are those by the camera's own parameters, then by its pose on the rig.
+    """
+    slopes = {
+        f"{camera}.{field}": i for i, field in enumerate((*rig.cameras[camera].parameters, *POSE))
+    }
+    pairs = [(slopes[name], i) for i, name in enumerate(names) if name in slopes]
+    columns, at = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    return columns, at
+
+
+def at_bound(rig: Rig, names: Sequence[str]) -> NDArray[np.bool_]:
+    """Which parameters of a rig have their least value."""
+    lows = [lowest(name.split(".")[1]) for name in names]
+    return np.array(
+        [low > -np.inf and value(rig, name) <= low for name, low in zip(names, lows, strict=True)],
+        dtype=bool,
+    )
+
+
+def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
+    """A rig after a step of some parameters; bounded ones stop at their bound.
+
+    Raises:
+        CalibrationError: a parameter leaves the range of a real camera.
+    """
+    steps: dict[str, dict[str, float]] = {camera: {} for camera in rig.cameras}
+    for name, change in zip(names, step.tolist(), strict=True):
+        owner, field = name.split(".")
+        steps[owner][field] = change
+    cameras, poses = dict(rig.cameras), dict(rig.cam_from_rig)
+    for name, mine in steps.items():
+        camera, pose = cameras[name], poses[name]
+        changed = {
+            field: max(camera.parameter(field) + change, lowest(field))
+            for field, change in mine.items()
+            if field not in POSE
+        }
+        if changed:
+            cameras[name] = camera.with_parameters(changed)
+        if len(changed) < len(mine):
+            turn, shift = ([mine.get(axis, 0.0) for axis in axes] for axes in (_TURN, _SHIFT))
+            poses[name] = RigidTransform.from_components(
+                pose.translation + shift, Rotation.from_rotvec(turn) * pose.rotation
+            )
+    return replace(rig, cameras=cameras, cam_from_rig=poses)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prior:
     """Normally distributed prior of some parameters, not from the views."""
@@ -99,18 +154,24 @@ class Prior:
         scaled = self.covariance / np.outer(sigma, sigma)
         if count and np.linalg.eigvalsh(scaled)[0] < 1e-13:
             raise CalibrationError("prior: its covariance is not positive definite")
-        turns = {name for name in self.parameters if name.endswith(POSE[:3])}
+        turns = {name for name in self.parameters if name.endswith(_TURN)}
         for camera in {name.split(".")[0] for name in turns}:
-            if not {f"{camera}.{axis}" for axis in POSE[:3]} <= turns:
-                raise CalibrationError(f"prior: {camera} needs all of {', '.join(POSE[:3])}")
+            if not {f"{camera}.{axis}" for axis in _TURN} <= turns:
+                raise CalibrationError(f"prior: {camera} needs all of {', '.join(_TURN)}")
 
     @property
     def information(self) -> Array:
         """(K, K) inverse of the covariance."""
-        scale = 1.0 / np.sqrt(np.diag(self.covariance))
-        weight = np.outer(scale, scale)
-        inverse: Array = np.linalg.inv(self.covariance * weight) * weight
-        return inverse
+        return inverse_of(self.covariance)
+
+    def misfit(self, rig: Rig) -> Array:
+        """(K,) a rig's parameters minus the mean; a turn counts from the mean's rotation."""
+        found = np.array([value(rig, name) for name in self.parameters]) - self.mean
+        for camera in {n.split(".")[0] for n in self.parameters if n.endswith(_TURN)}:
+            at = [self.parameters.index(f"{camera}.{axis}") for axis in _TURN]
+            turn = rig.cam_from_rig[camera].rotation * Rotation.from_rotvec(self.mean[at]).inv()
+            found[at] = turn.as_rotvec()
+        return found
 
     @classmethod
     def around(cls, rig: Rig, sigmas: Mapping[str, float]) -> "Prior":

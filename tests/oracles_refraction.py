@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.block_solver import Equations
 from alice_survey.base.frames import Array
 from reconstruct.mapping.normal_equations import LinearObservations
 from reconstruct.mapping.uncertainty import Uncertainty
@@ -82,7 +83,7 @@ def adjust_through_ports(
 
 def dense_normal_equations(linear: LinearObservations, stations: int) -> tuple[Array, Array]:
     """J^T J and J^T r of stations, points and shared parameters, in that order, from a full J."""
-    points, count = len(linear.starts) - 1, linear.by_shared.shape[2]
+    points, count = len(linear.starts) - 1, linear.rest.shape[2] - 1
     size = 6 * stations + 3 * points + count
     jacobian = np.zeros((2 * len(linear.station), size))
     for point in range(points):
@@ -95,8 +96,19 @@ def dense_normal_equations(linear: LinearObservations, stations: int) -> tuple[A
             jacobian[rows, first + 3 : first + 6] = -linear.by_point[o]
             at = 6 * stations + 3 * point
             jacobian[rows, at : at + 3] = linear.by_point[o]
-            jacobian[rows, size - count :] = linear.by_shared[o]
+            jacobian[rows, size - count :] = linear.rest[o, :, :-1]
     return jacobian.T @ jacobian, jacobian.T @ linear.miss.ravel()
+
+
+def dense_of(equations: Equations) -> Array:
+    """The whole matrix of normal equations: poses, then what is shared."""
+    count, wide = equations.free.shape
+    poses = np.zeros((count, wide, count, wide))
+    for row, column, block in zip(equations.rows, equations.columns, equations.blocks, strict=True):
+        poses[row, :, column] = block
+    border = equations.border[..., :-1].reshape(count * wide, -1)
+    square = poses.reshape(count * wide, count * wide)
+    return np.block([[square, border], [border.T, equations.shared[:-1, :-1]]])
 
 
 def laid_onto(

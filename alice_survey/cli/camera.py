@@ -113,8 +113,9 @@ def residual(
     epilog=examples(
         "camera convert rig.json cameras.xml",
         "camera convert rig.json model --to colmap --water 1.5 3 --drop-covariance",
-        "camera convert rig.json model --to flatport --drop-covariance",
+        "camera convert rig.json model --to refractive --drop-covariance",
         "camera convert camchain.yaml rig.json --port-distance 20 --glass 10 --n-water 1.34",
+        "camera convert gopro.json rig.json --dome-radius 60 --dome-centre 0 0 5 --n-water 1.34",
         "camera convert intrinsics.yml rig.json --extrinsics extrinsics.yml --image-size 640 480",
         "camera convert rig.json left.yaml --to ros --camera left --drop-port --drop-covariance",
     )
@@ -128,7 +129,11 @@ def convert(
     ] = None,
     target_format: Annotated[
         str | None,
-        typer.Option("--to", metavar="FORMAT", help="rig, opencv, colmap, flatport, kalibr, ros."),
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help="rig, opencv, colmap, refractive, kalibr, ros, metashape, mrcal.",
+        ),
     ] = None,
     image_size: Annotated[
         tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN states none.")
@@ -136,9 +141,20 @@ def convert(
     extrinsics: Annotated[Path | None, typer.Option(help="OpenCV file of R and T.")] = None,
     unit_m: Annotated[float, typer.Option(help="Metres in one unit of IN's translations.")] = 1.0,
     camera: Annotated[str | None, typer.Option(help="Convert this camera alone.")] = None,
+    lens: Annotated[
+        str | None,
+        typer.Option(help="fisheye or opencv, when an OpenCV file does not say what its 4 are."),
+    ] = None,
     names: Annotated[str | None, typer.Option(help="New names, such as left,right.")] = None,
     port_distance: Annotated[
         float | None, typer.Option(min=0.0, help="Entrance pupil to inner glass, mm.")
+    ] = None,
+    dome_radius: Annotated[
+        float | None, typer.Option(min=1.0, help="A dome's outer radius, mm.")
+    ] = None,
+    dome_centre: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="The dome's, from the pupil: right, down, forward, mm."),
     ] = None,
     glass: Annotated[float | None, typer.Option(min=0.0, help="Thickness, mm.")] = None,
     n_glass: Annotated[float | None, typer.Option(min=1.0, help="Index; 1.52 if new.")] = None,
@@ -157,7 +173,8 @@ def convert(
 ) -> None:
     """Convert between tools.
 
-    OpenCV, COLMAP, Refractive COLMAP (flatport), Kalibr, ROS, rig.json; nothing is lost silently.
+    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, mrcal, rig.json, and Gyroflow's lens
+    profiles as starts; nothing is lost silently.
     """
     from camera_calib.formats.convert import Conversion
     from camera_calib.formats.convert import convert as work
@@ -166,11 +183,13 @@ def convert(
     task = Conversion(
         source=source, target=target, source_format=source_format, target_format=target_format,
         reading=ReadOptions(
-            image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
+            image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera,
+            lens=lens,
         ),
         names=tuple(names.split(",")) if names else (), port_distance_mm=port_distance,
-        glass_mm=glass, n_glass=n_glass, n_water=n_water, water=water, model=model,
-        drop_port=drop_port, drop_covariance=drop_covariance, overwrite=overwrite,
+        dome_radius_mm=dome_radius, dome_centre_mm=dome_centre, glass_mm=glass, n_glass=n_glass,
+        n_water=n_water, water=water, model=model, drop_port=drop_port,
+        drop_covariance=drop_covariance, overwrite=overwrite,
     )  # fmt: skip
     print_result(*work(task), as_json)
 

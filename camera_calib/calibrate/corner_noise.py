@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import Adjustment
 from camera_calib.calibrate.normal_equations import CalibrationProblem
-from camera_calib.calibration import CornerNoise, Spread
+from camera_calib.calibration import CornerNoise, CornerSpread
 from camera_calib.rig import Covariance
 
 _REACHES = (0.12, 0.3, 0.8)
@@ -49,7 +49,7 @@ class _Part:
         return out
 
 
-class _Rows:
+class _CornerRows:
     """Weighted slopes and residuals of all views; 0 where unseen."""
 
     def __init__(self, problem: CalibrationProblem, found: Adjustment) -> None:
@@ -81,14 +81,14 @@ class _Rows:
         self.missed -= np.einsum("vcnak,vk->vcna", self.poses, taken_px)
 
 
-def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
+def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
     """Estimate the noise from the residuals of an adjustment, and propagate it.
 
     Args:
         problem: whose pixels and parameters were adjusted.
         found: the result.
     """
-    rows = _Rows(problem, found)
+    rows = _CornerRows(problem, found)
     diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
     squares = cdist(problem.points, problem.points, "sqeuclidean")
     parts = [_Part(kernel=np.eye(len(problem.points)), in_all=False)]
@@ -111,7 +111,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
         shared.append(inverse[:, prior_at] @ np.linalg.cholesky(problem.prior_information))
     factor = np.concatenate(shared, axis=1)
     matrix = inverse @ meat @ inverse + factor @ factor.T
-    return Spread(
+    return CornerSpread(
         noise=CornerNoise(
             alone=float(pictures[0]),
             together=pictures[1:],
@@ -119,6 +119,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
         ),
         covariance=Covariance(parameters=problem.names, matrix=0.5 * (matrix + matrix.T)),
         shared=factor,
+        of_places=products.of_places,
     )
 
 
@@ -129,7 +130,7 @@ class _Products:
     matrices, the mean of r^T K_i r is the sum of v_j tr(K_i M K_j M).
     """
 
-    def __init__(self, rows: _Rows, parts: list[_Part], inverse: Array) -> None:
+    def __init__(self, rows: _CornerRows, parts: list[_Part], inverse: Array) -> None:
         views, size = len(rows.seen), len(inverse)
         self.rows, self.parts, self.inverse = rows, parts, inverse
         self.smoothed = [part.smoothed(rows.by_rig, rows.seen) for part in parts]
@@ -148,11 +149,12 @@ class _Products:
             for p in self.poses
         ]
 
+        self.of_places = self._of_places()
+
     def variances(self) -> Array:
         """Variances of the parts within pictures, then of places by axes (square metres)."""
         count = len(self.parts)
         size = count + len(_AXES)
-        left = self._left_places()
         table, seen = np.zeros((size, size)), np.zeros(size)
         for i in range(count):
             for j in range(i + 1):
@@ -165,7 +167,9 @@ class _Products:
         for i, axes in enumerate(_AXES):
             seen[count + i] = float((pulled[:, axes] ** 2).sum())
             for j, others in enumerate(_AXES):
-                table[count + i, count + j] = float((left[:, axes][..., others] ** 2).sum())
+                table[count + i, count + j] = float(
+                    (self.of_places[:, axes][..., others] ** 2).sum()
+                )
         scale = 1.0 / np.sqrt(np.diag(table))
         # Under independent errors the products' covariance is twice the table.
         root = np.linalg.cholesky(table * np.outer(scale, scale) + 1e-12 * np.eye(size))
@@ -203,13 +207,13 @@ class _Products:
         square = by_place.T @ by_place
         return total + float(np.trace(inverse @ square @ inverse @ self.by_rig[i]))
 
-    def _left_places(self) -> Array:
+    def _of_places(self) -> Array:
         """(N, 3, N, 3) products of places' slopes, after all unknowns were fitted."""
         rows, count = self.rows, self.by_place.shape[0]
         posed = self.place_of_pose.transpose(1, 2, 0, 3).reshape(3 * count, -1)
         by_place = self.by_place.reshape(3 * count, -1)
         left = -(posed @ posed.T) - by_place @ self.inverse @ by_place.T
-        blocks = left.reshape(count, 3, count, 3)
+        blocks: Array = left.reshape(count, 3, count, 3)
         own = np.einsum("vcnai,vcnaj->nij", rows.by_place, rows.by_place)
         blocks[np.arange(count), :, np.arange(count)] += own
         return blocks

@@ -12,12 +12,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.block_solver import Flags
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibrate.adjust import Adjustment, adjust
 from camera_calib.calibrate.corner_noise import spread_of
-from camera_calib.calibrate.normal_equations import CalibrationProblem, Flags
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
 from camera_calib.calibration import (
@@ -41,7 +42,7 @@ from camera_calib.freedom import (
 from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
-from camera_calib.target_shape import TargetShape, bends
+from camera_calib.target_shape import TargetShape, usual_shape
 
 Intrinsics = Literal["held", "prior", "free"]
 
@@ -85,7 +86,7 @@ def calibrate(
         start: near the truth, such as the design; what is not adjusted is taken from it.
         freedom: what is adjusted.
         source: how, for the rig's `source`.
-        shape: how the target may differ from its drawing; None for bends of a flat one, and
+        shape: how the target may differ from its drawing; None for that of a flat sheet, and
             `AS_DRAWN` for points that are known better.
 
     Raises:
@@ -93,7 +94,7 @@ def calibrate(
     """
     usable, rejections = _usable(views, points)
     _check_served(usable, start)
-    shape = bends(points) if shape is None else shape
+    shape = usual_shape(points) if shape is None else shape
     found = locate_all(start, usable, points + shape.offsets_m)
     for view, pose in zip(usable, found, strict=True):
         if pose is None:

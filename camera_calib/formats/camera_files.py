@@ -3,14 +3,17 @@
 COLMAP: https://colmap.github.io/format.html, one line a camera: `CAMERA_ID MODEL WIDTH HEIGHT
 PARAMS[]`. Refractive COLMAP (She et al. 2024, https://arxiv.org/abs/2403.08640) appends
 `REFRAC_MODEL REFRAC_PARAMS[]` to the line; its binary has an int32 after the parameters, the
-refraction model's number or -1, and then its parameters. A FLATPORT has `Nx Ny Nz int_dist
-int_thick na ng nw`, lengths in metres, the normal pointing into the water.
+refraction model's number or -1, and then its parameters. Lengths are in metres. A FLATPORT has `Nx
+Ny Nz int_dist int_thick na ng nw`, the normal pointing into the water; a DOMEPORT `Cx Cy Cz
+int_radius int_thick na ng nw`, its centre and the radius of its inner surface.
 """
 
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
@@ -19,9 +22,13 @@ from alice_survey.base.contents import shown
 from alice_survey.base.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_bytes, read_text
-from camera_calib.formats.opencv_model import camera_in_air, distorts
+from camera_calib.formats.opencv_model import behind_port, camera_in_air, distorts, is_fisheye
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.lenses.values import LensValues
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.flat import FlatPort
 
-FLATPORT = "FLATPORT"
 MODELS = {
     "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
     "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
@@ -29,12 +36,19 @@ MODELS = {
     "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
     "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
     "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+    "SIMPLE_FISHEYE": (14, ("f", "cx", "cy")),
+    "FISHEYE": (15, ("fx", "fy", "cx", "cy")),
 }
-"""Number and parameters of COLMAP's models that OpenCV's model contains."""
-_REFRACTION = {0: FLATPORT, 1: "DOMEPORT"}
+"""Number and parameters of COLMAP's models that a lens here contains."""
+PORTS = ("FLATPORT", "DOMEPORT")
+"""Refraction models by their numbers; both have eight parameters, the last three indices."""
 _NO_REFRACTION = -1
 _PORT_PARAMETERS = 8
 _MOST_PX = 10**7
+_OURS = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +60,10 @@ class CameraRecord:
     width_px: int
     height_px: int
     params: tuple[float, ...]
-    port: tuple[float, ...] | None = None
-    """Parameters of a FLATPORT."""
+    refraction: str | None = None
+    """One of `PORTS`."""
+    port: tuple[float, ...] = ()
+    """Its parameters."""
 
     def fields(self, path: Path) -> Fields:
         """The record as named values, for checks that name file and camera."""
@@ -56,7 +72,7 @@ class CameraRecord:
             "WIDTH": float(self.width_px),
             "HEIGHT": float(self.height_px),
             **{name: [value] for name, value in zip(names, self.params, strict=True)},
-            "REFRAC_PARAMS": None if self.port is None else list(self.port),
+            "REFRAC_PARAMS": list(self.port),
         }
         return Fields(path=path, values=values, prefix=f"camera {self.camera_id}: ")
 
@@ -69,41 +85,74 @@ def record_of(camera_id: int, camera: Camera, *, port: bool) -> CameraRecord:
         camera: without thin-prism terms.
         port: add the port's parameters.
     """
-    if distorts(camera, "k3", "k4", "k5", "k6"):
+    if is_fisheye(camera):
+        model = "OPENCV_FISHEYE"
+    elif distorts(camera, "k3", "k4", "k5", "k6"):
         model = "FULL_OPENCV"
     else:
         model = "OPENCV" if distorts(camera, "k1", "k2", "p1", "p2") else "PINHOLE"
-    ours = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
-    housing = None
-    if port and camera.port.parameters:
-        distance, thickness, n_glass, n_water, *normal = camera.port.values.tolist()
-        housing = (*normal, distance, thickness, 1.0, n_glass, n_water)
     return CameraRecord(
         camera_id=camera_id,
         model=model,
         width_px=camera.width_px,
         height_px=camera.height_px,
-        params=tuple(camera.parameter(ours.get(name, name)) for name in MODELS[model][1]),
-        port=housing,
+        params=tuple(camera.parameter(_OURS.get(name, name)) for name in MODELS[model][1]),
+        **(_housing(camera) if port else {}),
     )
 
 
+def _housing(camera: Camera) -> dict[str, Any]:
+    values = camera.port.values.tolist()
+    if camera.port.shape == FlatPort.shape:
+        distance, thickness, n_glass, n_water, *normal = values
+        return {
+            "refraction": "FLATPORT",
+            "port": (*normal, distance, thickness, 1.0, n_glass, n_water),
+        }
+    if camera.port.shape == DomePort.shape:
+        x, y, z, radius, thickness, n_glass, n_water = values
+        return {
+            "refraction": "DOMEPORT",
+            "port": (x, y, z, radius - thickness, thickness, 1.0, n_glass, n_water),
+        }
+    return {}
+
+
 def camera_of(path: Path, record: CameraRecord) -> Camera:
-    """The camera of a record, without its port.
+    """The camera of a record, with its port.
 
     Raises:
         CalibrationError: a value is not a finite number or out of range.
     """
     fields = record.fields(path)
     names = MODELS[record.model][1]
-    values = {name: fields.number(name) for name in names}
-    focal = values.get("f", 0.0)
-    return camera_in_air(
-        fields,
-        "f" if "f" in values else "fx",
-        (fields.size("WIDTH"), fields.size("HEIGHT")),
-        lens=(values.get("fx", focal), values.get("fy", focal), values["cx"], values["cy"]),
-        coefficients={name: value for name, value in values.items() if name[0] in "kp"},
+    values = {_OURS.get(name, name): fields.number(name) for name in names}
+    focal = "fx"
+    if "f" in values:
+        focal = "f"
+        values["fx_px"] = values["fy_px"] = values.pop("f")
+    size = (fields.size("WIDTH"), fields.size("HEIGHT"))
+    lens: type[LensValues] = FisheyeLens if "FISHEYE" in record.model else OpenCVLens
+    camera = camera_in_air(fields, focal, size, lens, values)
+    if record.refraction is None:
+        return camera
+    key = "REFRAC_PARAMS"
+    x, y, z, reach, thickness, n_air, n_glass, n_water = fields.numbers(key, 8).tolist()
+    if n_air < 1 or min(n_glass, n_water) < n_air:
+        raise fields.fault(key, f"has the indices {n_air} {n_glass} {n_water}")
+    # Snell's law knows ratios only, so that an index of air other than 1 divides the others.
+    shared = {
+        "glass_thickness_m": thickness, "n_glass": n_glass / n_air, "n_water": n_water / n_air
+    }  # fmt: skip
+    if record.refraction == "DOMEPORT":
+        centre = {"dome_x_m": x, "dome_y_m": y, "dome_z_m": z}
+        return behind_port(
+            fields, key, camera, DomePort, outer_radius_m=reach + thickness, **centre, **shared
+        )
+    if abs(math.hypot(x, y, z) - 1.0) > 1e-6 or z <= 0:
+        raise fields.fault(key, f"has no unit normal facing forward: {x} {y} {z}")
+    return behind_port(
+        fields, key, camera, FlatPort, normal=(x, y, z), port_distance_m=reach, **shared
     )
 
 
@@ -111,7 +160,7 @@ def read_records(path: Path) -> list[CameraRecord]:
     """Cameras of a cameras.txt or cameras.bin of either kind, in the order of their numbers.
 
     Raises:
-        CalibrationError: no such file, or it is malformed, or a model is not OpenCV's.
+        CalibrationError: no such file, or it is malformed, or a model is none of `MODELS`.
     """
     records = _read_binary(path) if path.suffix.lower() == ".bin" else _read_text(path)
     if not records:
@@ -143,8 +192,8 @@ def write_records(path: Path, records: Sequence[CameraRecord]) -> None:
 def _line(record: CameraRecord) -> str:
     items = [record.camera_id, record.model, record.width_px, record.height_px]
     items += map(_digits, record.params)
-    if record.port is not None:
-        items += [FLATPORT, *map(_digits, record.port)]
+    if record.refraction is not None:
+        items += [record.refraction, *map(_digits, record.port)]
     return " ".join(map(str, items))
 
 
@@ -157,9 +206,13 @@ def _packed(record: CameraRecord) -> bytes:
     size = (record.width_px, record.height_px)
     start = struct.pack("<IiQQ", record.camera_id, number, *size)
     body = struct.pack(f"<{len(record.params)}d", *record.params)
-    if record.port is None:
+    if record.refraction is None:
         return start + body + struct.pack("<i", _NO_REFRACTION)
-    return start + body + struct.pack(f"<i{_PORT_PARAMETERS}d", 0, *record.port)
+    return (
+        start
+        + body
+        + struct.pack(f"<i{_PORT_PARAMETERS}d", PORTS.index(record.refraction), *record.port)
+    )
 
 
 def _read_text(path: Path) -> list[CameraRecord]:
@@ -177,10 +230,13 @@ def _read_text(path: Path) -> list[CameraRecord]:
         if len(params) < count or (port and _is_number(port[0])):
             raise CalibrationError(f"{where}: {model} has {count} PARAMS: {len(items) - 4} found")
         if port:
-            _must_be_flat(where, port[0])
+            if port[0] not in PORTS:
+                raise CalibrationError(
+                    f"{where}: port {shown(port[0])}: {' and '.join(PORTS)} can be read"
+                )
             if len(port) != 1 + _PORT_PARAMETERS:
                 raise CalibrationError(
-                    f"{where}: {FLATPORT} has {_PORT_PARAMETERS} REFRAC_PARAMS: "
+                    f"{where}: {port[0]} has {_PORT_PARAMETERS} REFRAC_PARAMS: "
                     f"{len(port) - 1} found"
                 )
         try:
@@ -191,7 +247,8 @@ def _read_text(path: Path) -> list[CameraRecord]:
                     width_px=int(items[2]),
                     height_px=int(items[3]),
                     params=tuple(map(float, params)),
-                    port=tuple(map(float, port[1:])) if port else None,
+                    refraction=port[0] if port else None,
+                    port=tuple(map(float, port[1:])),
                 )
             )
         except ValueError as error:
@@ -228,15 +285,15 @@ def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord
             size = len(MODELS[model][1])
             params = struct.unpack_from(f"<{size}d", content, at + 24)
             at += 24 + 8 * size
-            port = None
+            name = None
+            port: tuple[float, ...] = ()
             if refractive:
                 (refraction,) = struct.unpack_from("<i", content, at)
                 at += 4
                 if refraction != _NO_REFRACTION:
-                    name = _REFRACTION.get(refraction)
-                    if name is None:
+                    if not 0 <= refraction < len(PORTS):
                         return None
-                    _must_be_flat(f"{path}: camera {camera_id}", name)
+                    name = PORTS[refraction]
                     port = struct.unpack_from(f"<{_PORT_PARAMETERS}d", content, at)
                     at += 8 * _PORT_PARAMETERS
             records.append(
@@ -246,6 +303,7 @@ def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord
                     width_px=width,
                     height_px=height,
                     params=params,
+                    refraction=name,
                     port=port,
                 )
             )
@@ -270,11 +328,6 @@ def _model_name(number: int) -> str | None:
 def _known(where: str, model: str) -> str:
     if model not in MODELS:
         raise CalibrationError(
-            f"{where}: model {shown(model)} is not OpenCV's: {', '.join(MODELS)} can be read"
+            f"{where}: model {shown(model)} is not held here: {', '.join(MODELS)} can be read"
         )
     return model
-
-
-def _must_be_flat(where: str, refraction: str) -> None:
-    if refraction != FLATPORT:
-        raise CalibrationError(f"{where}: port {refraction} is not flat: {FLATPORT} can be read")

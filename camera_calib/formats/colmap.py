@@ -24,7 +24,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import CalibrationError, warn
-from camera_calib.camera import Camera
 from camera_calib.formats.camera_files import (
     MODELS,
     CameraRecord,
@@ -34,7 +33,6 @@ from camera_calib.formats.camera_files import (
     write_records,
 )
 from camera_calib.formats.fields import Fields, read_bytes, read_json_fields, read_text
-from camera_calib.formats.opencv_model import behind_port
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
 
@@ -77,8 +75,8 @@ def read_colmap(path: Path, reading: ReadOptions) -> Rig:
                 f"or put {RIG_CONFIG} next to it"
             )
         ties = [(chosen[0], str(chosen[0].camera_id), RigidTransform.identity())]
-    cameras = [_camera(file, record) for record, _, _ in ties]
-    tool = "Refractive COLMAP" if any(record.port for record, _, _ in ties) else "COLMAP"
+    cameras = [camera_of(file, record) for record, _, _ in ties]
+    tool = "Refractive COLMAP" if any(record.refraction for record, _, _ in ties) else "COLMAP"
     names = [name for _, name, _ in ties]
     return assemble(path, reading, tool, names, cameras, [pose for _, _, pose in ties])
 
@@ -127,8 +125,8 @@ def write_colmap(path: Path, rig: Rig) -> list[Path]:
     return [*written, folder / RIG_CONFIG]
 
 
-def write_flatport(path: Path, rig: Rig) -> list[Path]:
-    """Write cameras with FLATPORT parameters and the rig configuration of COLMAP 3.10."""
+def write_refractive(path: Path, rig: Rig) -> list[Path]:
+    """Write cameras with the parameters of their ports and the rig configuration of COLMAP 3.10."""
     folder, file = _target(path)
     records = [record_of(i, c, port=True) for i, c in enumerate(rig.cameras.values(), start=1)]
     entries = [
@@ -169,30 +167,6 @@ def _camera_file(path: Path) -> Path | None:
             raise CalibrationError(f"{path}: holds neither {' nor '.join(CAMERA_FILES)}")
         return found[0] if found else None
     return path
-
-
-def _camera(path: Path, record: CameraRecord) -> Camera:
-    camera = camera_of(path, record)
-    if record.port is None:
-        return camera
-    fields = record.fields(path)
-    x, y, z, distance, thickness, n_air, n_glass, n_water = fields.numbers("REFRAC_PARAMS", 8)
-    length = float(np.linalg.norm([x, y, z]))
-    if abs(length - 1.0) > 1e-6 or z <= 0:
-        raise fields.fault("REFRAC_PARAMS", f"has no unit normal facing forward: {x} {y} {z}")
-    if min(n_air, n_glass / n_air, n_water / n_air) < 1:
-        raise fields.fault("REFRAC_PARAMS", f"has the indices {n_air} {n_glass} {n_water}")
-    # Snell's law knows ratios only, so that an index of air other than 1 divides the others.
-    return behind_port(
-        fields,
-        "REFRAC_PARAMS",
-        camera,
-        normal=(float(x), float(y), float(z)),
-        port_distance_m=float(distance),
-        glass_thickness_m=float(thickness),
-        n_glass=float(n_glass / n_air),
-        n_water=float(n_water / n_air),
-    )
 
 
 def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
@@ -273,7 +247,7 @@ def _entries(path: Path) -> list[Fields]:
 def _entry_lens(entry: Fields) -> tuple[str, tuple[float, ...]]:
     model = entry.text("camera_model_name")
     if model not in MODELS:
-        raise entry.fault("camera_model_name", f"{model} is not OpenCV's: {', '.join(MODELS)}")
+        raise entry.fault("camera_model_name", f"{model}: {', '.join(MODELS)} can be read")
     return model, tuple(entry.numbers("camera_params", len(MODELS[model][1])).tolist())
 
 

@@ -11,12 +11,11 @@ from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import camera_name
-from camera_calib.formats.opencv_model import distorts
+from camera_calib.formats.opencv_model import FISHEYE, distorts, is_fisheye
 from camera_calib.formats.registry import (
     COVARIANCE,
     K3,
     MOUNT,
-    PORT,
     PRISM,
     RATIONAL,
     CalibrationFormat,
@@ -34,6 +33,7 @@ from camera_calib.formats.rigs import (
     with_port,
 )
 from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
 
@@ -54,7 +54,10 @@ class Conversion:
     names: tuple[str, ...] = ()
     """New names of the cameras, in order."""
     port_distance_mm: float | None = None
-    """To set, as the three below."""
+    """To set, as the five below."""
+    dome_radius_mm: float | None = None
+    """Outer; makes the port a dome."""
+    dome_centre_mm: tuple[float, float, float] | None = None
     glass_mm: float | None = None
     n_glass: float | None = None
     n_water: float | None = None
@@ -68,15 +71,15 @@ class Conversion:
 
     @property
     def port(self) -> dict[str, float]:
-        """Fields of `FlatPort` to set for the port."""
-        given = {
-            "port_distance_m": None
-            if self.port_distance_mm is None
-            else self.port_distance_mm / 1e3,
-            "glass_thickness_m": None if self.glass_mm is None else self.glass_mm / 1e3,
-            "n_glass": self.n_glass,
-            "n_water": self.n_water,
+        """Fields of a port to set."""
+        lengths = {
+            "port_distance_m": self.port_distance_mm,
+            "glass_thickness_m": self.glass_mm,
+            "outer_radius_m": self.dome_radius_mm,
+            **dict(zip(DomePort.parameters, self.dome_centre_mm or (), strict=False)),
         }
+        given = {"n_glass": self.n_glass, "n_water": self.n_water}
+        given |= {name: None if mm is None else mm / 1e3 for name, mm in lengths.items()}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -171,8 +174,15 @@ def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, 
                 f"{where} the distortion {' '.join(names)} of {', '.join(bent)}: "
                 "choose another format, or add --water NEAR FAR (m) for the best fit"
             )
+    wide = [n for n, one in rig.cameras.items() if is_fisheye(one) and FISHEYE not in target.holds]
+    if wide:
+        raise CalibrationError(
+            f"{where} the fisheye lens of {', '.join(wide)}: choose another format, or add "
+            "--water NEAR FAR (m) for the best fit"
+        )
     behind = [name for name, camera in rig.cameras.items() if has_port(camera)]
-    if task.drop_port or (behind and PORT not in target.holds):
+    lost = any(rig.cameras[name].port.shape not in target.holds for name in behind)
+    if task.drop_port or lost:
         if behind and not task.drop_port:
             raise CalibrationError(
                 f"{where} the port of {', '.join(behind)} ({_port_words(rig.cameras[behind[0]])}): "

@@ -157,21 +157,23 @@ def _flat(value: Any, depth: int = 0) -> list[float] | None:
     return [number] if math.isfinite(number) else None
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file of at most 1 MiB.
+def read_bytes(path: Path, largest: int = _LARGEST_BYTES) -> bytes:
+    """The content of a file of limited size.
 
     Raises:
         CalibrationError: there is no such file, or it is larger.
     """
     try:
         with path.open("rb") as file:
-            content = file.read(_LARGEST_BYTES + 1)
+            content = file.read(largest + 1)
     except FileNotFoundError:
         raise CalibrationError(f"{path}: no such file") from None
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
-    if len(content) > _LARGEST_BYTES:
-        raise CalibrationError(f"{path}: more than 1 MiB: no calibration file is that large")
+    if len(content) > largest:
+        raise CalibrationError(
+            f"{path}: more than {largest >> 20} MiB: no calibration file is that large"
+        )
     return content
 
 
@@ -179,16 +181,27 @@ def read_text(path: Path) -> str:
     """The text of a file that parsers can take without harm.
 
     Raises:
-        CalibrationError: no such file, too large, no UTF-8, or too many parts.
+        CalibrationError: no such file, too large, or refused by `safe_text`.
+    """
+    return safe_text(path, read_bytes(path))
+
+
+def safe_text(path: Path, content: bytes) -> str:
+    """The content of a file as text that parsers can take without harm.
+
+    Raises:
+        CalibrationError: no UTF-8, too many parts, or a document type (XML entities).
     """
     try:
-        text = read_bytes(path).decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise CalibrationError(f"{path}: is not UTF-8 text") from None
     if "\0" in text:
         raise CalibrationError(f"{path}: is not text")
     if len(re.findall(r"[\[{]|<[A-Za-z_]", text)) > _MOST_PARTS:
         raise CalibrationError(f"{path}: has more than {_MOST_PARTS} parts: no calibration file")
+    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise CalibrationError(f"{path}: declares a DOCTYPE or ENTITY, which is refused")
     return text
 
 
@@ -227,15 +240,14 @@ class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
         return values
 
 
-def read_yaml(path: Path) -> Fields:
-    """A YAML file whose top is a mapping.
+def read_yaml(path: Path, text: str | None = None) -> Fields:
+    """A YAML file whose top is a mapping; `text` is its content where that was read already.
 
     Raises:
         CalibrationError: the file is missing, not YAML, or not a mapping of text keys.
     """
-    text = read_text(path)
     try:
-        value = yaml.load(text, Loader=_PlainLoader)  # noqa: S506 - a SafeLoader
+        value = yaml.load(read_text(path) if text is None else text, Loader=_PlainLoader)  # noqa: S506 - a SafeLoader
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
@@ -268,12 +280,9 @@ def read_storage(path: Path) -> Fields:
     """A YAML, XML or JSON file of OpenCV's FileStorage; matrices are `{rows, cols, dt, data}`.
 
     Raises:
-        CalibrationError: the file is missing, is not such a file, declares a document type (XML
-            entities), or repeats a key.
+        CalibrationError: the file is missing, is not such a file, or repeats a key.
     """
     text = read_text(path)
-    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise CalibrationError(f"{path}: declares a DOCTYPE or ENTITY, which is refused")
     if not text.strip():
         raise CalibrationError(f"{path}: is empty")
     storage = cv2.FileStorage()

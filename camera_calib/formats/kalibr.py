@@ -1,21 +1,29 @@
-"""Kalibr's camchain YAML: pinhole cameras with radial-tangential distortion, one after the other.
+"""Kalibr's camchain YAML: pinhole cameras with radtan or equidistant distortion, in a chain.
 
 The format is that of https://github.com/ethz-asl/kalibr/wiki/yaml-formats: `T_cn_cnm1` takes points
 of the camera before (cam0 for cam1) to this camera, `radtan` has k1 k2 p1 p2 with OpenCV's meaning,
-and pixels count from the centre of the first one.
+`equidistant` k1 to k4 of OpenCV's `fisheye`, and pixels count from the centre of the first one.
 """
 
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml, write_yaml
-from camera_calib.formats.opencv_model import HALF_PIXEL, camera_in_air
+from camera_calib.formats.opencv_model import (
+    HALF_PIXEL,
+    LENS_NAMES,
+    counted_from_centre,
+    distortion,
+    is_fisheye,
+)
 from camera_calib.formats.rigs import ReadOptions, assemble
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig
 
 _NOT_HELD = ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
@@ -26,7 +34,7 @@ def read_kalibr(path: Path, reading: ReadOptions) -> Rig:
     """Read a chain of cameras.
 
     Raises:
-        CalibrationError: a key is missing or wrong, or a model is not pinhole with radtan.
+        CalibrationError: a key is missing or wrong, or a model is not held here.
     """
     top = read_yaml(path)
     count = sum(f"cam{i}" in top for i in range(len(top.values)))
@@ -56,8 +64,8 @@ def write_kalibr(path: Path, rig: Rig) -> list[Path]:
             entry["T_cn_cnm1"] = (rig.cam_from_rig[name] * before.inv()).as_matrix().tolist()
         entry["cam_overlaps"] = [other for other in range(len(names)) if other != i]
         entry["camera_model"] = "pinhole"
-        entry["distortion_coeffs"] = [camera.parameter(name) for name in ("k1", "k2", "p1", "p2")]
-        entry["distortion_model"] = "radtan"
+        entry["distortion_coeffs"] = distortion(camera)[:4].tolist()
+        entry["distortion_model"] = "equidistant" if is_fisheye(camera) else "radtan"
         centre = [camera.cx_px - HALF_PIXEL, camera.cy_px - HALF_PIXEL]
         entry["intrinsics"] = [camera.fx_px, camera.fy_px, *centre]
         entry["resolution"] = [camera.width_px, camera.height_px]
@@ -71,22 +79,22 @@ def _camera(fields: Fields) -> Camera:
     if fields.text("camera_model") != "pinhole":
         raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole expected")
     model = fields.text("distortion_model")
-    if model not in ("radtan", "none"):
-        raise fields.fault("distortion_model", f"is {model}; radtan or none expected")
-    k = fields.numbers("distortion_coeffs", 4) if model == "radtan" else ()
-    fx, fy, cx, cy = fields.numbers("intrinsics", 4)
+    if model not in ("radtan", "equidistant", "none"):
+        raise fields.fault("distortion_model", f"is {model}; radtan, equidistant or none expected")
+    k = np.zeros(0) if model == "none" else fields.numbers("distortion_coeffs", 4)
     width, height = fields.numbers("resolution", 2)
     size = Fields(
         path=fields.path,
         prefix=f"{fields.prefix}resolution: ",
         values={"width": width, "height": height},
     )
-    return camera_in_air(
+    return counted_from_centre(
         fields,
         "intrinsics",
         (size.size("width"), size.size("height")),
-        lens=(fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL),
-        coefficients=dict(zip(("k1", "k2", "p1", "p2"), map(float, k), strict=False)),
+        LENS_NAMES.get(model, OpenCVLens),
+        fields.numbers("intrinsics", 4),
+        k,
     )
 
 

@@ -3,9 +3,12 @@
 One camera has `camera_matrix` and `distortion_coefficients` (also of ROS and of MATLAB's exports),
 two have `M1 D1 M2 D2` and the second's pose `R T` in the first (x2 = R x1 + T), as the sample
 `stereo_calib.cpp` names them. What OpenCV lacks has keys of our own, so that nothing is lost:
-`port`, `port1`, `port2`, `camera_names`, `body_from_rig`, `source`, `covariance`.
+`port`, `port1`, `port2`, `camera_names`, `body_from_rig`, `source`, `covariance`. Four coefficients
+are k1 k2 p1 p2 of a pinhole or k1 to k4 of `cv2.fisheye`: `distortion_model` (with 1 or 2 where the
+lenses of a pair differ) or the caller says which; without either it is a pinhole.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +17,21 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_storage
-from camera_calib.formats.opencv_model import behind_port, camera_matrix, distortion, read_camera
+from camera_calib.formats.opencv_model import (
+    FISHEYE,
+    LENS_NAMES,
+    camera_matrix,
+    distortion,
+    is_fisheye,
+    read_camera,
+    read_port,
+)
 from camera_calib.formats.rigs import ReadOptions, assemble, default_names, own_keys
+from camera_calib.optics import PORTS
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
@@ -27,7 +40,6 @@ _PAIR = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix{}")
 _PAIR_DISTORTION = ("D{}", "distCoeffs{}", "distortion_coefficients{}")
 _WIDTH = ("image_width", "image_Width")
 _HEIGHT = ("image_height", "image_Height")
-_PORT_LENGTHS = ("port_distance_m", "glass_thickness_m", "n_glass", "n_water")
 
 
 def read_opencv(path: Path, reading: ReadOptions) -> Rig:
@@ -72,11 +84,13 @@ def write_opencv(path: Path, rig: Rig) -> list[Path]:
         camera = rig.cameras[names[0]]
         storage.write("camera_matrix", camera_matrix(camera))
         storage.write("distortion_coefficients", distortion(camera)[None])
+        _write_lens(storage, "", camera)
         _write_port(storage, "port", camera)
     else:
         for i, camera in enumerate(rig.cameras.values(), start=1):
             storage.write(f"M{i}", camera_matrix(camera))
             storage.write(f"D{i}", distortion(camera)[None])
+            _write_lens(storage, str(i), camera)
         second_from_first = rig.cam_from_rig[names[1]]
         storage.write("R", second_from_first.rotation.as_matrix())
         storage.write("T", second_from_first.translation[:, None])
@@ -98,10 +112,15 @@ def _write_port(storage: Any, key: str, camera: Camera) -> None:
     if not camera.port.parameters:
         return
     storage.startWriteStruct(key, cv2.FileNode_MAP)
-    for name in _PORT_LENGTHS:
-        storage.write(name, camera.parameter(name))
-    storage.write("normal", np.array([camera.port.axis_cam]))
+    storage.write("shape", camera.port.shape)
+    for name, value in asdict(camera.port).items():
+        storage.write(name, np.array([value]) if isinstance(value, tuple) else value)
     storage.endWriteStruct()
+
+
+def _write_lens(storage: Any, number: str, camera: Camera) -> None:
+    if is_fisheye(camera):
+        storage.write(f"distortion_model{number}", FISHEYE)
 
 
 def _write_texts(storage: Any, key: str, texts: list[str]) -> None:
@@ -118,13 +137,23 @@ def _numbered(fields: Fields, number: str, reading: ReadOptions) -> Camera:
         raise CalibrationError(f"{fields.path}: lacks {wanted}: is it a calibration?")
     every = _PAIR_DISTORTION if number else _DISTORTION
     k = fields.first(*(key.format(number) for key in every))
-    camera = read_camera(fields, matrix, k, _size(fields, number, reading))
-    if f"port{number}" not in fields:
+    named = fields.first(f"distortion_model{number}", "distortion_model")
+    name = (reading.lens if named is None else fields.text(named)) or "opencv"
+    if name not in LENS_NAMES:
+        raise fields.fault(named or "--lens", f"is {name}; {', '.join(LENS_NAMES)} can be read")
+    lens = LENS_NAMES[name]
+    unsure = named is None and reading.lens is None
+    if k is not None and unsure and fields.vector(k, 4, 5, 8, 12, 14).size == 4:
+        warn(f"{fields.path}: {k} taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
+    camera = read_camera(fields, matrix, k, _size(fields, number, reading), lens)
+    key = f"port{number}"
+    if key not in fields:
         return camera
-    port = fields.fields(f"port{number}")
-    x, y, z = port.vector("normal", 3).tolist()
-    numbers: dict[str, Any] = {name: port.number(name) for name in _PORT_LENGTHS}
-    return behind_port(fields, f"port{number}", camera, **numbers, normal=(x, y, z))
+    port = fields.fields(key)
+    shape = port.text("shape") if "shape" in port else FlatPort.shape
+    if shape not in PORTS:
+        raise port.fault("shape", f"is {shape}; {' or '.join(PORTS)} expected")
+    return read_port(fields, key, camera, PORTS[shape])
 
 
 def _size(fields: Fields, number: str, reading: ReadOptions) -> tuple[int, int]:

@@ -12,16 +12,26 @@ from camera_calib.formats.colmap import (
     model_files,
     read_colmap,
     write_colmap,
-    write_flatport,
+    write_refractive,
 )
 from camera_calib.formats.fields import read_text, read_yaml
+from camera_calib.formats.gyroflow import KEY, read_gyroflow
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
+from camera_calib.formats.metashape import is_metashape, read_metashape, write_metashape
+from camera_calib.formats.mrcal import SUFFIX, mrcal_files, read_mrcal, write_mrcal
 from camera_calib.formats.opencv import read_opencv, write_opencv
-from camera_calib.formats.rigs import ReadOptions
-from camera_calib.formats.ros import SUFFIXES, read_ros, ros_files, write_ros
+from camera_calib.formats.rigs import ReadOptions, file_each
+from camera_calib.formats.ros import SUFFIXES, read_ros, write_ros
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, read_rig, write_rig
 
-PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "port", "k3", "rational", "prism", "covariance", "m"
+K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "k3", "rational", "prism", "covariance", "mount"
+FISHEYE, FLAT, DOME = FisheyeLens.model, FlatPort.shape, DomePort.shape
+_PINHOLE = frozenset({K3, RATIONAL, PRISM})
+_ALL = _PINHOLE | {FISHEYE, FLAT, DOME, COVARIANCE, MOUNT}
+_COLMAP = frozenset({K3, RATIONAL, FISHEYE})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +41,7 @@ class CalibrationFormat:
     name: str
     title: str
     holds: frozenset[str]
+    """More than cameras with k1 k2 p1 p2: terms, lenses, ports, and what belongs to the rig."""
     read: Callable[[Path, ReadOptions], Rig]
     write: Callable[[Path, Rig], list[Path]]
     targets: Callable[[Path, Rig], list[Path]]
@@ -52,11 +63,16 @@ def _itself(path: Path, rig: Rig) -> list[Path]:
     return [path]
 
 
+def _not_written(path: Path, rig: Rig) -> list[Path]:
+    del rig
+    raise CalibrationError(f"{path}: lens profiles are read only: choose another --to")
+
+
 _FORMATS = (
     CalibrationFormat(
         name="rig",
         title="rig.json of this project",
-        holds=frozenset({PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT}),
+        holds=_ALL,
         read=_read_own,
         write=_write_own,
         targets=_itself,
@@ -64,7 +80,7 @@ _FORMATS = (
     CalibrationFormat(
         name="opencv",
         title="OpenCV YAML or XML",
-        holds=frozenset({PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT}),
+        holds=_ALL,
         read=read_opencv,
         write=write_opencv,
         targets=_itself,
@@ -72,23 +88,23 @@ _FORMATS = (
     CalibrationFormat(
         name="colmap",
         title="COLMAP model and rig_config.json",
-        holds=frozenset({K3, RATIONAL}),
+        holds=_COLMAP,
         read=read_colmap,
         write=write_colmap,
         targets=model_files,
     ),
     CalibrationFormat(
-        name="flatport",
-        title="Refractive COLMAP cameras with FLATPORT",
-        holds=frozenset({PORT, K3, RATIONAL}),
+        name="refractive",
+        title="Refractive COLMAP cameras with FLATPORT or DOMEPORT",
+        holds=_COLMAP | {FLAT, DOME},
         read=read_colmap,
-        write=write_flatport,
+        write=write_refractive,
         targets=model_files,
     ),
     CalibrationFormat(
         name="kalibr",
         title="Kalibr camchain YAML",
-        holds=frozenset(),
+        holds=frozenset({FISHEYE}),
         read=read_kalibr,
         write=write_kalibr,
         targets=_itself,
@@ -96,10 +112,34 @@ _FORMATS = (
     CalibrationFormat(
         name="ros",
         title="ROS camera_info YAML",
-        holds=frozenset({K3, RATIONAL}),
+        holds=frozenset({K3, RATIONAL, FISHEYE}),
         read=read_ros,
         write=write_ros,
-        targets=ros_files,
+        targets=file_each,
+    ),
+    CalibrationFormat(
+        name="metashape",
+        title="Metashape calibration XML",
+        holds=frozenset({K3, FISHEYE}),
+        read=read_metashape,
+        write=write_metashape,
+        targets=_itself,
+    ),
+    CalibrationFormat(
+        name="mrcal",
+        title="mrcal .cameramodel",
+        holds=_PINHOLE,
+        read=read_mrcal,
+        write=write_mrcal,
+        targets=mrcal_files,
+    ),
+    CalibrationFormat(
+        name="gyroflow",
+        title="Gyroflow lens profile",
+        holds=frozenset(),
+        read=read_gyroflow,
+        write=_not_written,
+        targets=_not_written,
     ),
 )
 FORMATS = {each.name: each for each in _FORMATS}
@@ -138,7 +178,7 @@ def of_target(path: Path) -> CalibrationFormat:
     """
     if path.name in CAMERA_FILES:
         return FORMATS["colmap"]
-    by_suffix = {".json": "rig", ".xml": "opencv"}
+    by_suffix = {".json": "rig", ".xml": "opencv", SUFFIX: "mrcal"}
     if path.suffix.lower() not in by_suffix:
         raise CalibrationError(f"{path}: name the format with --to: {', '.join(FORMATS)}")
     return FORMATS[by_suffix[path.suffix.lower()]]
@@ -150,6 +190,8 @@ def _of_folder(path: Path) -> str | None:
             return _of_file(path / name)
     if (path / RIG_CONFIG).is_file():
         return "colmap"
+    if any(path.glob(f"*{SUFFIX}")):
+        return "mrcal"
     files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
     return "ros" if files and all(_of_file(file) == "ros" for file in files) else None
 
@@ -157,11 +199,16 @@ def _of_folder(path: Path) -> str | None:
 def _of_file(path: Path) -> str | None:
     suffix = path.suffix.lower()
     if suffix in (".txt", ".bin"):
-        ports = any(record.port for record in read_records(path))
-        return "flatport" if ports else "colmap"
+        ports = any(record.refraction for record in read_records(path))
+        return "refractive" if ports else "colmap"
+    if suffix == SUFFIX:  # may be larger than others
+        return "mrcal"
     text = read_text(path)
     if suffix == ".json":
-        return "colmap" if text.lstrip().startswith("[") else "rig"
+        other = "gyroflow" if f'"{KEY}"' in text else "rig"
+        return "colmap" if text.lstrip().startswith("[") else other
+    if suffix == ".xml" and is_metashape(text):
+        return "metashape"
     if suffix == ".xml" or text.startswith("%YAML:1.") or "!!opencv-matrix" in text:
         return "opencv"
     if suffix in SUFFIXES:

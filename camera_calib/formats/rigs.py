@@ -1,7 +1,7 @@
 """Rigs assembled from files, and with parts removed or added."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, camera_name
 from camera_calib.freedom import POSE
+from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig
 
@@ -32,6 +33,8 @@ class ReadOptions:
     """Length of one unit of the file's translations."""
     camera: str | None = None
     """The one camera that is wanted."""
+    lens: str | None = None
+    """Lens of cameras whose file does not name it: a key of `LENS_NAMES`."""
 
     def size(self, path: Path) -> tuple[int, int]:
         """Width and height for a file that does not state them.
@@ -69,6 +72,21 @@ def assemble(
         body_from_rig=UNKNOWN_MOUNT,
         source=f"{tool} file {path.name}",
     )
+
+
+def file_each(path: Path, rig: Rig, suffix: str = ".yaml") -> list[Path]:
+    """Files of formats that have one for each camera: the path, or those in it when it is a folder.
+
+    Raises:
+        CalibrationError: several cameras should go into one file.
+    """
+    if len(rig.cameras) == 1:
+        return [path]
+    if path.suffix:
+        raise CalibrationError(
+            f"{path}: {len(rig.cameras)} cameras have as many files: name a folder for them"
+        )
+    return [path / f"{name}{suffix}" for name in rig.cameras]
 
 
 def default_names(count: int) -> list[str]:
@@ -150,11 +168,14 @@ def own_keys(fields: Fields, rig: Rig) -> Rig:
 
 
 def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
-    """Every camera of a rig behind a flat port; the covariance of replaced numbers is dropped.
+    """Every camera of a rig behind a port; the covariance of replaced numbers is dropped.
 
     Args:
         rig: cameras in air, or behind ports some of whose numbers change.
-        port: by field of `FlatPort`: lengths in metres, indices, `normal`.
+        port: by field of `FlatPort` or `DomePort`: lengths in metres, indices, `normal`.
+
+    Raises:
+        CalibrationError: a camera has a port of another shape, or a value is out of range.
     """
     changed = {"normal_x", "normal_y"} if "normal" in port else set()
     changed |= set(port)
@@ -167,8 +188,16 @@ def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
 
 
 def _with_port(camera: Camera, port: Mapping[str, Any]) -> Camera:
-    old = camera.port if camera.port.parameters else FlatPort(n_water=1.0)
-    return replace(camera, port=replace(old, **dict(port)))
+    if not camera.port.parameters:
+        kind = DomePort if "outer_radius_m" in port else FlatPort
+        return replace(camera, port=kind(**{"n_water": 1.0, **port}))
+    unknown = set(port) - set(asdict(camera.port))
+    if unknown:
+        raise CalibrationError(
+            f"{camera.port.words}: has no {', '.join(sorted(unknown))}: convert with --drop-port "
+            "first, then state the other port"
+        )
+    return replace(camera, port=replace(camera.port, **dict(port)))
 
 
 def in_air(rig: Rig) -> Rig:

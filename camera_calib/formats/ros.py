@@ -17,11 +17,17 @@ from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml, write_yaml
-from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
-from camera_calib.formats.rigs import ReadOptions, assemble
+from camera_calib.formats.opencv_model import (
+    LENS_NAMES,
+    camera_matrix,
+    distortion,
+    is_fisheye,
+    read_camera,
+)
+from camera_calib.formats.rigs import ReadOptions, assemble, file_each
 from camera_calib.rig import Rig
 
-_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14)}
+_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 SUFFIXES = (".yaml", ".yml")
 
 
@@ -75,7 +81,7 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
         projection = np.hstack([camera_matrix(camera), np.zeros((3, 1))])
         write_yaml(path, _document(names[0], camera, np.eye(3), projection))
         return [path]
-    files = ros_files(path, rig)
+    files = file_each(path, rig)
     first, second = rig.cameras.values()
     size = (first.width_px, first.height_px)
     second_from_first = rig.cam_from_rig[names[1]]
@@ -83,8 +89,10 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
         raise CalibrationError(f"{path}: ROS rectifies pairs of one picture size only")
     if float(np.linalg.norm(second_from_first.translation)) == 0.0:
         raise CalibrationError(f"{path}: the cameras have no baseline to rectify along")
+    # A fisheye is rectified to the pinhole of its focal length: no such picture holds all of it.
+    k1, k2 = (np.zeros(5) if is_fisheye(one) else distortion(one) for one in (first, second))
     _, _, p1, p2, *_ = cv2.stereoRectify(
-        camera_matrix(first), distortion(first), camera_matrix(second), distortion(second), size,
+        camera_matrix(first), k1, camera_matrix(second), k2, size,
         second_from_first.rotation.as_matrix(), second_from_first.translation[:, None],
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
     )  # fmt: skip
@@ -97,19 +105,6 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
     return files
 
 
-def ros_files(path: Path, rig: Rig) -> list[Path]:
-    """The files that writing a rig would replace.
-
-    Raises:
-        CalibrationError: a pair should go into one file.
-    """
-    if len(rig.cameras) == 1:
-        return [path]
-    if path.suffix:
-        raise CalibrationError(f"{path}: a pair has two files: name a folder for them")
-    return [path / f"{name}.yaml" for name in rig.cameras]
-
-
 _ONE = (RigidTransform.identity(),)
 
 
@@ -120,7 +115,7 @@ def _camera(fields: Fields) -> Camera:
     key = "distortion_coefficients"
     k = fields.vector(key, 0, *_MODELS[model])
     size = (fields.size("image_width"), fields.size("image_height"))
-    return read_camera(fields, "camera_matrix", key if k.size else None, size)
+    return read_camera(fields, "camera_matrix", key if k.size else None, size, LENS_NAMES[model])
 
 
 def _projection(fields: Fields) -> Array:
@@ -172,12 +167,13 @@ def _rectified(second_from_first: RigidTransform, axis: int) -> tuple[Array, Arr
 
 def _document(name: str, camera: Camera, rotation: Array, projection: Array) -> Any:
     k = distortion(camera)
+    model = {4: "equidistant", 5: "plumb_bob"}.get(k.size, "rational_polynomial")
     return {
         "image_width": camera.width_px,
         "image_height": camera.height_px,
         "camera_name": name,
         "camera_matrix": _matrix(camera_matrix(camera)),
-        "distortion_model": "plumb_bob" if k.size == 5 else "rational_polynomial",
+        "distortion_model": model,
         "distortion_coefficients": _matrix(k[None]),
         "rectification_matrix": _matrix(rotation),
         "projection_matrix": _matrix(projection),

@@ -42,7 +42,11 @@ _CLEAR_PX = 2.0
 """Distance kept from other edges, which are blurred too."""
 _LEAST_PX = 1.0
 _FEWEST_PIXELS = 25
-_WORST_MISFIT = 0.2
+_WORST_MISFIT, _WORST_NOISY_MISFIT = 0.2, 0.35
+"""Largest rms of what a fit leaves over the contrast: where noise does not explain it, and where it
+does."""
+_NOISES = 2.0
+"""What a fit leaves is noise up to this many standard deviations of the picture's."""
 _LEAST_CONTRAST = 0.001
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
 
@@ -131,17 +135,25 @@ def fit_corners(
         high = np.ceil(seen.max(axis=0)).astype(int) + room
         part = picture[low[1] : high[1], low[0] : high[0]]
         light = _light(part)
+        noise = _NOISES**2 * _noise_variance(light) / _WHITE_NOISE
         light = cv2.GaussianBlur(light, (0, 0), _BLUR_PX)
         fits[inside], states[inside] = _fit_corners(
-            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]), reach, arm
+            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]), reach, arm, noise
         )
         fits[inside, :2] += low
     return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
 
 
+def _noise_variance(light: Array) -> float:
+    """Variance of white noise in a picture, from what no edge or slope has (Immerkaer 1996)."""
+    mask = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+    rough = np.abs(cv2.filter2D(light, cv2.CV_64F, mask))
+    return float(np.median(rough) / (0.6745 * 6.0)) ** 2
+
+
 @compiled
 def _fit_corners(
-    picture: Array, near: Array, steps: Array, reach: float, arm: float
+    picture: Array, near: Array, steps: Array, reach: float, arm: float, noise: float
 ) -> tuple[Array, NDArray[np.intp]]:
     out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
     side = 2 * _HALF_PX + 1
@@ -162,7 +174,9 @@ def _fit_corners(
             states[i] = NOT_SETTLED
             continue
         variance = cost / (count - 9)
-        if abs(best[5]) < _LEAST_CONTRAST or variance > (_WORST_MISFIT * best[5]) ** 2:
+        contrast2 = best[5] * best[5]
+        allowed = min(_WORST_MISFIT**2 * contrast2 + noise, _WORST_NOISY_MISFIT**2 * contrast2)
+        if abs(best[5]) < _LEAST_CONTRAST or variance > allowed:
             states[i] = UNLIKE_A_CORNER
             continue
         inverse = np.linalg.inv(normal + 1e-12 * np.eye(9))

@@ -27,9 +27,9 @@ from camera_calib.targets.corners import (
     fit_corners,
 )
 from camera_calib.targets.grow import (
-    chessboard_size,
     from_neighbours,
     grown_chessboard,
+    largest_chessboard,
     spans_board,
 )
 from camera_calib.targets.target import (
@@ -43,10 +43,15 @@ from camera_calib.targets.target import (
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _FEWEST_POINTS = 6
-_FARTHEST_OFF = 0.2
-"""Largest distance of a point from its prediction by its neighbours, in squares."""
-_WEAKEST = 0.15
-"""Contrast of a corner over the middle one of the picture."""
+_FARTHEST_OFF, _ALWAYS_NEAR = 0.2, 0.02
+"""Largest distance of a point from its prediction by its neighbours, in squares; one that is always
+allowed."""
+_FARTHEST_OVER_MIDDLE = 10.0
+"""The same over the middle one of the picture: a lens bends all of a board."""
+_WEAKEST = 0.1
+"""Contrast of a corner over the middle one of those near it: part of a target may be in shade."""
+_ALIKE_NEAR = 9
+"""Corners whose contrast is compared with, the corner itself among them."""
 _SECOND_LOOK = 0.5
 """Factor of the smaller window for points that did not fit."""
 SMALL_PX, LARGE_PX = 1000, 2000
@@ -145,9 +150,30 @@ def as_grey(picture: Picture) -> Grey:
 
 
 def _no_chessboard(target: Target, grey: Grey) -> str:
-    wanted = f"no chessboard of {target.columns}x{target.rows} inner corners with all its sides"
-    seen = chessboard_size(reduced(grey, SMALL_PX).picture)
-    return wanted if seen is None else f"{wanted}; one of {seen[0]}x{seen[1]}, or a part, is seen"
+    """What was found in place of the whole chessboard."""
+    board = largest_chessboard(reduced(grey, SMALL_PX).picture)
+    if board is None:
+        return f"no chessboard is found, of {target.columns}x{target.rows} inner corners or another"
+    sides, wanted = sorted(board.shape[:2]), sorted(target.shape)
+    if sides[0] <= wanted[0] and sides[1] <= wanted[1]:
+        return _in_part(target, np.isfinite(board[..., 0]), {})
+    return (
+        f"a chessboard of {sides[1]}x{sides[0]} inner corners is seen, or a part of one, not one "
+        f"of {target.columns}x{target.rows}"
+    )
+
+
+def _in_part(target: Target, seen: NDArray[np.bool_], dropped: Mapping[str, int]) -> str:
+    """Why a chessboard of which only some corners are found, (rows, columns), is not used."""
+    sides = sorted(np.ptp(at) + 1 if len(at) else 0 for at in np.nonzero(seen))
+    counts = "" if sides == sorted(target.shape) else "its counts are others, or "
+    why = "; ".join(f"{count}: {reason}" for reason, count in dropped.items())
+    return (
+        f"{int(seen.sum())} inner corners are found, in {sides[1]}x{sides[0]}, of the "
+        f"{target.columns}x{target.rows} of the target, of which half and a quarter of each outer "
+        f"row and column are needed: {counts}glare, shadow, a hand or the picture's border hides "
+        "the others" + (f" ({why})" if why else "")
+    )
 
 
 def _refined(target: Target, grey: Grey, near: Array) -> Detection:
@@ -161,7 +187,10 @@ def _refined(target: Target, grey: Grey, near: Array) -> Detection:
         order = _numbering(target, near, corners)
         near, corners = near[order], corners.take(order)
     corners = _without_astray(target, corners)
-    corners = _second_look(target, grey, corners)
+    fitted = -1
+    while int((corners.states == FITTED).sum()) > fitted:
+        fitted = int((corners.states == FITTED).sum())
+        corners = _second_look(target, grey, corners)
     used = corners.states == FITTED
     seen = np.isfinite(near).all(axis=1)
     counts = {
@@ -176,7 +205,7 @@ def _refined(target: Target, grey: Grey, near: Array) -> Detection:
         refused = f"only {int(used.sum())} of {len(used)} points, {needed}"
         return Detection(pixels=None, refused=f"{refused} ({why})" if why else refused)
     if target.kind == "chessboard" and not spans_board(used.reshape(target.shape)):
-        return Detection(pixels=None, refused=_no_chessboard(target, grey))
+        return Detection(pixels=None, refused=_in_part(target, used.reshape(target.shape), dropped))
     return Detection(pixels=corners.pixels, sigma_px=corners.sigma_px, dropped=dropped)
 
 
@@ -225,8 +254,10 @@ def _without_astray(target: Target, corners: Corners) -> Corners:
     if target.is_ambiguous:  # of such chessboards the first square may be white
         contrast *= np.sign(np.median(contrast))
     astray = np.zeros(len(fitted), dtype=np.bool_)
-    faint = contrast < _WEAKEST * max(float(np.median(contrast)), 0.0)
-    astray[fitted] = (off > _FARTHEST_OFF) | faint
+    nearest = cKDTree(board).query(board, k=min(_ALIKE_NEAR, len(board)))[1]
+    faint = contrast < _WEAKEST * np.maximum(np.median(contrast[nearest], axis=1), 0.0)
+    usual = max(_ALWAYS_NEAR, _FARTHEST_OVER_MIDDLE * float(np.median(off)))
+    astray[fitted] = (off > min(_FARTHEST_OFF, usual)) | faint
     return corners.without(astray, ASTRAY)
 
 

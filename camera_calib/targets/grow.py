@@ -20,6 +20,7 @@ from camera_calib.targets.corners import fit_corners
 
 Place = tuple[int, int]
 Places = dict[Place, Array]
+"""Column and row on the board: pixel, and once fitted the contrast, turned so that it agrees."""
 
 _BLUR_PX = 1.5
 _APART_PX = 7
@@ -27,6 +28,9 @@ _FAINTEST = 0.02
 """Weakest saddle over the strongest."""
 _MOST_SADDLES = 600
 _MOST_STARTS = 25
+"""Saddles that squares are built from."""
+_MOST_SQUARES = 4
+"""Squares built from one of them."""
 _MOST_ROUNDS = 40
 _MOST_TRIES = 3
 _NEAR = 40
@@ -34,8 +38,10 @@ _ALIKE = 0.15
 """Least strength of a saddle over that of the stronger one next to which it stands in a start."""
 _OFF = 0.15
 """Largest distance of a grown corner from its prediction by its neighbours, in squares."""
-_WEAKEST = 0.2
-"""Contrast of a grown corner over the middle one of those it grows from."""
+_WEAKEST = 0.1
+"""Contrast of a grown corner over the middle one of those near it; a shadow may lie between."""
+_ALIKE_NEAR = 6
+"""Known corners whose contrast is compared with."""
 _FEWEST = 9
 _LONGEST = 100
 _LEAST_SHARE = 0.5
@@ -87,13 +93,20 @@ def chessboard_size(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
     Returns:
         The size of the largest chessboard, or part of one, in the picture; None: there is none.
     """
-    sizes: list[tuple[int, int]] = [
-        _spread(known).shape[:2] for known in _boards(picture, _LONGEST)
-    ]
-    if not sizes:
+    board = largest_chessboard(picture)
+    if board is None:
         return None
-    shorter, longer = sorted(max(sizes, key=math.prod))
+    shorter, longer = sorted(board.shape[:2])
     return longer, shorter
+
+
+def largest_chessboard(picture: NDArray[np.uint8]) -> Array | None:
+    """(rows, columns, 2) corners of the largest chessboard, or part of one, in a picture.
+
+    NaN where a corner was not found; None: there is none.
+    """
+    boards = [_spread(known) for known in _boards(picture, _LONGEST)]
+    return max(boards, key=lambda board: math.prod(board.shape[:2]), default=None)
 
 
 def _spread(known: Places) -> Array:
@@ -102,8 +115,8 @@ def _spread(known: Places) -> Array:
     low = places.min(axis=0)
     columns, rows = np.ptp(places, axis=0) + 1
     grid = np.full((rows, columns, 2), np.nan)
-    for (x, y), pixel in known.items():
-        grid[y - low[1], x - low[0]] = pixel
+    for (x, y), corner in known.items():
+        grid[y - low[1], x - low[0]] = corner[:2]
     return grid
 
 
@@ -117,12 +130,16 @@ def _boards(picture: NDArray[np.uint8], longest: int) -> Iterator[Places]:
             continue
         known = _grow(picture, start, longest)
         if len(known) >= _FEWEST:
-            taken = np.concatenate([taken, list(known.values())])
+            taken = np.concatenate([taken, np.array(list(known.values()))[:, :2]])
             yield known
 
 
 def _starts(picture: NDArray[np.uint8]) -> Iterator[Places]:
-    """Four saddles each that stand like the corners of a square, strongest first."""
+    """Four saddles each that stand like the corners of a square, strongest first.
+
+    Seen at a slant, the corners of a square may lie farther apart than those of other
+    parallelograms of the same board: several are tried from one saddle.
+    """
     saddles, angles, strengths = _saddles(picture)
     if len(saddles) < 4:
         return
@@ -135,6 +152,7 @@ def _starts(picture: NDArray[np.uint8]) -> Iterator[Places]:
         if len(turned) < 2:
             continue
         a, along = turned[0], saddles[turned[0]] - saddles[c]
+        squares = 0
         for b in turned[1:]:
             down = saddles[b] - saddles[c]
             cross = along[0] * down[1] - along[1] * down[0]
@@ -146,9 +164,11 @@ def _starts(picture: NDArray[np.uint8]) -> Iterator[Places]:
                 right, below = (a, b) if cross > 0 else (b, a)
                 corners = {(0, 0): c, (1, 0): right, (0, 1): below, (1, 1): d}
                 yield {place: saddles[i] for place, i in corners.items()}
-                count += 1
+                squares += 1
+            if squares == _MOST_SQUARES:
                 break
-        if count >= _MOST_STARTS:
+        count += squares > 0
+        if count == _MOST_STARTS:
             return
 
 
@@ -179,10 +199,10 @@ def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
     middle = float(np.median(contrast))
     if not np.isfinite(middle) or (contrast / middle < _WEAKEST).any():
         return {}
-    known: Places = dict(zip(start, fits.pixels, strict=True))
+    known: Places = dict(zip(start, np.column_stack([fits.pixels, contrast]), strict=True))
     tries: Counter[Place] = Counter()
     for _ in range(_MOST_ROUNDS):
-        fresh = _next_to(picture, known, middle, tries)
+        fresh = _next_to(picture, known, tries)
         grown = _knit(known | fresh)
         if grown.keys() <= known.keys() or not grown:
             break
@@ -193,12 +213,16 @@ def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
 
 
 def _knit(known: Places) -> Places:
-    """Only corners with two known neighbours: one that fits by chance off the board has fewer."""
+    """Only corners with known ones along both ways: one that fits by chance off the board has none.
+
+    A known corner may lie one further, for a shadow's edge or a glare hides whole rows.
+    """
+    near = (-2, -1, 1, 2)
     while True:
         kept = {
-            (x, y): pixel
-            for (x, y), pixel in known.items()
-            if sum(n in known for n in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1))) >= 2
+            (x, y): corner
+            for (x, y), corner in known.items()
+            if any((x + a, y) in known for a in near) and any((x, y + a) in known for a in near)
         }
         if len(kept) == len(known):
             return known
@@ -211,13 +235,11 @@ def _alternating(places: NDArray[np.int_]) -> Array:
     return signs
 
 
-def _next_to(
-    picture: NDArray[np.uint8], known: Places, middle: float, tries: Counter[Place]
-) -> Places:
+def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -> Places:
     """Corners that fit next to known ones, or beyond one that is hidden.
 
-    Their contrast must alternate as the known ones', of which `middle` is the middle one. A place
-    is tried a limited number of times, counted in `tries`.
+    Their contrast must alternate as that of the known ones near them. A place is tried a limited
+    number of times, counted in `tries`.
     """
     far = 2 if len(known) >= _FEWEST else 1
     moves = [(a, b) for a in range(-far, far + 1) for b in range(-far, far + 1)]
@@ -228,15 +250,19 @@ def _next_to(
         return {}
     tries.update(worth)
     tried = np.array(worth)
-    board, pixels = np.array(list(known), dtype=np.float64), np.array(list(known.values()))
+    board, corners = np.array(list(known), dtype=np.float64), np.array(list(known.values()))
+    pixels = np.ascontiguousarray(corners[:, :2])
     expected, steps = from_neighbours(board, pixels, tried.astype(np.float64))
     fits = fit_corners(picture, expected, steps)
-    good = _alternating(tried) * fits.contrast / middle > _WEAKEST
+    nearest = cKDTree(board).query(tried, k=min(_ALIKE_NEAR, len(board)))[1]
+    contrast = _alternating(tried) * fits.contrast
+    good = contrast / np.median(corners[nearest, 2], axis=1) > _WEAKEST
     miss = (fits.pixels[good] - expected[good])[..., None]
     off = np.linalg.norm(np.linalg.solve(steps[good], miss)[..., 0], axis=1)
     good[good] = off < _OFF
     keys = [(int(x), int(y)) for x, y in tried[good]]
-    return dict(zip(keys, fits.pixels[good], strict=True))
+    found = np.column_stack([fits.pixels[good], contrast[good]])
+    return dict(zip(keys, found, strict=True))
 
 
 def from_neighbours(

@@ -5,15 +5,14 @@ pixels as taken depend on stations, on points and on every parameter of the rig.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from camera_calib.camera import Camera, pose_jacobian
-from camera_calib.freedom import POSE as TURN_AND_SHIFT
+from camera_calib.camera import pose_jacobian
+from camera_calib.freedom import wanted_slopes
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.database import Observations
@@ -52,8 +51,8 @@ class Pixels:
 class RigState:
     """One guess of all unknowns."""
 
-    cameras: tuple[Camera, ...]
-    cam_from_rig: tuple[RigidTransform, ...]
+    rig: Rig
+    """The cameras that took pictures, the reference first."""
     turns: Array
     """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
     centres: Array
@@ -121,8 +120,11 @@ def start_state(
         as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
     ]
     return RigState(
-        cameras=tuple(rig.cameras[name] for name in names),
-        cam_from_rig=tuple(rig.cam_from_rig[name] * reference.inv() for name in names),
+        rig=replace(
+            rig,
+            cameras={name: rig.cameras[name] for name in names},
+            cam_from_rig={name: rig.cam_from_rig[name] * reference.inv() for name in names},
+        ),
         turns=np.array([p.rotation.as_matrix() for p in poses]),
         centres=np.array([p.translation for p in poses]),
         points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
@@ -131,34 +133,29 @@ def start_state(
 
 
 def exact_observations(
-    state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
+    state: RigState, pixels: Pixels, fields: Sequence[str], *, lever: bool
 ) -> LinearObservations:
     """The observations linearised; those that no ray explains do not count."""
-    count = len(fields) + 3 * lever
     arm = state.points[pixels.point] - state.centres[pixels.station]
     by_point = np.zeros((len(arm), 2, 3))
-    by_shared, miss = np.zeros((len(arm), 2, count)), np.zeros((len(arm), 2))
-    for c, name in enumerate(names):
-        pose, turn = state.cam_from_rig[c], state.cam_from_rig[c].rotation.as_matrix()
-        mine = [(g, f.split(".")[1]) for g, f in enumerate(fields) if f.split(".")[0] == name]
-        # A camera's pixels depend on itself, and on its place on the rig.
-        every = (*state.cameras[c].parameters, *TURN_AND_SHIFT)
-        source = np.array([every.index(parameter) for _, parameter in mine], dtype=np.int64)
-        target = np.array([g for g, _ in mine], dtype=np.int64)
-        seen = np.flatnonzero(pixels.camera == c)
-        for first in range(0, len(seen), _BLOCK):
-            rows = seen[first : first + _BLOCK]
+    rest = np.zeros((len(arm), 2, len(fields) + 3 * lever + 1))
+    for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
+        camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
+        source, target = (np.append(at, -1) for at in wanted_slopes(state.rig, fields, name))
+        every = np.flatnonzero(pixels.camera == c)
+        for first in range(0, len(every), _BLOCK):
+            rows = every[first : first + _BLOCK]
             turned = _in_rig(arm, rows, pixels.station, state.turns) @ turn.T
-            at, by_cam, by_camera = state.cameras[c].project_jacobian(turned + pose.translation)
+            at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
+            miss = (at - pixels.taken[rows])[..., None]
+            slopes = np.concatenate([by_camera, pose_jacobian(by_cam, turned), miss], axis=2)
             _put(
-                rows, at, by_cam, turn, state.turns, pixels.station, pixels.taken,
-                np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2),
-                source, target, by_point, by_shared, miss,
+                rows, by_cam @ turn, state.turns, pixels.station, slopes, source, target,
+                by_point, rest,
             )  # fmt: skip
     return LinearObservations(
-        starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm,
-        by_shared=by_shared, miss=miss,
-    )  # fmt: skip
+        starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm, rest=rest
+    )
 
 
 @compiled
@@ -174,44 +171,30 @@ def _in_rig(arm: Array, rows: Indices, station: Indices, turns: Array) -> Array:
 
 @compiled
 def _put(
-    rows: Indices, at: Array, by_cam: Array, turn: Array, turns: Array, station: Indices,
-    taken: Array, slopes: Array, source: Indices, target: Indices,
-    by_point: Array, by_shared: Array, miss: Array,
+    rows: Indices, by_rig: Array, turns: Array, station: Indices, slopes: Array, source: Indices,
+    target: Indices, by_point: Array, rest: Array,
 ) -> None:  # fmt: skip
     """Put what one camera sees in its rows, in place; what it does not see stays as it is.
 
     Args:
         rows: (N,) observations of the camera.
-        at: (N, 2) where it sees them; NaN where it does not.
-        by_cam: (N, 2, 3) slopes by the point in the camera's frame.
-        turn: (3, 3) rotation of `cam_from_rig`.
+        by_rig: (N, 2, 3) slopes by the point along the axes of the rig.
         turns: (F, 3, 3) of `world_from_rig`.
         station: (O,).
-        taken: (O, 2).
-        slopes: (N, 2, K) by all that the camera may depend on.
+        slopes: (N, 2, K) by all that the camera may depend on, last the miss; NaN if not seen.
         source: (G',) which of the K are wanted.
-        target: (G',) and where among what is shared they go.
+        target: (G',) and where in `rest` they go.
         by_point: (O, 2, 3) to fill.
-        by_shared: (O, 2, G) the same way.
-        miss: (O, 2) the same way.
+        rest: (O, 2, G + 1) the same way.
     """
-    cam_from_world = np.empty((3, 3))
     for i in range(rows.shape[0]):
         o = rows[i]
-        if not (np.isfinite(at[i, 0]) and np.isfinite(at[i, 1])):
+        if not np.isfinite(slopes[i, 0, -1] + slopes[i, 1, -1]):
             continue
-        for k in range(3):
-            for j in range(3):
-                value = 0.0
-                for m in range(3):
-                    value += turn[k, m] * turns[station[o], j, m]
-                cam_from_world[k, j] = value
+        turn = turns[station[o]]
         for row in range(2):
-            miss[o, row] = at[i, row] - taken[o, row]
-            u, v, w = by_cam[i, row, 0], by_cam[i, row, 1], by_cam[i, row, 2]
+            u, v, w = by_rig[i, row, 0], by_rig[i, row, 1], by_rig[i, row, 2]
             for j in range(3):
-                by_point[o, row, j] = (
-                    u * cam_from_world[0, j] + v * cam_from_world[1, j] + w * cam_from_world[2, j]
-                )
+                by_point[o, row, j] = u * turn[j, 0] + v * turn[j, 1] + w * turn[j, 2]
             for g in range(source.shape[0]):
-                by_shared[o, row, target[g]] = slopes[i, row, source[g]]
+                rest[o, row, target[g]] = slopes[i, row, source[g]]

@@ -4,19 +4,15 @@ Every pixel depends on the pose of one station, on one point, and perhaps on a f
 all share. With R, c the pose `world_from_rig` and X the point, the pixel depends on
 R^T (X - c) only, so that with P its slopes by X those by a small rotation about the axes of the
 world (R' = exp(turn) R) and by a motion of c are P [X - c]x and -P. Points are eliminated one by
-one (Schur complement; Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6),
-which leaves a block-sparse system of the stations with a border of what is shared.
+one, which leaves a block-sparse system of the stations with a border of what is shared
+(`alice_survey.base.block_solver`).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import bsr_matrix, csc_matrix
-from scipy.sparse.linalg import splu
 
+from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices, product_of
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
@@ -26,7 +22,6 @@ LEAST_POINTS = 4
 """A station that sees fewer is not determined."""
 TURN_INFORMATION = 1.0
 """1/rad^2 of a station whose position is given: a line does not determine its own roll."""
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,10 +36,13 @@ class LinearObservations:
     """(O, 2, 3) slopes of the pixel by the point in the world."""
     arm: Array
     """(O, 3) vector from the station's origin to the point, in the world."""
-    by_shared: Array
-    """(O, 2, G) slopes by what all share; G may be 0."""
-    miss: Array
-    """(O, 2) computed pixel minus the observed one."""
+    rest: Array
+    """(O, 2, G + 1) slopes by what all share, then computed pixel minus the observed one."""
+
+    @property
+    def miss(self) -> Array:
+        """(O, 2) computed pixel minus the observed one."""
+        return self.rest[..., -1]
 
     @property
     def seen_by(self) -> Indices:
@@ -54,44 +52,46 @@ class LinearObservations:
 
     def weighted(self, weights: Array) -> "LinearObservations":
         """The same observations with the squares of each weighted, (O,)."""
-        root = np.sqrt(weights)[:, None]
-        return replace(
-            self,
-            by_point=root[:, :, None] * self.by_point,
-            by_shared=root[:, :, None] * self.by_shared,
-            miss=root * self.miss,
-        )
+        root = np.sqrt(weights)[:, None, None]
+        return replace(self, by_point=root * self.by_point, rest=root * self.rest)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ReducedSystem:
-    """The normal equations of stations and of what is shared, the points eliminated."""
+class PointEquations(Equations):
+    """Normal equations of stations and of what is shared, the points eliminated."""
 
-    pointers: Indices
-    """(F + 1,) and (B,): the blocks of every station's row, and their columns, sorted."""
-    columns: Indices
-    blocks: Array
-    """(B, 6, 6) blocks."""
-    border: Array
-    """(6 F, G) block between stations and what is shared."""
-    shared: Array
-    """(G, G) block of what is shared."""
-    slope: Array
-    """(6 F,) gradient by the stations."""
-    shared_slope: Array
-    """(G,) gradient by what is shared."""
+    linear: LinearObservations
     point_inverse: Array
     """(P, 3, 3) covariance of the points where all else is known."""
 
-    @property
-    def matrix(self) -> csc_matrix:
-        """(6 F, 6 F) matrix of the stations."""
-        size = POSE * (len(self.pointers) - 1)
-        blocks = (self.blocks, self.columns, self.pointers)
-        return csc_matrix(bsr_matrix(blocks, shape=(size, size), blocksize=(POSE, POSE)))
+    def point_steps(self, step: BlockStep) -> Array:
+        """How far every point moves, (P, 3), where all else takes a step."""
+        return self.follow(step.poses, np.append(step.shared, 1.0))
+
+    def follow(self, poses: Array, rest: Array) -> Array:
+        """Motions (P, 3) of points by steps (F, 6) of stations and (G + 1,) of the `rest`."""
+        linear = self.linear
+        return _follow(
+            linear.starts, linear.station, linear.by_point, linear.arm, linear.rest,
+            self.point_inverse, poses, rest,
+        )  # fmt: skip
+
+    def point_covariances(self, blocks: Array) -> Array:
+        """Covariance of every point, (P, 3, 3), from those of its stations.
+
+        With G = -V^-1 W^T what a point does when its stations move: V^-1 + G C G^T.
+
+        Args:
+            blocks: (B, 6, 6) covariances between the stations that see a point in common.
+        """
+        linear = self.linear
+        return _point_covariances(
+            linear.starts, linear.station, linear.by_point, linear.arm, self.point_inverse,
+            self.pointers, self.columns, blocks,
+        )  # fmt: skip
 
 
-def reduce_points(linear: LinearObservations, stations: int) -> ReducedSystem:
+def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
     """Eliminate the points.
 
     Args:
@@ -103,42 +103,17 @@ def reduce_points(linear: LinearObservations, stations: int) -> ReducedSystem:
     rows, columns = np.nonzero(meets)
     pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
     columns = columns.astype(np.int64)
-    blocks, border, shared, slope, shared_slope, inverse = _reduce(
-        linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
-        pointers, columns,
-    )  # fmt: skip
-    return ReducedSystem(
-        pointers=pointers,
-        columns=columns,
-        blocks=blocks,
-        border=border.reshape(POSE * stations, -1),
-        shared=shared,
-        slope=slope.ravel(),
-        shared_slope=shared_slope,
-        point_inverse=inverse,
+    blocks, border, shared, inverse = _reduce(
+        linear.starts, linear.station, linear.by_point, linear.arm, linear.rest, pointers, columns
     )
-
-
-def solver_of(matrix: csc_matrix, free: NDArray[np.bool_]) -> Callable[[Array], Array]:
-    """A solver of symmetric equations whose unknowns that are not free are held at zero."""
-    kept = np.flatnonzero(free)
-    cut: Any = matrix[kept][:, kept]
-    factor_of: Any = splu
-    factor = factor_of(
-        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+    return PointEquations(
+        pointers=pointers, columns=columns, blocks=blocks, border=border, shared=shared,
+        free=np.ones((stations, POSE), dtype=np.bool_), linear=linear, point_inverse=inverse,
     )  # fmt: skip
-
-    def solve(right: Array) -> Array:
-        solution = np.zeros_like(right)
-        solution[kept] = factor.solve(np.ascontiguousarray(right[kept]))
-        return solution
-
-    return solve
 
 
 @compiled
-def _mark(starts: Indices, station: Indices, meets: NDArray[np.bool_]) -> None:
+def _mark(starts: Indices, station: Indices, meets: Flags) -> None:
     """Mark the pairs of stations that see a point in common, in place."""
     for p in range(starts.shape[0] - 1):
         for a in range(starts[p], starts[p + 1]):
@@ -185,33 +160,30 @@ def _invert(m: Array, out: Array) -> None:
 
 @compiled
 def _reduce(
-    starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
+    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array,
     pointers: Indices, columns: Indices,
-) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
-    points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, by_shared.shape[2]
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, rest.shape[2]
     longest = 0
     for p in range(points):
         longest = max(longest, starts[p + 1] - starts[p])
     blocks = np.zeros((columns.shape[0], 6, 6))
     border, shared = np.zeros((stations, 6, count)), np.zeros((count, count))
-    slope, shared_slope = np.zeros((stations, 6)), np.zeros(count)
     inverse = np.empty((points, 3, 3))
     pose = np.empty((longest, 2, 6))
     cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
-    together, solved = np.empty((3, count)), np.empty((3, count))
-    own, pull = np.empty((3, 3)), np.empty(3)
+    own, together, solved = np.empty((3, 3)), np.empty((3, count)), np.empty((3, count))
     for p in range(points):
         first, end = starts[p], starts[p + 1]
-        own[:], pull[:], together[:] = 0.0, 0.0, 0.0
+        own[:], together[:] = 0.0, 0.0
         for o in range(first, end):
             for row in range(2):
                 for i in range(3):
                     s = by_point[o, row, i]
-                    pull[i] += s * miss[o, row]
                     for j in range(3):
                         own[i, j] += s * by_point[o, row, j]
                     for g in range(count):
-                        together[i, g] += s * by_shared[o, row, g]
+                        together[i, g] += s * rest[o, row, g]
         _invert(own, inverse[p])
         back = inverse[p]
         for i in range(3):
@@ -238,19 +210,13 @@ def _reduce(
             k, s = o - first, station[o]
             at = find_block(pointers, columns, s, s)
             for i in range(6):
-                for j in range(6):
-                    blocks[at, i, j] += (
-                        pose[k, 0, i] * pose[k, 0, j] + pose[k, 1, i] * pose[k, 1, j]
-                    )
-                value = pose[k, 0, i] * miss[o, 0] + pose[k, 1, i] * miss[o, 1]
-                for j in range(3):
-                    value -= gain[k, i, j] * pull[j]
-                slope[s, i] += value
                 u, v = pose[k, 0, i], pose[k, 1, i]
+                for j in range(6):
+                    blocks[at, i, j] += u * pose[k, 0, j] + v * pose[k, 1, j]
                 x, y, z = gain[k, i, 0], gain[k, i, 1], gain[k, i, 2]
                 for g in range(count):
                     border[s, i, g] += (
-                        u * by_shared[o, 0, g] + v * by_shared[o, 1, g]
+                        u * rest[o, 0, g] + v * rest[o, 1, g]
                         - x * together[0, g] - y * together[1, g] - z * together[2, g]
                     )  # fmt: skip
             for other in range(first, end):
@@ -260,29 +226,26 @@ def _reduce(
                     for j in range(6):
                         block[i, j] -= x * cross[m, j, 0] + y * cross[m, j, 1] + z * cross[m, j, 2]
             for g in range(count):
-                u, v = by_shared[o, 0, g], by_shared[o, 1, g]
+                u, v = rest[o, 0, g], rest[o, 1, g]
                 if u == 0.0 and v == 0.0:  # of another camera
                     continue
-                for h in range(g + 1):
-                    shared[g, h] += u * by_shared[o, 0, h] + v * by_shared[o, 1, h]
-                shared_slope[g] += u * miss[o, 0] + v * miss[o, 1]
+                for h in range(min(g + 1, count - 1)):
+                    shared[g, h] += u * rest[o, 0, h] + v * rest[o, 1, h]
         for g in range(count):
             for j in range(3):
-                shared_slope[g] -= solved[j, g] * pull[j]
                 for h in range(g + 1):
                     shared[g, h] -= together[j, g] * solved[j, h]
     for g in range(count):
         for h in range(g):
             shared[h, g] = shared[g, h]
-    return blocks, border, shared, slope, shared_slope, inverse
+    return blocks, border, shared, inverse
 
 
 @compiled
-def moved_points(
-    starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
-    inverse: Array, steps: Array, shared_step: Array,
+def _follow(
+    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array,
+    inverse: Array, steps: Array, rest_steps: Array,
 ) -> Array:  # fmt: skip
-    """How far every point moves, (P, 3), where stations take steps (F, 6)."""
     points = starts.shape[0] - 1
     moved = np.empty((points, 3))
     pose, pull = np.empty((2, 6)), np.empty(3)
@@ -291,11 +254,11 @@ def moved_points(
         for o in range(starts[p], starts[p + 1]):
             by_pose(by_point[o], arm[o], pose)
             for row in range(2):
-                value = miss[o, row]
+                value = 0.0
                 for i in range(6):
                     value += pose[row, i] * steps[station[o], i]
-                for g in range(shared_step.shape[0]):
-                    value += by_shared[o, row, g] * shared_step[g]
+                for g in range(rest_steps.shape[0]):
+                    value += rest[o, row, g] * rest_steps[g]
                 for i in range(3):
                     pull[i] -= by_point[o, row, i] * value
         for i in range(3):
@@ -306,24 +269,10 @@ def moved_points(
 
 
 @compiled
-def point_covariances(
+def _point_covariances(
     starts: Indices, station: Indices, by_point: Array, arm: Array, inverse: Array,
     pointers: Indices, columns: Indices, blocks: Array,
 ) -> Array:  # fmt: skip
-    """Covariance of every point, (P, 3, 3), from those of its stations.
-
-    With G = -V^-1 W^T what a point does when its stations move: V^-1 + G C G^T.
-
-    Args:
-        starts: as `LinearObservations`; so `station`, `by_point` and `arm`.
-        station: (O,).
-        by_point: (O, 2, 3).
-        arm: (O, 3).
-        inverse: (P, 3, 3) V^-1.
-        pointers: pattern of `blocks`, as in `ReducedSystem`.
-        columns: of the matrix.
-        blocks: (B, 6, 6) covariances between the stations that see a point in common.
-    """
     points = starts.shape[0] - 1
     found = inverse.copy()
     longest = 0
@@ -362,23 +311,16 @@ class Gauge:
         """Take stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
         self.middle = centres.mean(axis=0)
         arms = centres - self.middle
-        count = len(arms)
-        self.motions = np.zeros((count, POSE, 7 if scale_free else 6))
+        self.motions = np.zeros((len(arms), POSE, 7 if scale_free else 6))
         self.motions[:, :3, :3] = np.eye(3)
         self.motions[:, 3:] = self.of_points(centres)
-        self.weights = np.tile([depth**2] * 3 + [1.0] * 3, count)
-        flat = self.flat
-        self.spread = np.linalg.inv(flat.T @ (self.weights[:, None] * flat))
-        far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
-        self.held = list(range(POSE))
+        self.weighed = self.motions * np.array([depth**2] * 3 + [1.0] * 3)[:, None]
+        self.spread = np.linalg.inv(product_of(self.motions, self.weighed))
+        self.held: Flags = np.zeros((len(arms), POSE), dtype=np.bool_)
+        self.held[0] = True
         if scale_free:
-            along = int(np.argmax(np.abs(arms[far] - arms[0])))
-            self.held.append(POSE * far + 3 + along)
-
-    @property
-    def flat(self) -> Array:
-        """(6 F, 6 or 7)."""
-        return self.motions.reshape(-1, self.motions.shape[2])
+            far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
+            self.held[far, 3 + int(np.argmax(np.abs(arms[far] - arms[0])))] = True
 
     def of_points(self, points: Array) -> Array:
         """What the same motions do to (N, 3) points, (N, 3, 6 or 7)."""
@@ -390,3 +332,38 @@ class Gauge:
         if found.shape[2] > POSE:
             found[:, :, POSE] = arms
         return found
+
+    def motion_in(self, steps: Array) -> Array:
+        """How much of each motion (6 or 7, G) steps (F, 6, G) of the stations are."""
+        found: Array = self.spread @ product_of(self.weighed, steps)
+        return found
+
+    def placed(self, equations: PointEquations, given: Array) -> PointEquations:
+        """The equations of steps on top of a motion of the whole block, which is what is shared.
+
+        Pictures say nothing of that motion, so that given poses alone determine it. Steps and
+        motion are apart, since the information on a vague place would be lost in that on the shape.
+
+        Args:
+            equations: of the stations, with nothing shared.
+            given: (F, 6) information on each pose from elsewhere; those held move with the whole.
+        """
+        count = self.motions.shape[2]
+        border, shared = given[:, :, None] * self.motions, np.zeros((count + 1, count + 1))
+        shared[:-1, :-1] = product_of(self.motions, border)
+        border = np.concatenate([border, equations.border], axis=2)
+        found = equations.knowing(given[:, :, None] * np.eye(POSE))
+        return replace(found, border=border, shared=shared)
+
+    def shape_blocks(self, equations: Equations) -> Array:
+        """Covariances (B, 6, 6) of stations without these motions, where the equations have blocks.
+
+        Args:
+            equations: of the stations, whatever holds their place.
+        """
+        along = equations.covariance_times(self.weighed) @ self.spread
+        across = along - 0.5 * self.motions @ self.motion_in(along)
+        rows, columns = equations.rows, equations.columns
+        blocks = self.motions[rows] @ across[columns].swapaxes(1, 2)
+        blocks += across[rows] @ self.motions[columns].swapaxes(1, 2)
+        return equations.covariance_blocks() - blocks

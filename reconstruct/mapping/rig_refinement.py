@@ -9,6 +9,7 @@ The model is then rebuilt on the refined rig: settings `refine_port`, `refine_ri
 `port.json` (values, sigmas, correlation) and `rig.json` (the refined rig) next to the model.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,20 +17,19 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.sparse import block_diag, csc_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.block_solver import BlockStep, Flags, inverse_of, minimise
 from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.errors import CalibrationError, ReconstructionError, warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PortRecord
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
-from camera_calib.freedom import Prior, pose_names, value
-from camera_calib.ports.values import lowest
+from camera_calib.freedom import Prior, at_bound, moved, pose_names, value
 from camera_calib.rig import Covariance, Rig, write_rig
-from reconstruct.mapping.arrays import Indices, first_pictures, frames_of
+from reconstruct.mapping.arrays import Indices, cross_matrices, first_pictures, frames_of
 from reconstruct.mapping.bundle import move_points
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_observations import (
@@ -45,14 +45,12 @@ from reconstruct.mapping.normal_equations import (
     POSE,
     TURN_INFORMATION,
     LinearObservations,
-    ReducedSystem,
-    moved_points,
+    PointEquations,
     reduce_points,
-    solver_of,
 )
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
-from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
+from reconstruct.mapping.robust import cauchy_cost, cauchy_weights, sigma_of, variance_of
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
@@ -70,9 +68,9 @@ _MOST_CORRELATED = 0.98
 """Correlation of navigation's errors from one station to the next."""
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
-_ROUNDS = 20
-_SETTLED = 3e-2
-"""Steps of all parameters, in their sigmas, at which the adjustment ends."""
+_STEPS = 20
+_SETTLED = 0.05
+"""Length of a step of all parameters, in sigmas, at which the adjustment ends."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,15 +97,14 @@ class RigFit:
 
     def to_json(self) -> dict[str, Any]:
         """What `port.json` says."""
-        sigmas = np.sqrt(np.diag(self.covariance))
-        scale = 1.0 / np.where(sigmas > 0, sigmas, np.inf)
+        known = Covariance(parameters=self.parameters, matrix=self.covariance)
         return {
             "parameters": list(self.parameters),
             "before": self.before.tolist(),
             "after": self.after.tolist(),
             "prior_sigmas": self.prior_sigmas.tolist(),
-            "sigmas": sigmas.tolist(),
-            "correlation": (self.covariance * np.outer(scale, scale)).tolist(),
+            "sigmas": list(known.sigmas.values()),
+            "correlation": known.correlation.tolist(),
             "sigma_px": self.sigma_px,
             "observations": self.observations,
             "stations": len(self.stations),
@@ -149,43 +146,24 @@ def fit_rig(
     names = list(seen.cameras)
     frames = frames_of(mapped.model)
     pixels, ids = choose_pixels(mapped, seen, names, frames)
-    prior = _prior(rig, names, port=port, pose=pose)
-    fields = prior.parameters
-    fixes = fixes if pose else None
-    information = np.zeros((len(fields) + 3 * (fixes is not None),) * 2)
-    information[: len(fields), : len(fields)] = prior.information
-    if fixes is not None:
-        information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
-    _hold_baseline(information, fields, rig, names)
-    state = start_state(mapped, rig, names, frames, ids)
-    fixes = None if fixes is None else _with_correlation(fixes, state)
-    first = _values(state, fields, names, lever=fixes is not None)
-    drift = np.zeros(len(first))
-    variance = np.nan
-    for _ in range(_ROUNDS):
-        linear = exact_observations(state, pixels, fields, names, lever=fixes is not None)
-        left = _spare(pixels, len(frames), len(first)) / (2 * len(pixels.station))
-        sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
-        weights = cauchy_weights(linear.miss, sigma)
-        now = variance_of(linear.miss, weights, left)
-        linear = linear.weighted(weights)
-        variance = now if np.isnan(variance) else min(variance, now)
-        step = _step(linear, state, variance, information, drift, fixes)
-        state = _moved(state, pixels, step, linear, fields, names)
-        drift = drift + step.shared
-        if np.all(np.abs(step.shared) < _SETTLED * np.sqrt(np.diag(step.covariance))):
-            break
-    else:
-        warn(f"the rig's refinement did not settle in {_ROUNDS} rounds: trust it with care")
-    parameters = (*fields, *(_LEVER if fixes is not None else ()))
-    after = _values(state, fields, names, lever=fixes is not None)
+    problem = _SurveyProblem(
+        pixels, start_state(mapped, rig, names, frames, ids), fixes if pose else None,
+        _prior(rig, names, port=port, pose=pose),
+    )  # fmt: skip
+    found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
+    if not found.is_settled:
+        warn(f"the rig's refinement did not settle in {_STEPS} steps: trust it with care")
+    covariance = inverse_of(found.equations.information)
+    state = found.guess.state
+    sigma_px, variance = found.noise.tolist()
+    weights = cauchy_weights(found.guess.linear.miss, sigma_px)
     return RigFit(
-        rig=_as_rig(rig, names, state, fields, step.covariance, fixes is not None),
-        parameters=parameters,
-        before=first,
-        after=after,
-        prior_sigmas=np.sqrt(np.diag(_inverse(information))),
-        covariance=step.covariance,
+        rig=_as_rig(rig, names, state, problem.fields, covariance, problem.fixes is not None),
+        parameters=(*problem.fields, *(_LEVER if problem.fixes is not None else ())),
+        before=problem.values(problem.start.state),
+        after=problem.values(state),
+        prior_sigmas=np.sqrt(np.diag(inverse_of(problem.information))),
+        covariance=covariance,
         sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
         stations=tuple(
@@ -195,6 +173,131 @@ def fit_rig(
         points=state.points,
         point_ids=ids,
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _RigGuess:
+    """One guess of all unknowns, with what is seen from there."""
+
+    state: RigState
+    linear: LinearObservations
+    lost: Indices
+    """Observations that no ray explains."""
+
+
+class _SurveyProblem:
+    """Stations, points and rig of a survey as `minimise` adjusts them."""
+
+    def __init__(
+        self, pixels: Pixels, state: RigState, fixes: NavigationFixes | None, prior: Prior
+    ) -> None:
+        self.pixels, self.prior, self.fields = pixels, prior, prior.parameters
+        self.fixes = None if fixes is None else _with_correlation(fixes, state)
+        self.information = np.zeros((len(self.fields) + 3 * (fixes is not None),) * 2)
+        self.information[: len(self.fields), : len(self.fields)] = prior.information
+        if fixes is not None:
+            self.information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
+        _hold_baseline(self.information, self.fields, state.rig)
+        self.first_lever = state.lever
+        self.left = self._spare(state) / (2 * len(pixels.station))
+        self.start = self._seen(state)
+
+    def _spare(self, state: RigState) -> int:
+        observations, points = len(self.pixels.station), self.pixels.points
+        stations, shared = len(state.centres), len(self.information)
+        spare = 2 * observations - 3 * points - POSE * stations
+        if spare < 10 * shared:
+            raise ReconstructionError(
+                f"{observations} observations of {points} points from {stations} stations do not "
+                f"determine {shared} parameters of the rig: leave refine_port and refine_rig off"
+            )
+        return spare
+
+    def _seen(self, state: RigState) -> _RigGuess:
+        linear = exact_observations(state, self.pixels, self.fields, lever=self.fixes is not None)
+        lost = np.flatnonzero(~linear.by_point[:, 0].any(axis=1))
+        return _RigGuess(state=state, linear=linear, lost=lost)
+
+    def values(self, state: RigState) -> Array:
+        """(G,) values of what is shared."""
+        lever = state.lever[: 0 if self.fixes is None else 3]
+        return np.array([*(value(state.rig, name) for name in self.fields), *lever])
+
+    def misfit(self, state: RigState) -> Array:
+        """(G,) what is shared minus what is known of it."""
+        off = np.concatenate([self.prior.misfit(state.rig), state.lever - self.first_lever])
+        return off[: len(self.information)]
+
+    def fix_rows(self, state: RigState) -> Array:
+        """Fixes in sigmas: slopes (F, 3, 10) by station and lever arm, then misses; 0 for none."""
+        if self.fixes is None:
+            return np.zeros((len(state.turns), 3, POSE + 4))
+        arms = state.turns @ state.lever
+        unit = np.broadcast_to(np.eye(3), state.turns.shape)
+        off = (state.centres + arms - self.fixes.positions)[:, :, None]
+        rows = np.concatenate([-cross_matrices(arms), unit, state.turns, off], axis=2)
+        rows = rows / self.fixes.sigmas[:, :, None]
+        return np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
+
+    def noise(self, guess: _RigGuess) -> Array:
+        """Sigma of a keypoint's coordinate for the weights, and variance that scales them."""
+        miss = guess.linear.miss
+        sigma = sigma_of(miss, guess.linear.seen_by, len(guess.state.centres))
+        return np.array([sigma, variance_of(miss, cauchy_weights(miss, sigma), self.left)])
+
+    def cost(self, guess: _RigGuess, noise: Array) -> float:
+        """Half of Cauchy's loss, prior and fixes."""
+        if np.setdiff1d(guess.lost, self.start.lost).size:
+            return math.inf
+        sigma, variance = noise
+        off, fixes = self.misfit(guess.state), self.fix_rows(guess.state)[..., -1]
+        pixels = cauchy_cost(guess.linear.miss, sigma) / variance
+        return 0.5 * float(pixels + off @ self.information @ off + (fixes**2).sum())
+
+    def linearised(self, guess: _RigGuess, noise: Array) -> PointEquations:
+        """Normal equations with the points eliminated."""
+        sigma, variance = noise
+        weights = cauchy_weights(guess.linear.miss, sigma)
+        weights[self.start.lost] = 0.0
+        found = reduce_points(guess.linear.weighted(weights / variance), len(guess.state.centres))
+        found.shared[:-1, :-1] += self.information
+        found.shared[:-1, -1] += self.information @ self.misfit(guess.state)
+        if self.fixes is None:
+            found.free[0] = False
+            return found
+        rows = self.fix_rows(guess.state)
+        square = rows.swapaxes(1, 2) @ rows
+        square[:, -1, -1] = 0.0
+        fixed = np.flatnonzero(rows.any(axis=(1, 2)))
+        square[fixed[:, None], np.arange(3), np.arange(3)] += TURN_INFORMATION
+        found.border[:, :, -4:] += square[:, :POSE, POSE:]
+        found.shared[-4:, -4:] += square[:, POSE:, POSE:].sum(axis=0)
+        return found.knowing(square[:, :POSE, :POSE])
+
+    def moved(
+        self, guess: _RigGuess, equations: PointEquations, step: BlockStep
+    ) -> _RigGuess | None:
+        """The guess after a step; None where a camera would leave its range."""
+        state, count = guess.state, len(self.fields)
+        try:
+            rig = moved(state.rig, self.fields, step.shared[:count])
+        except CalibrationError:
+            return None
+        return self._seen(
+            RigState(
+                rig=rig,
+                turns=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ state.turns,
+                centres=state.centres + step.poses[:, 3:],
+                points=state.points + equations.point_steps(step),
+                lever=state.lever if self.fixes is None else state.lever + step.shared[count:],
+            )
+        )
+
+    def at_bound(self, guess: _RigGuess) -> Flags:
+        """Parameters that have their least value; the lever arm has none."""
+        bound = np.zeros(len(self.information), dtype=np.bool_)
+        bound[: len(self.fields)] = at_bound(guess.state.rig, self.fields)
+        return bound
 
 
 def _with_correlation(fixes: NavigationFixes, state: RigState) -> NavigationFixes:
@@ -210,17 +313,6 @@ def _with_correlation(fixes: NavigationFixes, state: RigState) -> NavigationFixe
     spread = np.maximum((off**2).sum(axis=0), 1e-12)
     correlation = np.clip((off[1:] * off[:-1]).sum(axis=0) / spread, 0.0, _MOST_CORRELATED)
     return replace(fixes, sigmas=fixes.sigmas * np.sqrt((1.0 + correlation) / (1.0 - correlation)))
-
-
-def _spare(pixels: Pixels, stations: int, shared: int) -> int:
-    spare = 2 * len(pixels.station) - 3 * pixels.points - POSE * stations
-    if spare < 10 * shared:
-        raise ReconstructionError(
-            f"{len(pixels.station)} observations of {pixels.points} points from {stations} "
-            f"stations do not determine {shared} parameters of the rig: leave refine_port and "
-            "refine_rig off"
-        )
-    return spare
 
 
 def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
@@ -244,137 +336,14 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
     return Prior.of_rig(rig, known).and_also(loose) if known else loose
 
 
-def _hold_baseline(
-    information: Array, fields: Sequence[str], rig: Rig, names: Sequence[str]
-) -> None:
+def _hold_baseline(information: Array, fields: Sequence[str], rig: Rig) -> None:
     """Keep the length of a baseline that no calibration measured, in place."""
-    known = rig.sigmas
-    for name in names:
-        at = [
-            fields.index(n)
-            for n in (f"{name}.{axis}" for axis in TURN_AND_SHIFT[3:])
-            if n in fields
-        ]
-        if len(at) < 3 or f"{name}.x_m" in known:
-            continue
-        along = rig.cam_from_rig[name].translation
-        along = along / np.linalg.norm(along)
-        information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
-
-
-def _values(state: RigState, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
-    now = Rig(
-        cameras=dict(zip(names, state.cameras, strict=True)),
-        cam_from_rig=dict(zip(names, state.cam_from_rig, strict=True)),
-        body_from_rig=RigidTransform.identity(),
-        source="",
-    )
-    values = [value(now, name) for name in fields]
-    return np.array([*values, *(state.lever if lever else [])])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _RigStep:
-    stations: Array
-    shared: Array
-    covariance: Array
-    reduced: ReducedSystem
-
-
-def _step(
-    linear: LinearObservations,
-    state: RigState,
-    variance: float,
-    information: Array,
-    drift: Array,
-    fixes: NavigationFixes | None,
-) -> _RigStep:
-    """One Gauss-Newton step of stations and shared parameters, and the shared ones' covariance."""
-    count = len(state.centres)
-    reduced = reduce_points(linear, count)
-    shared = reduced.shared / variance + information
-    pull = reduced.shared_slope / variance + information @ drift
-    border, slope = reduced.border / variance, reduced.slope / variance
-    matrix = csc_matrix(reduced.matrix / variance)
-    free = np.ones(POSE * count, dtype=np.bool_)
-    if fixes is None:
-        free[:POSE] = False
-    else:
-        extra = np.zeros((count, POSE, POSE))
-        for s in np.flatnonzero(np.isfinite(fixes.positions + fixes.sigmas).all(axis=1)).tolist():
-            arm = state.turns[s] @ state.lever
-            x, y, z = arm
-            rows = np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3), state.turns[s]])
-            rows = rows / fixes.sigmas[s][:, None]
-            off = (state.centres[s] + arm - fixes.positions[s]) / fixes.sigmas[s]
-            extra[s] = rows[:, :POSE].T @ rows[:, :POSE]
-            extra[s][[0, 1, 2], [0, 1, 2]] += TURN_INFORMATION
-            at = slice(POSE * s, POSE * s + POSE)
-            border[at, -3:] += rows[:, :POSE].T @ rows[:, POSE:]
-            slope[at] += rows[:, :POSE].T @ off
-            shared[-3:, -3:] += rows[:, POSE:].T @ rows[:, POSE:]
-            pull[-3:] += rows[:, POSE:].T @ off
-        matrix = csc_matrix(matrix + block_diag(list(extra), format="csc"))
-    solve = solver_of(matrix, free)
-    back, plain = solve(border), solve(slope)
-    covariance = _inverse(shared - border.T @ back)
-    moved = -covariance @ (pull - border.T @ plain)
-    return _RigStep(
-        stations=(-plain - back @ moved).reshape(count, POSE),
-        shared=moved,
-        covariance=covariance,
-        reduced=reduced,
-    )
-
-
-def _inverse(matrix: Array) -> Array:
-    """Inverse of a symmetric matrix whose parameters have many units."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    inverse: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return (inverse + inverse.T) / 2.0
-
-
-def _moved(
-    state: RigState,
-    pixels: Pixels,
-    step: _RigStep,
-    linear: LinearObservations,
-    fields: Sequence[str],
-    names: Sequence[str],
-) -> RigState:
-    points = moved_points(
-        linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, linear.miss,
-        step.reduced.point_inverse, step.stations, step.shared,
-    )  # fmt: skip
-    cameras, poses = list(state.cameras), list(state.cam_from_rig)
-    for c, name in enumerate(names):
-        changes: dict[str, float] = {}
-        motion = np.zeros(POSE)
-        for g, field in enumerate(fields):
-            camera, parameter = field.split(".")
-            if camera != name:
-                continue
-            if parameter in cameras[c].parameters:
-                changes[parameter] = max(
-                    lowest(parameter), cameras[c].parameter(parameter) + step.shared[g]
-                )
-            else:
-                motion[TURN_AND_SHIFT.index(parameter)] = step.shared[g]
-        cameras[c] = cameras[c].with_parameters(changes)
-        poses[c] = RigidTransform.from_components(
-            poses[c].translation + motion[3:],
-            Rotation.from_rotvec(motion[:3]) * poses[c].rotation,
-        )
-    turns = Rotation.from_rotvec(step.stations[:, :3]).as_matrix() @ state.turns
-    lever = state.lever + step.shared[-3:] if len(step.shared) > len(fields) else state.lever
-    return RigState(
-        cameras=tuple(cameras),
-        cam_from_rig=tuple(poses),
-        turns=turns,
-        centres=state.centres + step.stations[:, 3:],
-        points=state.points + points,
-        lever=lever,
-    )
+    for name, pose in rig.cam_from_rig.items():
+        shift = [f"{name}.{axis}" for axis in TURN_AND_SHIFT[3:]]
+        if set(shift) <= set(fields) and shift[0] not in rig.sigmas:
+            at = [fields.index(field) for field in shift]
+            along = pose.translation / np.linalg.norm(pose.translation)
+            information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
 
 
 def _as_rig(
@@ -386,9 +355,9 @@ def _as_rig(
     lever: bool,
 ) -> Rig:
     reference = rig.cam_from_rig[names[0]]
-    cameras = {**rig.cameras, **dict(zip(names, state.cameras, strict=True))}
+    cameras = {**rig.cameras, **state.rig.cameras}
     moved: Mapping[str, RigidTransform] = {
-        name: pose * reference for name, pose in zip(names, state.cam_from_rig, strict=True)
+        name: pose * reference for name, pose in state.rig.cam_from_rig.items()
     }
     body_from_rig = rig.body_from_rig
     if lever:

@@ -60,6 +60,12 @@ def cauchy_weights(misses: Array, sigma_px: float) -> Array:
     return weights
 
 
+def cauchy_cost(misses: Array, sigma_px: float) -> float:
+    """Cauchy's loss of (O, 2) residuals, px^2; the sum of squares where all are small."""
+    squares = loss_scale(sigma_px) ** 2
+    return squares * float(np.log1p((misses**2).sum(axis=1) / squares).sum())
+
+
 def variance_of(misses: Array, weights: Array, share_left: float) -> float:
     """Variance of one coordinate that makes `(J' W J)^-1` a covariance.
 

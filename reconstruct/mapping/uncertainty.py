@@ -21,8 +21,6 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -47,16 +45,9 @@ from reconstruct.mapping.normal_equations import (
     TURN_INFORMATION,
     Gauge,
     LinearObservations,
-    ReducedSystem,
-    moved_points,
-    point_covariances,
     reduce_points,
-    solver_of,
 )
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
-
-_CHUNK = 32
-"""Stations whose columns of the inverse are in memory at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,8 +101,7 @@ class CalibrationPart:
 
     def without(self, gauge: Gauge) -> "CalibrationPart":
         """The same minus what a motion of the whole block does, which does not change its shape."""
-        flat = self.stations.reshape(-1, self.stations.shape[2])
-        whole = gauge.spread @ gauge.flat.T @ (gauge.weights[:, None] * flat)
+        whole = gauge.motion_in(self.stations)
         return replace(
             self,
             stations=self.stations - gauge.motions @ whole,
@@ -152,23 +142,20 @@ def estimate(
     sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
     weights = cauchy_weights(linear.miss, sigma)
     variance = variance_of(linear.miss, weights, left)
-    linear = linear.weighted(weights)
-    reduced = reduce_points(linear, len(frames))
-    centres = _centres(model, frames)
+    linear = linear.weighted(weights / variance)
+    gauge = Gauge(
+        _centres(model, frames), float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free
+    )
     given = navigation_information(model, position_sigmas)
-    counts = np.bincount(linear.station, minlength=len(frames))
-    loose = counts < LEAST_POINTS
-    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
-    blocks = _inverse_blocks(reduced, variance, given, gauge, loose)
-    rows = np.repeat(np.arange(len(frames)), np.diff(reduced.pointers))
-    own = np.flatnonzero(rows == reduced.columns)
-    points = point_covariances(
-        linear.starts, linear.station, linear.by_point, linear.arm,
-        reduced.point_inverse, reduced.pointers, reduced.columns, blocks,
-    )  # fmt: skip
-    noise = variance * reduced.point_inverse
-    points += noise - reduced.point_inverse
-    frame_cov = blocks[own]
+    loose = np.bincount(linear.station, minlength=len(frames)) < LEAST_POINTS
+    equations = reduce_points(linear, len(frames))
+    equations = replace(equations, free=~(gauge.held | loose[:, None]))
+    if given is not None:
+        equations = gauge.placed(equations, given * ~loose[:, None])
+    blocks = gauge.shape_blocks(equations)
+    blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
+    points = equations.point_covariances(blocks)
+    frame_cov = blocks[equations.own]
     if calibration is not None:
         shape = calibration.without(gauge)
         frame_cov = frame_cov + shape.of_stations()
@@ -181,7 +168,7 @@ def estimate(
         frame_cov=frame_cov,
         point_ids=seen.point_ids,
         point_cov=points,
-        point_noise=noise,
+        point_noise=equations.point_inverse,
         sigma_px=float(np.sqrt(variance / weights.mean())),
     )
 
@@ -256,7 +243,7 @@ def pinhole_observations(
     points, local, pixels = seen.points, seen.in_cameras, seen.pixels
     order = np.argsort(seen.point, kind="stable")
     station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
-    miss = np.empty((len(order), 2))
+    rest = np.empty((len(order), 2, 1))
     centres = _centres(model, frames)
     for n, number in enumerate(seen.pictures.tolist()):
         image, rows = model.images[number], seen.of(n)
@@ -266,7 +253,7 @@ def pinhole_observations(
         slopes = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=-1)
         turn = image.cam_from_world().matrix()[:, :3]
         by_point[rows] = slopes.reshape(-1, 2, 3) @ turn
-        miss[rows] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
+        rest[rows, :, 0] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
         station[rows] = np.searchsorted(frames, image.frame_id)
     counts = np.bincount(seen.point, minlength=len(points))
     linear = LinearObservations(
@@ -274,52 +261,9 @@ def pinhole_observations(
         station=station[order],
         by_point=by_point[order],
         arm=(points[seen.point] - centres[station])[order],
-        by_shared=np.zeros((len(order), 2, 0)),
-        miss=miss[order],
+        rest=rest[order],
     )
     return linear, order.astype(np.int64)
-
-
-def _inverse_blocks(
-    reduced: ReducedSystem,
-    variance: float,
-    given: Array | None,
-    gauge: Gauge,
-    loose: NDArray[np.bool_],
-) -> Array:
-    """Covariances (B, 6, 6) between stations that see a point in common, without the gauge."""
-    matrix = csc_matrix(reduced.matrix / variance)
-    size = matrix.shape[0]
-    free = np.repeat(~loose, POSE)
-    if given is None:
-        free[gauge.held] = False
-    else:
-        matrix = csc_matrix(matrix + diags_array(given.ravel()))
-    solve = solver_of(matrix, free)
-    flat, spread = gauge.flat, gauge.spread
-    weighed = gauge.weights[:, None] * flat
-    along = solve(weighed)
-    middle = spread @ (weighed.T @ along) @ spread
-    count = size // POSE
-    blocks = np.empty_like(reduced.blocks)
-    motions, along = gauge.motions, along.reshape(count, POSE, -1)
-    for first in range(0, count, _CHUNK):
-        last = min(first + _CHUNK, count)
-        right = np.zeros((size, POSE * (last - first)))
-        right[POSE * first + np.arange(right.shape[1]), np.arange(right.shape[1])] = 1.0
-        columns = solve(right).reshape(count, POSE, last - first, POSE)
-        for s in range(first, last):
-            rows = slice(int(reduced.pointers[s]), int(reduced.pointers[s + 1]))
-            others = reduced.columns[rows]
-            plain = columns[others, :, s - first, :].swapaxes(1, 2)
-            blocks[rows] = (
-                plain
-                - motions[s] @ spread @ along[others].swapaxes(1, 2)
-                - along[s] @ spread @ motions[others].swapaxes(1, 2)
-                + motions[s] @ middle @ motions[others].swapaxes(1, 2)
-            )
-            blocks[rows][loose[others] | loose[s]] = np.nan
-    return blocks
 
 
 def navigation_information(model: pycolmap.Reconstruction, sigmas: Array | None) -> Array | None:
@@ -383,10 +327,10 @@ def calibration_part(
     frames = frames_of(mapped.model)
     pixels, ids = choose_pixels(mapped, seen, names, frames)
     state = start_state(mapped, rig, names, frames, ids)
-    linear = exact_observations(state, pixels, fields, names, lever=False)
+    linear = exact_observations(state, pixels, fields, lever=False)
     sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
-    linear = linear.weighted(cauchy_weights(linear.miss, sigma))
-    stations, points = _response(linear, len(frames), sigma**2, given)
+    linear = linear.weighted(cauchy_weights(linear.miss, sigma) / sigma**2)
+    stations, points = _response(linear, len(frames), given)
     at = [rig.covariance.parameters.index(name) for name in fields]
     return CalibrationPart(
         frames=frames,
@@ -397,27 +341,20 @@ def calibration_part(
     )
 
 
-def _response(
-    linear: LinearObservations, count: int, variance: float, given: Array | None
-) -> tuple[Array, Array]:
+def _response(linear: LinearObservations, count: int, given: Array | None) -> tuple[Array, Array]:
     """Slopes of stations (F, 6, G) and points (P, 3, G) by what is shared, in some gauge."""
-    reduced = reduce_points(linear, count)
-    matrix = csc_matrix(reduced.matrix / variance)
+    equations = reduce_points(linear, count)
     seeing = np.bincount(linear.station, minlength=count) >= LEAST_POINTS
-    free = np.repeat(seeing, POSE)
+    free = np.repeat(seeing[:, None], POSE, axis=1)
     if given is None:
-        free[:POSE] = False
+        free[0] = False
     else:
-        matrix = csc_matrix(matrix + diags_array(given.ravel()))
-    solve = solver_of(matrix, free)
-    shared = reduced.border.shape[1]
-    stations = -solve(reduced.border / variance).reshape(count, POSE, shared)
-    still = np.zeros_like(linear.miss)
+        equations = equations.knowing(given[:, :, None] * np.eye(POSE))
+    equations = replace(equations, free=free)
+    stations = equations.response
+    count = stations.shape[2]
     points = [
-        moved_points(
-            linear.starts, linear.station, linear.by_point, linear.arm, linear.by_shared, still,
-            reduced.point_inverse, np.ascontiguousarray(stations[:, :, g]), np.eye(shared)[g],
-        )
-        for g in range(shared)
-    ]  # fmt: skip
+        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
+        for g, unit in enumerate(np.eye(count, count + 1))
+    ]
     return stations, np.stack(points, axis=-1)

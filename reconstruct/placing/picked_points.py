@@ -20,7 +20,7 @@ _LARGEST_CONDITION = 1e8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Camera:
+class RegisteredPicture:
     """A registered picture: its camera, and where its pinhole stands in the model."""
 
     warp: PinholeWarp
@@ -58,7 +58,7 @@ class Spot:
 
 
 def find_spots(
-    picks: Sequence[Pick], cameras: Mapping[str, Camera]
+    picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> tuple[dict[str, Spot], dict[str, str]]:
     """Find every picked point that two or more registered pictures show.
 
@@ -95,7 +95,9 @@ def find_spots(
     return found, lost
 
 
-def _triangulate(name: str, picks: list[Pick], cameras: Mapping[str, Camera]) -> Spot | str:
+def _triangulate(
+    name: str, picks: list[Pick], cameras: Mapping[str, RegisteredPicture]
+) -> Spot | str:
     """The point that fits the picks best, or why there is none."""
     start = _nearest(picks, cameras)
     if isinstance(start, str):
@@ -135,7 +137,7 @@ def _worst(off: Array, picks: Sequence[Pick]) -> float:
 
 
 def _without_one(
-    point: Array, picks: list[Pick], off: Array, cameras: Mapping[str, Camera]
+    point: Array, picks: list[Pick], off: Array, cameras: Mapping[str, RegisteredPicture]
 ) -> list[Pick]:
     """Leave out the pick without which the others agree best; among many, the worst.
 
@@ -147,7 +149,7 @@ def _without_one(
     return choices[int(np.argmin(misses))]
 
 
-def _nearest(picks: Sequence[Pick], cameras: Mapping[str, Camera]) -> Array | str:
+def _nearest(picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> Array | str:
     """The point nearest to all rays, (3,)."""
     rays = [cameras[p.image].ray(np.array([p.x_px, p.y_px])) for p in picks]
     starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
@@ -168,7 +170,7 @@ def nearest_to_rays(starts: Array, ways: Array) -> Array | None:
 
 
 def _fit(
-    start: Array, picks: Sequence[Pick], cameras: Mapping[str, Camera]
+    start: Array, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> tuple[Array, Array, Array]:
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
     picked = np.array([[p.x_px, p.y_px] for p in picks])

@@ -45,7 +45,7 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.georeference import PlacementFit, fit_control, fit_navigation, level
-from reconstruct.placing.picked_points import Camera, find_spots
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.track import (
     TrackRow,
     placed_covariances,
@@ -349,7 +349,7 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
     if picked and picked.isdisjoint(r.image for r in task.records):
         raise WorkspaceError(f"no picture of the model is picked; {min(picked)} is not in it")
     cameras = {
-        record.image: Camera(warp=task.warps[record.camera], model_from_pinhole=pose)
+        record.image: RegisteredPicture(warp=task.warps[record.camera], model_from_pinhole=pose)
         for record, pose in zip(task.records, task.pinholes, strict=True)
     }
     spots, lost = find_spots(picks, cameras)

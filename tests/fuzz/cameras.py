@@ -217,12 +217,12 @@ TARGETS = (
         read=_read_folder,
     ),
     _calibration(
-        "FLATPORT cameras.txt", "text", "m/cameras.txt", _write("flatport", "m", small_rig),
+        "FLATPORT cameras.txt", "text", "m/cameras.txt", _write("refractive", "m", small_rig),
         read=_read_folder,
     ),
     _calibration(
         "FLATPORT cameras.bin", "binary", "m/cameras.bin",
-        _write("flatport", "m/cameras.bin", small_rig), read=_read_folder,
+        _write("refractive", "m/cameras.bin", small_rig), read=_read_folder,
     ),
     _calibration("target JSON", "json", "board.json", _board, read=read_board),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),

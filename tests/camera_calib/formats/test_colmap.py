@@ -15,13 +15,21 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from camera_calib.camera import Camera, flat_port_camera
 from camera_calib.formats.camera_files import MODELS
-from camera_calib.formats.colmap import read_colmap, write_colmap, write_flatport
+from camera_calib.formats.colmap import read_colmap, write_colmap, write_refractive
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
 from tests.cameras import changed
-from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, fault_of, rigs
+from tests.strategies_formats import (
+    BOTH_LENSES,
+    RATIONAL,
+    WIDE_RIG,
+    assert_same_geometry,
+    fault_of,
+    points_for,
+    rigs,
+)
 
 AIR = flat_port_camera(
     width_px=1920, height_px=1200, fx_px=705.5, fy_px=705.25, cx_px=963.5, cy_px=604.75,
@@ -55,14 +63,28 @@ def test_models_are_as_colmap_has_them(name: str) -> None:
     assert int(pycolmap.CameraModelId.__members__[name]) == number
     camera = pycolmap.Camera(model=name, width=9, height=9, params=np.ones(len(parameters)))
     stated = camera.params_info.split(", ")
-    if name in ("SIMPLE_RADIAL", "RADIAL"):  # COLMAP calls their first coefficient k or k1
+    if "RADIAL" in name:  # COLMAP calls their first coefficient k or k1
         stated = [{"k": "k1"}.get(each, each) for each in stated]
     assert tuple(stated) == parameters
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_projects_as_in_colmap(name: str, tmp_path: Path) -> None:
+    size = {"f": 700.5, "fx": 700.5, "fy": 702.25, "cx": 963.5, "cy": 604.75}
+    params = [size.get(each, 0.01 / (i + 1)) for i, each in enumerate(MODELS[name][1])]
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"1 {name} 1920 1200 {' '.join(map(str, params))}\n")
+    ours = read_colmap(path, ReadOptions()).cameras["1"].project(WIDE_RIG)
+    theirs = pycolmap.Camera(model=name, width=1920, height=1200, params=params)
+    known = np.isfinite(ours[:, 0])
+    assert known.sum() >= 40
+    seen = np.array([theirs.img_from_cam(point) for point in WIDE_RIG[known]])
+    np.testing.assert_allclose(ours[known], seen, atol=1e-8, rtol=0)
+
+
 @pytest.mark.parametrize("target", ["model", "model/cameras.bin"])
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs(RATIONAL, most=3))
+@given(rig=rigs(RATIONAL, lenses=BOTH_LENSES, most=3))
 def test_colmap_projects_as_we_do_from_what_it_reads(target: str, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         written = write_colmap(Path(folder) / target, rig)
@@ -80,14 +102,14 @@ def test_colmap_projects_as_we_do_from_what_it_reads(target: str, rig: Rig) -> N
         assert entry.ref_sensor == (i == 1)
         assert entry.camera.model == theirs.model
         np.testing.assert_array_equal(entry.camera.params, theirs.params)
-        points = POINTS_RIG
+        points = points_for(camera)
+        ours = camera.project(rig.cam_from_rig[name].apply(points))
         if i > 1:
             rigid = sensors.sensor_from_rig(theirs.sensor_id)
             assert rigid is not None
             np.testing.assert_allclose(entry.cam_from_rig.matrix(), rigid.matrix(), atol=1e-14)
             points = points @ rigid.matrix()[:, :3].T + rigid.matrix()[:, 3]
-        ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
-        known = np.isfinite(ours[:, 0])
+        known = np.isfinite(ours[:, 0]) & (points[:, 2] > 0.1)  # COLMAP sees nothing behind it
         assert known.any()
         seen = np.array([theirs.img_from_cam(point) for point in points[known]])
         np.testing.assert_allclose(seen, ours[known], atol=1e-8, rtol=0)
@@ -185,7 +207,7 @@ def test_a_rig_configuration_without_cameras_takes_them_in_order_and_says_so(
 
 def test_the_forks_text_is_a_line_of_lens_and_port(tmp_path: Path) -> None:
     rig = pair(WET)
-    write_flatport(tmp_path, rig)
+    write_refractive(tmp_path, rig)
     lines = (tmp_path / "cameras.txt").read_text().splitlines()
     assert lines[1].endswith("PARAMS[] OPTIONAL[REFRAC_MODEL REFRAC_PARAMS[]]")
     left, right = (line.split() for line in lines[3:])
@@ -202,7 +224,7 @@ def test_the_forks_text_is_a_line_of_lens_and_port(tmp_path: Path) -> None:
 
 
 def test_the_forks_binary_has_the_port_after_each_lens(tmp_path: Path) -> None:
-    write_flatport(tmp_path / "cameras.bin", pair(WET))
+    write_refractive(tmp_path / "cameras.bin", pair(WET))
     content = (tmp_path / "cameras.bin").read_bytes()
     assert struct.unpack_from("<QIiQQ", content) == (2, 1, 1, 1920, 1200)
     assert struct.unpack_from("<4di8d", content, 32) == (
@@ -216,7 +238,7 @@ def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
     text.write_text(
         "1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1 1.5 1.33\n2 PINHOLE 9 8 5 6 4 3\n"
     )
-    assert detect(text).name == "flatport"
+    assert detect(text).name == "refractive"
     dry = read_colmap(text, ReadOptions(camera="2")).cameras["2"]
     assert dry.port == NO_PORT
     binary = tmp_path / "cameras.bin"
@@ -227,7 +249,7 @@ def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
         + struct.pack("<IiQQ4di8d", 1, *lens, *port)
         + struct.pack("<IiQQ4di", 2, *lens, -1)
     )
-    assert detect(binary).name == "flatport"
+    assert detect(binary).name == "refractive"
     assert read_colmap(binary, ReadOptions(camera="1")).cameras["1"].n_water == 1.33
     assert read_colmap(binary, ReadOptions(camera="2")).cameras["2"] == dry
 
@@ -239,16 +261,56 @@ def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
     assert (camera.port.n_glass, camera.n_water) == (1.2, 1.2)
 
 
+def test_a_domeport_bends_light_as_the_forks_code_does(tmp_path: Path) -> None:
+    """Its way: the far hit of each sphere, refraction there; the inner radius comes first."""
+    centre, inner, thickness, indices = (
+        np.array([0.002, -0.001, 0.006]),
+        0.05,
+        0.007,
+        (1, 1.52, 1.334),
+    )
+    path = tmp_path / "cameras.txt"
+    numbers = [*centre, inner, thickness, *indices]
+    path.write_text(
+        "1 OPENCV_FISHEYE 1920 1200 700 701 963 604 0.02 -0.01 0.002 0.001 DOMEPORT "
+        f"{' '.join(map(str, numbers))}\n"
+    )
+    assert detect(path).name == "refractive"
+    (camera,) = read_colmap(path, ReadOptions()).cameras.values()
+    pixels = camera.frame_grid(7, 5).reshape(-1, 2)
+    _, rays = camera.in_air().unproject(pixels)
+    points = np.zeros_like(rays)
+    for radius, before, after in zip(
+        (inner, inner + thickness), indices, indices[1:], strict=False
+    ):
+        along = ((points - centre) * rays).sum(axis=1)
+        gap = ((points - centre) ** 2).sum(axis=1) - radius**2
+        points = points + (np.sqrt(along**2 - gap) - along)[:, None] * rays
+        normals = (points - centre) / radius
+        cos, ratio = (normals * rays).sum(axis=1), before / after
+        bend = np.sqrt(1 - ratio**2 * (1 - cos**2)) - ratio * cos
+        rays = ratio * rays + bend[:, None] * normals
+    starts, directions = camera.unproject(pixels)
+    np.testing.assert_allclose(starts, points, atol=1e-14)
+    np.testing.assert_allclose(directions, rays, atol=1e-13)
+    for target in ("text", "binary/cameras.bin"):
+        write_refractive(tmp_path / target, read_colmap(path, ReadOptions()))
+        (after,) = read_colmap(tmp_path / target, ReadOptions()).cameras.values()
+        np.testing.assert_allclose(after.port.values, camera.port.values, rtol=1e-15)
+
+
 def test_faults_name_file_and_line(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
 
     lens = "1 PINHOLE 9 8 5 6 4 3"
     for line, named in (
         ("1 PINHOLE 9", "line 1"),
-        ("1 OPENCV_FISHEYE 9 8 1 1 1 1 0 0 0 0", "OPENCV_FISHEYE"),
+        ("1 FOV 9 8 1 1 1 1 0", "FOV"),
         ("1 PINHOLE 9 8 5 6 4", "4 PARAMS: 3"),
         (lens + " 1", "4 PARAMS: 5"),
-        (lens + " DOMEPORT 0 0 0 0.05 0.007 1 1.52 1.334", "DOMEPORT"),
+        (lens + " CONEPORT 0 0 0 0.05 0.007 1 1.52 1.334", "CONEPORT"),
+        (lens + " DOMEPORT 0 0 0.06 0.05 0.007 1 1.52 1.334", "outside its inner radius of 50"),
+        (lens + " DOMEPORT 0 0 0 0.05 0.007 0 1.52 1.334", "indices"),
         (lens + " FLATPORT 0 0", "8 REFRAC_PARAMS: 2"),
         (lens + " FLATPORT 0 0 2 0.05 0.007 1 1.52 1.334", "normal"),
         (lens + " FLATPORT 0 0 1 0.05 0.007 1 1.52 0.9", "0.9"),
@@ -266,8 +328,8 @@ def test_faults_name_file_and_line(tmp_path: Path) -> None:
     for content in (b"", good[:-1], good + b"x", struct.pack("<Q", 1 << 60), b"\xff" * 90):
         binary.write_bytes(content)
         assert "cameras.bin" in fault(binary)
-    binary.write_bytes(struct.pack("<QIiQQ8d", 1, 1, 5, 9, 8, *[1.0] * 8))
-    assert "OPENCV_FISHEYE" in fault(binary)
+    binary.write_bytes(struct.pack("<QIiQQ5d", 1, 1, 7, 9, 8, *[1.0] * 5))
+    assert "FOV" in fault(binary)
 
 
 def test_faults_of_a_rig_configuration_name_the_key(tmp_path: Path) -> None:

@@ -34,9 +34,10 @@ IN_AIR = in_air(BENT)
 CHANNELS = {
     "opencv": "o.xml",
     "colmap": "model",
-    "flatport": "flat",
+    "refractive": "flat",
     "kalibr": "c.yaml",
     "ros": "r",
+    "mrcal": "m",
 }
 
 
@@ -70,16 +71,16 @@ def test_a_port_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> Non
     assert "--drop-port" in shown and "--water" in shown
 
 
-@pytest.mark.parametrize("name", ["colmap", "flatport", "kalibr", "ros"])
+@pytest.mark.parametrize("name", ["colmap", "refractive", "kalibr", "ros"])
 def test_a_covariance_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
-    water = None if name == "flatport" else (1.5, 3.0)
+    water = None if name == "refractive" else (1.5, 3.0)
     shown = refused(own, tmp_path / CHANNELS[name], target_format=name, water=water)
     assert "--drop-covariance" in shown
 
 
 @pytest.mark.parametrize(
     ("name", "term"), [("kalibr", "k3"), ("kalibr", "k5"), ("ros", "s1"), ("colmap", "s4"),
-                       ("flatport", "s2")],
+                       ("refractive", "s2")],
 )  # fmt: skip
 def test_distortion_is_never_lost(tmp_path: Path, name: str, term: str) -> None:
     rig = replace(IN_AIR, cameras={**IN_AIR.cameras})
@@ -101,9 +102,11 @@ def test_a_dropped_port_leaves_the_cameras_in_air_and_a_warning(
 
 
 def test_flatport_carries_the_port(own: Path, tmp_path: Path) -> None:
-    _, data = convert_files(own, tmp_path / "flat", target_format="flatport", drop_covariance=True)
-    assert data["to"] == "flatport"
-    assert detect(tmp_path / "flat").name == "flatport"
+    _, data = convert_files(
+        own, tmp_path / "flat", target_format="refractive", drop_covariance=True
+    )
+    assert data["to"] == "refractive"
+    assert detect(tmp_path / "flat").name == "refractive"
     convert_files(tmp_path / "flat", tmp_path / "back.json")
     assert_same_geometry(read_rig(tmp_path / "back.json"), BENT)
 
@@ -262,7 +265,7 @@ def test_formats_are_found_from_files_and_names(tmp_path: Path) -> None:
     for source in ("none.yml", "note.txt", "note.md", "a.yaml", "empty"):
         assert source in refused(tmp_path / source, tmp_path / "x.json")
     refused(tmp_path / "rig.json", tmp_path / "x.yaml")
-    refused(tmp_path / "rig.json", tmp_path / "x", target_format="metashape")
+    refused(tmp_path / "rig.json", tmp_path / "x", target_format="photoscan")
 
 
 def test_contradictions_are_refused(own: Path, tmp_path: Path) -> None:
@@ -314,7 +317,7 @@ def test_the_command_converts_and_names_faults(
 
 
 def _wet(name: str) -> Rig:
-    return BENT if name == "flatport" else IN_AIR
+    return BENT if name == "refractive" else IN_AIR
 
 
 def test_hostile_files_of_every_kind_end_in_one_line(tmp_path: Path) -> None:

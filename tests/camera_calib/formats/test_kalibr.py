@@ -15,7 +15,7 @@ from camera_calib.formats.kalibr import read_kalibr, write_kalibr
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
-from tests.strategies_formats import POINTS_RIG, RADTAN, fault_of, rigs
+from tests.strategies_formats import POINTS_RIG, RADTAN, WIDE_RIG, fault_of, rigs
 
 EXAMPLE = """\
 cam0:
@@ -92,6 +92,30 @@ def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
         np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
 
 
+@settings(max_examples=25, deadline=None)
+@given(rig=rigs(lenses=("fisheye",), most=3))
+def test_kalibrs_equidistant_equations_give_our_pixels(rig: Rig) -> None:
+    """Those of `EquidistantDistortion::distort`, on tangents, of points before the camera."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_kalibr(Path(folder) / "camchain.yaml", rig)
+        chain = yaml.safe_load((Path(folder) / "camchain.yaml").read_text())
+    for (name, camera), entry in zip(rig.cameras.items(), chain.values(), strict=True):
+        assert (entry["camera_model"], entry["distortion_model"]) == ("pinhole", "equidistant")
+        points = rig.cam_from_rig[name].apply(WIDE_RIG)
+        points = points[points[:, 2] > 0.1]
+        ours = camera.project(points)
+        tangents = points[:, :2] / points[:, 2:]
+        r = np.linalg.norm(tangents, axis=1)
+        theta = np.arctan(r)
+        k1, k2, k3, k4 = entry["distortion_coeffs"]
+        bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
+        fx, fy, cx, cy = entry["intrinsics"]
+        seen = tangents * (bent / r)[:, None] * [fx, fy] + [cx, cy]
+        known = np.isfinite(ours[:, 0])
+        assert known.sum() > 20
+        np.testing.assert_allclose(seen[known] + 0.5, ours[known], atol=1e-8, rtol=0)
+
+
 def test_an_example_like_that_of_the_wiki_is_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,7 +152,8 @@ def test_rounded_rotations_are_made_rotations(tmp_path: Path) -> None:
 def test_faults_name_file_and_key(tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
     for old, new, named in (
-        ("distortion_model: none", "distortion_model: equidistant", "cam1.distortion_model"),
+        ("distortion_model: none", "distortion_model: fov", "cam1.distortion_model"),
+        ("distortion_model: none", "distortion_model: equidistant", "cam1.distortion_coeffs"),
         ("pinhole", "omni", "cam0.camera_model"),
         (", 1e-05]", "]", "cam0.distortion_coeffs"),
         ("461.629", "fast", "cam0.intrinsics"),

@@ -15,9 +15,10 @@ from alice_survey.base.errors import CalibrationError
 from camera_calib.camera import flat_port_camera
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
+from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.rig import Rig
 from tests.cameras import changed
-from tests.strategies_formats import POINTS_RIG, fault_of, rigs
+from tests.strategies_formats import BOTH_LENSES, POINTS_RIG, fault_of, opencv_pixels, rigs
 
 AIR = flat_port_camera(
     width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=320.25, cy_px=241.0, n_water=1.0
@@ -48,7 +49,7 @@ def write(path: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml"])
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs())
+@given(rig=rigs(lenses=BOTH_LENSES))
 def test_opencv_projects_as_we_do_from_what_its_loader_reads(suffix: str, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
@@ -71,11 +72,12 @@ def test_opencv_projects_as_we_do_from_what_its_loader_reads(suffix: str, rig: R
         turn = Rotation.from_matrix(read["R"]).as_rotvec()
         each = [("M1", "D1", zero, zero), ("M2", "D2", turn, read["T"])]
     for (name, camera), (m, d, rvec, tvec) in zip(rig.cameras.items(), each, strict=True):
-        seen, _ = cv2.projectPoints(POINTS_RIG, rvec, tvec, read[m], read[d])
+        assert (read[d].size == 4) == (camera.lens.model == "fisheye")
+        seen = opencv_pixels(POINTS_RIG, rvec, tvec, read[m], read[d])
         ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
         known = np.isfinite(ours[:, 0])
         assert known.any()
-        np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
+        np.testing.assert_allclose(seen[known] + 0.5, ours[known], atol=1e-8, rtol=0)
 
 
 def test_the_half_pixel_is_taken_once(tmp_path: Path) -> None:
@@ -138,6 +140,26 @@ def test_other_common_keys_are_understood(tmp_path: Path, matrix: str, k: str) -
     )
 
 
+def test_four_coefficients_are_a_fisheyes_when_file_or_caller_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    four = GOOD + "distortion_coefficients: [ 0.1, 0.02, 0.003, 0.004 ]\n"
+    path = write(tmp_path / "a.yml", four)
+    fisheye = FisheyeLens(fx_px=530, fy_px=531, cx_px=320, cy_px=240, k1=0.1, k2=0.02, k3=0.003,
+                          k4=0.004)  # fmt: skip
+    assert read_opencv(path, ReadOptions(lens="fisheye")).cameras["cam0"].lens == fisheye
+    assert capsys.readouterr().err == ""
+    assert read_opencv(path, ReadOptions()).cameras["cam0"].lens.model == "opencv"
+    assert "--lens fisheye" in capsys.readouterr().err
+    for name in ("fisheye", "equidistant"):
+        path = write(tmp_path / "a.yml", four + f"distortion_model: {name}\n")
+        assert read_opencv(path, ReadOptions(lens="opencv")).cameras["cam0"].lens == fisheye
+    assert "distortion_model" in fault(path, four + "distortion_model: fov\n")
+    assert "--lens" in fault(path, four, ReadOptions(lens="fov"))
+    assert "4 expected" in fault(path, GOOD + "D: [ 0., 0., 0., 0., 0. ]\n",
+                                 ReadOptions(lens="fisheye"))  # fmt: skip
+
+
 def test_a_tilted_sensor_is_refused_and_a_level_one_read(tmp_path: Path) -> None:
     coefficients = "distortion_coefficients: [" + ", ".join(["0.001"] * 12)
     level = write(tmp_path / "a.yml", GOOD + coefficients + ", 0., 0. ]\n")
@@ -172,6 +194,8 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         ("%YAML:1.0\n---\na: [ 1., 2.\n", "line 3"),
         ("hello\n", "FileStorage"),
         ("\n", "empty"),
+        (GOOD + port + "   shape: cube\n", "shape"),
+        (GOOD + port + "   shape: dome\n", "port.dome_x_m"),
         (GOOD + "camera_names: [ a, b ]\n", "camera_names"),
         (GOOD + "camera_names: [ ../up ]\n", "../up"),
     ):

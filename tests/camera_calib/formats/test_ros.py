@@ -19,7 +19,15 @@ from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.ros import read_ros, write_ros
 from camera_calib.rig import Rig
 from tests.cameras import changed
-from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, fault_of, rigs
+from tests.strategies_formats import (
+    BOTH_LENSES,
+    POINTS_RIG,
+    RATIONAL,
+    assert_same_geometry,
+    fault_of,
+    opencv_pixels,
+    rigs,
+)
 
 SAMPLE = """\
 image_width: 2448
@@ -61,7 +69,7 @@ fault = partial(fault_of, read_ros)
 
 
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs(RATIONAL, one_size=True))
+@given(rig=rigs(RATIONAL, lenses=BOTH_LENSES, one_size=True))
 def test_rectified_by_opencv_a_pair_is_where_the_file_says(rig: Rig) -> None:
     """As image_geometry does: a ray goes through R and P to the rectified picture.
 
@@ -84,15 +92,14 @@ def test_rectified_by_opencv_a_pair_is_where_the_file_says(rig: Rig) -> None:
                 "projection_matrix",
             )
         )  # fmt: skip
-        assert document["distortion_model"] == (
-            "plumb_bob" if d.size == 5 else "rational_polynomial"
-        )
+        model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[d.size]
+        assert document["distortion_model"] == model
         points = rig.cam_from_rig[name].apply(POINTS_RIG)
-        seen, _ = cv2.projectPoints(np.ascontiguousarray(points), np.zeros(3), np.zeros(3), k, d)
+        seen = opencv_pixels(points, np.zeros(3), np.zeros(3), k, d)
         ours = camera.project(points)
         known = np.isfinite(ours[:, 0])
         assert known.any()
-        np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
+        np.testing.assert_allclose(seen[known] + 0.5, ours[known], atol=1e-8, rtol=0)
         # Of the camera's own frame a point goes through R; of the first camera's rectified frame,
         # through the last column of P. Tangents, since OpenCV may choose any focal length.
         first = POINTS_RIG @ np.array(documents[0]["rectification_matrix"]["data"]).reshape(3, 3).T
@@ -203,7 +210,8 @@ def test_what_ros_has_no_files_for_is_refused(tmp_path: Path) -> None:
 def test_faults_name_file_and_key(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     for old, new, named in (
-        ("plumb_bob", "equidistant", "distortion_model"),
+        ("plumb_bob", "fov", "distortion_model"),
+        ("plumb_bob", "equidistant", "distortion_coefficients"),
         ("plumb_bob", "rational_polynomial", "distortion_coefficients"),
         ("image_width", "width", "image_width"),
         ("0, 0, 1]\nd", "0, 0]\nd", "camera_matrix"),

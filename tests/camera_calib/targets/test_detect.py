@@ -135,6 +135,16 @@ def test_a_chessboard_without_an_outer_row_is_refused_and_its_size_said() -> Non
     assert found.refused is not None and "8x6" in found.refused
 
 
+def test_a_board_of_which_glare_hides_a_side_is_refused_with_what_is_missing() -> None:
+    target, picture, true = view(KINDS[0], (0, 0, 0))
+    edge = int(true[1::9, 0].mean()) + 5
+    picture[:, :edge] = 255
+    found = detect_with_reasons(target, picture)
+    assert found.pixels is None
+    assert found.refused is not None
+    assert "42 inner corners are found, in 7x6, of the 9x6" in found.refused
+
+
 def test_a_board_of_another_size_is_refused_and_its_size_said() -> None:
     _, picture, _ = view(KINDS[0])
     for wrong in ("chessboard 8x6 25mm", "chessboard 9x5 25mm", "chessboard 11x8 25mm"):

@@ -33,6 +33,57 @@ def test_whole_boards_are_found(turn: tuple[float, float, float]) -> None:
     assert grown_chessboard(picture, (7, 9)) is None
 
 
+def found_in(light: np.ndarray, true: np.ndarray, shape: tuple[int, int], off_px: float) -> int:
+    """How many corners are found, each next to a true one and none twice; 0: no board."""
+    found = grown_chessboard(to_srgb(light), shape)
+    if found is None:
+        return 0
+    seen = found[np.isfinite(found).all(axis=1)]
+    near = np.linalg.norm(seen[:, None] - true[None], axis=2)
+    assert near.min(axis=1).max() < off_px
+    assert len(set(near.argmin(axis=1))) == len(seen)
+    return len(seen)
+
+
+@pytest.mark.parametrize("shade", [0.2, 0.4])
+@pytest.mark.parametrize("turn", [(15, 10, 14), (0, 56, 20)])
+def test_a_board_with_a_shadow_along_a_row_is_found(
+    turn: tuple[float, float, float], shade: float
+) -> None:
+    """The row is lost, but not what lies in the shadow behind it."""
+    seen = seen_from(BOARD, SIZE, turn, 0.6)
+    true = true_pixels(BOARD, seen)
+    light = picture_light(BOARD, seen, SIZE, fine=4, blur_px=0.0)
+    start, end = true[18], true[26]
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    off = (x - start[0]) * (end - start)[1] - (y - start[1]) * (end - start)[0]
+    light = np.where(off < -2.0 * np.linalg.norm(end - start), shade * light, light)
+    light = 0.3 * cv2.GaussianBlur(light, (0, 0), 0.7)
+    light += np.random.default_rng(3).normal(0, 0.002, light.shape)
+    assert 45 <= found_in(light, true, (6, 9), 1.0) <= 54
+
+
+@pytest.mark.parametrize("steps", [((14.5, 0.2), (16.4, 26.8)), ((20.0, 2.0), (-24.0, 21.0))])
+def test_a_board_at_a_slant_is_found(steps: tuple[tuple[float, float], ...]) -> None:
+    """The nearest saddles of a slanted board make parallelograms that are no squares."""
+    across, down = np.array(steps) / BOARD.size_m
+    middle = BOARD.points[:, :2].mean(axis=0)
+    at = np.array(SIZE) / 2 - np.column_stack([across, down]) @ middle
+    seen = np.array([[across[0], down[0], at[0]], [across[1], down[1], at[1]], [0.0, 0.0, 1.0]])
+    light = picture_light(BOARD, seen, SIZE, fine=4, blur_px=1.2)
+    light = 0.3 + 0.4 * (light - 0.3)
+    light += np.random.default_rng(2).normal(0, 0.003, light.shape)
+    assert found_in(light, true_pixels(BOARD, seen), (6, 9), 0.5) == 54
+
+
+def test_a_faint_board_in_noise_is_found() -> None:
+    """What a fit leaves is noise, not another shape; nothing beyond is taken for a corner."""
+    seen = seen_from(BOARD, SIZE, (20, 10, 5), 0.7)
+    light = picture_light(BOARD, seen, SIZE, fine=4, blur_px=1.0)
+    light = 0.3 + 0.06 * (light - 0.3) + np.random.default_rng(2).normal(0, 0.01, light.shape)
+    assert found_in(light, true_pixels(BOARD, seen), (6, 9), 1.5) >= 50
+
+
 def test_hidden_corners_are_left_out() -> None:
     picture, true = view((30, 25, 20))
     for spot in (true[20], true[49]):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from alice_survey.base.block_solver import BlockStep
 from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import observed
@@ -15,7 +16,6 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     Gauge,
     LinearObservations,
-    moved_points,
     reduce_points,
 )
 from reconstruct.mapping.refraction import refract
@@ -29,7 +29,7 @@ from reconstruct.mapping.uncertainty import (
     write_uncertainty,
 )
 from reconstruct.placing.alignment import align_rigid
-from tests.oracles_refraction import dense_normal_equations, laid_onto
+from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, true_stations, warped_scene
 
@@ -75,7 +75,7 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     stations = int(few.station.max()) + 1
     reduced = reduce_points(few, stations)
     hessian, slope = dense_normal_equations(few, stations)
-    size, count = 6 * stations, few.by_shared.shape[2]
+    size, count = 6 * stations, few.rest.shape[2] - 1
     own = np.r_[0:size, len(slope) - count : len(slope)]
     rest = np.r_[size : len(slope) - count]
     back = np.linalg.inv(hessian[np.ix_(rest, rest)])
@@ -83,20 +83,14 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
         hessian[np.ix_(own, own)] - hessian[np.ix_(own, rest)] @ back @ hessian[np.ix_(rest, own)]
     )
     pull = slope[own] - hessian[np.ix_(own, rest)] @ back @ slope[rest]
-    whole = np.block(
-        [[reduced.matrix.toarray(), reduced.border], [reduced.border.T, reduced.shared]]
-    )
     scale = np.abs(expected).max()
-    np.testing.assert_allclose(whole, expected, atol=1e-9 * scale)
-    together = np.concatenate([reduced.slope, reduced.shared_slope])
+    np.testing.assert_allclose(dense_of(reduced), expected, atol=1e-9 * scale)
+    together = np.concatenate([reduced.border[..., -1].ravel(), reduced.shared[:-1, -1]])
     np.testing.assert_allclose(together, pull, atol=1e-9 * np.abs(slope).max())
 
     rng = np.random.default_rng(1)
     steps, shared_step = rng.normal(0, 1e-3, (stations, 6)), rng.normal(0, 1e-3, count)
-    moved = moved_points(
-        few.starts, few.station, few.by_point, few.arm, few.by_shared, few.miss,
-        reduced.point_inverse, steps, shared_step,
-    )  # fmt: skip
+    moved = reduced.point_steps(BlockStep(poses=steps, shared=shared_step, gain=0.0, length=0.0))
     step = np.concatenate([steps.ravel(), shared_step])
     wanted = -back @ (slope[rest] + hessian[np.ix_(rest, own)] @ step)
     np.testing.assert_allclose(moved.ravel(), wanted, atol=1e-9)
@@ -181,8 +175,7 @@ def _few(linear: LinearObservations, points: int, rng: np.random.Generator) -> L
         station=linear.station[:end],
         by_point=linear.by_point[:end],
         arm=linear.arm[:end],
-        by_shared=rng.normal(0, 100, (end, 2, 2)),
-        miss=linear.miss[:end],
+        rest=np.concatenate([rng.normal(0, 100, (end, 2, 2)), linear.rest[:end]], axis=2),
     )
 
 

@@ -16,7 +16,7 @@ from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
-from reconstruct.placing.picked_points import Camera, find_spots
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.run import body_from_pinhole
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
@@ -44,7 +44,7 @@ class Gauge:
     """A model in a gauge of its own."""
 
     ned_from_model: Similarity
-    cameras: dict[str, Camera]
+    cameras: dict[str, RegisteredPicture]
 
     def points(self, ned: np.ndarray) -> np.ndarray:
         place = self.ned_from_model
@@ -60,7 +60,7 @@ def in_gauge(seed: int) -> Gauge:
     for record, pose in zip(site().records, site().ned_from_cam, strict=True):
         warp = warps()[record.camera]
         pinhole = place.inv() * pose * warp.pinhole_from_cam.inv()
-        cameras[record.image] = Camera(warp=warp, model_from_pinhole=pinhole)
+        cameras[record.image] = RegisteredPicture(warp=warp, model_from_pinhole=pinhole)
     return Gauge(
         ned_from_model=Similarity(scale=1.0, rotation=turn, translation=shift), cameras=cameras
     )

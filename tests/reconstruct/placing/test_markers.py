@@ -13,9 +13,10 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import write_manifest
 from camera_calib.approximation.pinhole_warp import best_warp
+from camera_calib.camera import Camera
 from reconstruct.placing.control_file import read_picks
 from reconstruct.placing.markers import find_markers, survey_control
-from reconstruct.placing.picked_points import Camera, find_spots
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 SIDE_M, DEPTH_M = 0.15, 15.0
@@ -91,7 +92,7 @@ def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspac
         n: best_warp(c, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M) for n, c in site().rig.cameras.items()
     }
     cameras = {
-        r.image: Camera(
+        r.image: RegisteredPicture(
             warp=warps[r.camera],
             model_from_pinhole=p * warps[r.camera].pinhole_from_cam.inv(),
         )
