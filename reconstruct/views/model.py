@@ -62,10 +62,6 @@ class View:
         points = self.world_from_cam.inv().apply(points_world)
         return self.shift.warped(self.pinhole.project(points), points[:, 2])
 
-    def project_ideal(self, points_world: Array) -> Array:
-        """Pixels (N, 2) at which the ideal pinhole sees points (N, 3); NaN behind the camera."""
-        return self.pinhole.project(self.world_from_cam.inv().apply(points_world))
-
     def at_depth(self, pixels: Array, depth: Array) -> Array:
         """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
         slopes = self.pinhole.slopes(self.shift.ideal(pixels, depth))
