@@ -26,11 +26,11 @@ from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, first_pictures, observed
-from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.pictures.files import named
+from reconstruct.views.model_files import as_transform
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
 """A station is off navigation when it misses by more than both."""

@@ -5,17 +5,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
-from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.matching.matches import PairMatches, as_seen
+from reconstruct.views.model_files import rigid3d
 
 VerifiedPair = tuple[int, int, PairMatches]
 """Indices of two pictures and what they share."""
@@ -82,30 +82,6 @@ def write_database(
             database.write_frame(frame, use_frame_id=True)
         for i, j, pair in seen.pairs:
             _write_pair(database, i + 1, j + 1, pair)
-
-
-def colmap_pinhole(pinhole: Pinhole) -> pycolmap.Camera:
-    """A pinhole as COLMAP's camera."""
-    return pycolmap.Camera(
-        model="PINHOLE",
-        width=pinhole.width_px,
-        height=pinhole.height_px,
-        params=pinhole.numbers,
-        has_prior_focal_length=True,
-    )
-
-
-def rigid3d(pose: RigidTransform) -> pycolmap.Rigid3d:
-    """A scipy transform as COLMAP's."""
-    rotation = pycolmap.Rotation3d(pose.rotation.as_quat())
-    return pycolmap.Rigid3d(rotation, np.asarray(pose.translation))
-
-
-def as_transform(pose: Any) -> RigidTransform:
-    """A COLMAP pose as scipy's."""
-    return RigidTransform.from_components(
-        np.asarray(pose.translation), Rotation.from_quat(np.asarray(pose.rotation.quat))
-    )
 
 
 def _write_rigs(

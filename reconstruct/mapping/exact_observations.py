@@ -15,9 +15,10 @@ from camera_calib.camera import pose_jacobian
 from camera_calib.freedom import wanted_slopes
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import LinearObservations
+from reconstruct.views.model_files import as_transform
 
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""

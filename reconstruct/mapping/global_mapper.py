@@ -27,8 +27,9 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.mapping.bundle import all_pictures, direct_solver
-from reconstruct.mapping.database import Observations, as_transform, rigid3d, station_frames
+from reconstruct.mapping.database import Observations, station_frames
 from reconstruct.mapping.stations import StationLink, link_stations
+from reconstruct.views.model_files import as_transform, rigid3d
 
 _FIRST_ERROR_PX = 20.0
 """Reprojection errors that the first adjustment keeps."""

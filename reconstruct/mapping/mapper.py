@@ -24,9 +24,9 @@ from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, new_folder, write_database
-from reconstruct.mapping.database import as_transform as as_transform
 from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
 from reconstruct.pictures.files import named
+from reconstruct.views.model_files import as_transform
 
 Method = Literal["auto", "global", "incremental"]
 """How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""

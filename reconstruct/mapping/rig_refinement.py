@@ -31,7 +31,7 @@ from camera_calib.freedom import Prior, at_bound, moved, pose_names, value
 from camera_calib.rig import Covariance, Rig, write_rig
 from reconstruct.mapping.arrays import Indices, cross_matrices, first_pictures, frames_of
 from reconstruct.mapping.bundle import move_points
-from reconstruct.mapping.database import Observations, colmap_pinhole, rigid3d
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_observations import (
     Pixels,
     RigState,
@@ -53,6 +53,7 @@ from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.robust import cauchy_cost, cauchy_weights, sigma_of, variance_of
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.pairs import positions_ned
+from reconstruct.views.model_files import colmap_pinhole, rigid3d
 
 _PORT_SIGMAS = {
     "port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005,

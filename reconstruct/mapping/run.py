@@ -24,7 +24,7 @@ from alice_survey.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, read_rig
 from reconstruct.mapping.acceptance import judge_model
-from reconstruct.mapping.database import Observations, VerifiedPair, colmap_pinhole
+from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
@@ -49,6 +49,7 @@ from reconstruct.pictures.files import exif_focal_px, named
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
 from reconstruct.views.model import datum_of
+from reconstruct.views.model_files import colmap_pinhole
 
 RATIO = 0.8
 """Largest distance of a match over that of the second nearest descriptor."""

@@ -20,10 +20,9 @@ from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.formats.camera_files import CameraRecord, camera_of
 from reconstruct.mapping.bundle import all_pictures, direct_solver
-from reconstruct.mapping.database import Observations, colmap_pinhole
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import (
     Mapped,
-    as_transform,
     largest,
     model_baseline,
     report_left_out,
@@ -31,6 +30,7 @@ from reconstruct.mapping.mapper import (
     scale_model,
     sizes,
 )
+from reconstruct.views.model_files import as_transform, colmap_pinhole
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""

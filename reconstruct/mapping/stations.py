@@ -25,9 +25,10 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import CAUCHY_TUNING
 from reconstruct.mapping.arrays import cross_matrices
-from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.matches import Matches
+from reconstruct.views.model_files import as_transform
 
 _LARGEST_GAP_PX = 3.0
 """Distance by which the two rays of a stereo point may miss each other, as seen from the cameras.

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.triangulate import nearest_to_rays
 from reconstruct.placing.control_file import Pick
 
 _ROBUST_PX = 1.0
@@ -16,7 +17,6 @@ _WRONG_SIGMAS = 5.0
 _WRONG_PX = 2.0
 """A pick further off than both is left out where three or more remain."""
 _TRIED = 6
-_LARGEST_CONDITION = 1e8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,18 +155,8 @@ def _nearest(picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) ->
     starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
     if not np.isfinite(starts + ways).all():
         return "a pick is beyond the reach of its lens"
-    found = nearest_to_rays(starts, ways)
-    return "the pictures see it from one direction only" if found is None else found
-
-
-def nearest_to_rays(starts: Array, ways: Array) -> Array | None:
-    """The point (3,) nearest to rays with starts and unit directions (N, 3); None if parallel."""
-    across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
-    system = across.sum(axis=0)
-    if np.linalg.cond(system) > _LARGEST_CONDITION:
-        return None
-    found: Array = np.linalg.solve(system, np.einsum("nij,nj->i", across, starts))
-    return found
+    found: Array = nearest_to_rays(starts[:, None], ways[:, None])[0]
+    return found if np.isfinite(found).all() else "the pictures see it from one direction only"
 
 
 def _fit(

@@ -31,7 +31,6 @@ from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, read_rig
-from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.mapper import model_baseline
 from reconstruct.mapping.run import read_inputs
 from reconstruct.mapping.uncertainty import read_uncertainty
@@ -59,7 +58,7 @@ from reconstruct.placing.track import (
     write_track_tum,
 )
 from reconstruct.views.model import WorldFrame, read_warps, write_frame
-from reconstruct.views.model_files import read_reconstruction
+from reconstruct.views.model_files import as_transform, read_reconstruction
 
 RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach

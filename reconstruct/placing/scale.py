@@ -15,8 +15,8 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRecord
 from alice_survey.stages import SCALE_FILE
+from camera_calib.triangulate import nearest_to_rays
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.picked_points import nearest_to_rays
 from reconstruct.views.model import SparseModel, View, read_model
 
 _NEIGHBOURS = 15
@@ -164,8 +164,8 @@ def _triangulate(token: str, picks: list[tuple[View, Array]]) -> Array:
     starts = np.stack([view.world_from_cam.translation for view, _ in picks])
     rays = np.stack([r.apply(_slope(v, p)) for r, (v, p) in zip(rotation, picks, strict=True)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    point = nearest_to_rays(starts, rays)
-    if point is None:
+    point: Array = nearest_to_rays(starts[:, None], rays[:, None])[0]
+    if not np.isfinite(point).all():
         raise ReconstructionError(f"{token!r}: the pictures see the spot from one direction only")
     misses = [np.linalg.norm(v.project(point[None])[0] - p) for v, p in picks]
     worst = float(np.max(misses))

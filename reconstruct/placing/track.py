@@ -22,11 +22,11 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import cross_matrices, observed
-from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import attitude_axes
 from reconstruct.views.model import WorldFrame
+from reconstruct.views.model_files import as_transform
 
 _NED = ("north_m", "east_m", "depth_m")
 _MODEL = ("x", "y", "z")

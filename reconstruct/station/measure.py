@@ -24,6 +24,7 @@ from camera_calib.rig import Rig, read_rig
 from camera_calib.triangulate import nearest_to_rays
 from reconstruct.evaluate.elevation import read_elevation
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.placing.picked_points import RegisteredPicture
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
 from reconstruct.station.solve import PairOptics, calibration_slopes, stereo_rig
@@ -316,10 +317,7 @@ def _in_workspace(
 
 def _ray(view: View, warp: PinholeWarp, taken: Array) -> tuple[Array, Array]:
     """A point and the unit direction of the straight ray in water of one pixel as taken."""
-    pixel = warp.to_pinhole(taken[None])
-    near, far = (view.at_depth(pixel, np.array([depth]))[0] for depth in (1.0, 2.0))
-    direction: Array = (far - near) / np.linalg.norm(far - near)
-    return near, direction
+    return RegisteredPicture(warp=warp, model_from_pinhole=view.world_from_cam).ray(taken)
 
 
 def _crossed(rays: list[tuple[View, PinholeWarp, Array]], sigma_px: float) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array, Datum
@@ -61,10 +61,6 @@ class View:
         """Pixels (N, 2) at which the warped picture shows points (N, 3); NaN behind the camera."""
         points = self.world_from_cam.inv().apply(points_world)
         return self.shift.warped(self.pinhole.project(points), points[:, 2])
-
-    def project_ideal(self, points_world: Array) -> Array:
-        """Pixels (N, 2) at which the ideal pinhole sees points (N, 3); NaN behind the camera."""
-        return self.pinhole.project(self.world_from_cam.inv().apply(points_world))
 
     def at_depth(self, pixels: Array, depth: Array) -> Array:
         """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
@@ -166,6 +162,8 @@ def read_model(sparse: str | Path) -> SparseModel:
 
 
 def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
+    from reconstruct.views.model_files import as_transform
+
     warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
     # Without lengths in metres a port's shift is not known.
     shifts = {
@@ -177,17 +175,14 @@ def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
     )
     views = []
     for image in images:
-        cam_from_world, record = image.cam_from_world(), stored.images[image.name]
-        pose = RigidTransform.from_components(
-            cam_from_world.translation, Rotation.from_quat(cam_from_world.rotation.quat)
-        )
+        record = stored.images[image.name]
         views.append(
             View(
                 image=image.name,
                 camera=record.camera,
                 station=record.station,
                 pinhole=warps[record.camera].pinhole,
-                world_from_cam=pose.inv(),
+                world_from_cam=as_transform(image.cam_from_world()).inv(),
                 shift=shifts[record.camera],
             )
         )

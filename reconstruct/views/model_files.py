@@ -1,4 +1,6 @@
-"""COLMAP's binary files: looked at before COLMAP reads them, and read where it is slow.
+"""The border to COLMAP: its types from ours and back, and its binary files.
+
+Files are looked at before COLMAP reads them, and read where it is slow.
 
 COLMAP trusts the counts in these files: past the end of a file that was cut short it goes
 on reading what is not there. The layout is that of COLMAP 4 (scene/reconstruction_io.cc).
@@ -9,12 +11,15 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
+from camera_calib.approximation.pinhole_warp import Pinhole
 
 _PARAMS = {
     0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5,
@@ -42,6 +47,30 @@ def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
             f"{folder}: COLMAP cannot read the model ({text}): remove the folder's stage and run "
             "'alice-survey reconstruct' again"
         ) from None
+
+
+def colmap_pinhole(pinhole: Pinhole) -> pycolmap.Camera:
+    """A pinhole as COLMAP's camera."""
+    return pycolmap.Camera(
+        model="PINHOLE",
+        width=pinhole.width_px,
+        height=pinhole.height_px,
+        params=pinhole.numbers,
+        has_prior_focal_length=True,
+    )
+
+
+def rigid3d(pose: RigidTransform) -> pycolmap.Rigid3d:
+    """A scipy transform as COLMAP's."""
+    rotation = pycolmap.Rotation3d(pose.rotation.as_quat())
+    return pycolmap.Rigid3d(rotation, np.asarray(pose.translation))
+
+
+def as_transform(pose: Any) -> RigidTransform:
+    """A COLMAP pose as scipy's."""
+    return RigidTransform.from_components(
+        np.asarray(pose.translation), Rotation.from_quat(np.asarray(pose.rotation.quat))
+    )
 
 
 def keypoints_of(model: pycolmap.Reconstruction) -> dict[int, NDArray[np.void]]:

@@ -8,8 +8,9 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from reconstruct.mapping.database import Observations, as_transform, colmap_pinhole, rigid3d
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
+from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.scenes import Scene
 
 POSE_ERROR = (2e-3, 5e-3)

@@ -10,12 +10,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
 from camera_calib.approximation.pinhole_warp import best_warp
-from reconstruct.mapping.database import Observations, colmap_pinhole, rigid3d, write_database
+from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
     Method,
     _options,
-    as_transform,
     collapsed_frames,
     map_calibrated,
     merge_models,
@@ -28,6 +27,7 @@ from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
 from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 
@@ -145,7 +145,7 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
     assert model_baseline(mapped.model) == pytest.approx(1.0, rel=1e-9)
     for warp in mapped.warps.values():
         assert warp.camera.fx_px == pytest.approx(760, rel=0.01)
-        assert warp.camera.k1 == pytest.approx(-0.08, abs=0.02)
+        assert warp.camera.parameter("k1") == pytest.approx(-0.08, abs=0.02)
     found, true = pupils(mapped, scene)
     fit = align_similarity(found, true)
     misses = np.linalg.norm(fit.apply(found) - true, axis=1)

@@ -17,7 +17,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig, read_rig
 from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
@@ -32,6 +32,7 @@ from reconstruct.mapping.rig_refinement import (
 )
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid
+from reconstruct.views.model_files import as_transform
 from tests.cameras import changed
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene

@@ -4,11 +4,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from reconstruct.mapping.database import as_transform, rigid3d
 from reconstruct.mapping.global_mapper import adjust
 from reconstruct.mapping.mapper import Mapped, _options
 from reconstruct.mapping.priors import adjust_freely
 from reconstruct.placing.alignment import align_rigid
+from reconstruct.views.model_files import as_transform, rigid3d
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 

@@ -17,6 +17,7 @@ from reconstruct.mosaic import run
 from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
+from tests.cameras import changed
 from tests.engines import PicklingThreads
 from tests.oracles_dense import (
     DEPTH_M,
@@ -201,7 +202,7 @@ def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corre
     """A camera calibrated in water as a plain pinhole has no dispersion to correct."""
     camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
     bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": n_water}
-    warp = best_warp(replace(camera, **bare), 1.5, 2.5)
+    warp = best_warp(changed(camera, **bare), 1.5, 2.5)
     write_json(
         tmp_path / "sparse" / "cameras.json", {"cameras": {"left": warp.to_json()}, "images": {}}
     )

@@ -9,9 +9,9 @@ from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ImageError, WorkspaceError
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
 from camera_calib.camera import flat_port_camera
-from reconstruct.mapping.database import colmap_pinhole
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
+from reconstruct.views.model_files import colmap_pinhole
 
 WIDTH, HEIGHT = 320, 240
 

@@ -119,7 +119,7 @@ def test_a_view_sees_points_through_its_port() -> None:
     )
     points = warp.pinhole_from_cam.apply(spots)
     np.testing.assert_allclose(view.project(points), warp.to_pinhole(taken), atol=5e-3)
-    assert np.abs(view.project_ideal(points) - warp.to_pinhole(taken)).max() > 0.2
+    assert np.abs(view.pinhole.project(points) - warp.to_pinhole(taken)).max() > 0.2
     depth = points[:, 2]
     np.testing.assert_allclose(view.at_depth(view.project(points), depth), points, atol=1e-6)
 
