@@ -73,8 +73,9 @@ def value(rig: Rig, name: str) -> float:
     if field in PARAMETERS:
         return rig.cameras[camera].parameter(field)
     pose = rig.cam_from_rig[camera]
-    vector = np.concatenate([pose.rotation.as_rotvec(), pose.translation])
-    return float(vector[POSE.index(field)])
+    if field in _SHIFT:
+        return float(pose.translation[_SHIFT.index(field)])
+    return float(pose.rotation.as_rotvec()[_TURN.index(field)])
 
 
 def wanted_slopes(names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
@@ -160,7 +161,7 @@ class Prior:
 
     def misfit(self, rig: Rig) -> Array:
         """(K,) a rig's parameters minus the mean; a turn counts from the mean's rotation."""
-        found = np.array([value(rig, name) for name in self.parameters]) - self.mean
+        found = np.array([n.endswith(_TURN) or value(rig, n) for n in self.parameters]) - self.mean
         for camera in {n.split(".")[0] for n in self.parameters if n.endswith(_TURN)}:
             at = [self.parameters.index(f"{camera}.{axis}") for axis in _TURN]
             turn = rig.cam_from_rig[camera].rotation * Rotation.from_rotvec(self.mean[at]).inv()

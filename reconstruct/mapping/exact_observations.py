@@ -142,17 +142,20 @@ def exact_observations(
     rest = np.zeros((len(arm), 2, len(fields) + 3 * lever + 1))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
-        source, target = (np.append(at, -1) for at in wanted_slopes(fields, name))
+        source, target = wanted_slopes(fields, name)
+        target = np.append(target, -1)
         every = np.flatnonzero(pixels.camera == c)
         for first in range(0, len(every), _BLOCK):
             rows = every[first : first + _BLOCK]
             turned = _in_rig(arm, rows, pixels.station, state.turns) @ turn.T
             at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
-            miss = (at - pixels.taken[rows])[..., None]
-            slopes = np.concatenate([by_camera, pose_jacobian(by_cam, turned), miss], axis=2)
+            slopes = by_camera
+            if source.max(initial=0) >= by_camera.shape[2]:  # it may move on the rig
+                slopes = np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2)
+            miss = (at - pixels.taken[rows])[:, :, None]
             _put(
-                rows, by_cam @ turn, state.turns, pixels.station, slopes, source, target,
-                by_point, rest,
+                rows, by_cam @ turn, state.turns, pixels.station,
+                np.concatenate([slopes[:, :, source], miss], axis=2), target, by_point, rest,
             )  # fmt: skip
     return LinearObservations(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm, rest=rest
@@ -172,8 +175,8 @@ def _in_rig(arm: Array, rows: Indices, station: Indices, turns: Array) -> Array:
 
 @compiled
 def _put(
-    rows: Indices, by_rig: Array, turns: Array, station: Indices, slopes: Array, source: Indices,
-    target: Indices, by_point: Array, rest: Array,
+    rows: Indices, by_rig: Array, turns: Array, station: Indices, slopes: Array, target: Indices,
+    by_point: Array, rest: Array,
 ) -> None:  # fmt: skip
     """Put what one camera sees in its rows, in place; what it does not see stays as it is.
 
@@ -182,9 +185,8 @@ def _put(
         by_rig: (N, 2, 3) slopes by the point along the axes of the rig.
         turns: (F, 3, 3) of `world_from_rig`.
         station: (O,).
-        slopes: (N, 2, K) by all that the camera may depend on, last the miss; NaN if not seen.
-        source: (G',) which of the K are wanted.
-        target: (G',) and where in `rest` they go.
+        slopes: (N, 2, K) by what is wanted of the camera, last the miss; NaN if not seen.
+        target: (K,) where in `rest` they go.
         by_point: (O, 2, 3) to fill.
         rest: (O, 2, G + 1) the same way.
     """
@@ -197,5 +199,5 @@ def _put(
             u, v, w = by_rig[i, row, 0], by_rig[i, row, 1], by_rig[i, row, 2]
             for j in range(3):
                 by_point[o, row, j] = u * turn[j, 0] + v * turn[j, 1] + w * turn[j, 2]
-            for g in range(source.shape[0]):
-                rest[o, row, target[g]] = slopes[i, row, source[g]]
+            for k in range(target.shape[0]):
+                rest[o, row, target[k]] = slopes[i, row, k]
