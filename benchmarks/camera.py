@@ -1,6 +1,6 @@
 """The camera, its peers and what theory allows: speed, absolute pose, calibration.
 
-    .venv/bin/python -m benchmarks.camera [--quick] [--json FILE] [--only speed pose calibration]
+    .venv/bin/python -m benchmarks.camera [--quick] [--json FILE] [--only PART ...]
 
 Everything that is compared is measured in this run. Ends with exit code 1 when a goal is missed.
 AquaCal needs an environment of its own, as it pins an OpenCV whose files clash with ours:
@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.base.executor import local_executor
-from benchmarks import camera_calibration, camera_pose, camera_speed
+from benchmarks import camera_calibration, camera_pose, camera_speed, target_calibration
 from benchmarks.figures import Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 
-_PARTS = ("speed", "pose", "calibration")
+_PARTS = ("speed", "pose", "calibration", "target")
 
 
 def main() -> None:
@@ -61,6 +61,18 @@ def main() -> None:
         judged = not options.quick
         findings += Findings(
             figures=tuple(f for mode in modes for f in mode.figures(judged=judged))
+        )
+    if "target" in options.only:
+        count = 40 if options.quick else 200
+        cases = [
+            target_calibration.run_case(name, range(count), local_executor(options.threads))
+            for name in target_calibration.TARGETS
+        ]
+        print(f"Calibration from real targets, {count} trials each.")
+        print(target_calibration.table(cases), "\n", flush=True)
+        report["target"] = [asdict(case) for case in cases]
+        findings += Findings(
+            figures=tuple(f for case in cases for f in case.figures(judged=not options.quick))
         )
     sys.exit(hand_over(options, about, findings, report))
 

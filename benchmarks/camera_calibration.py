@@ -1,7 +1,8 @@
 """Calibration through the ports from synthetic views, compared with its Cramer-Rao bound.
 
 25 stereo views of a board of 12 x 9 squares of 30 mm at 0.6 to 2.2 m, tilted, with 0.1 px of noise
-in each coordinate. Distance and normal of both ports and the pose of the right camera are unknown;
+in each coordinate. Distance and normal of both ports, the pose of the right camera and the board's
+shape (but for its usual spread) are unknown;
 the intrinsics are held at the truth, drawn from what a calibration in air would know and then taken
 with that prior, or unknown too. The adjustment starts from the design.
 
@@ -37,6 +38,7 @@ from camera_calib.freedom import (
 )
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Covariance, Rig
+from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape
 from tests.camera_calib.calibration_scenes import (
     BOARD,
     DESIGN,
@@ -156,6 +158,7 @@ def cramer_rao(
     seen: NDArray[np.bool_],
     freedom: Freedom,
     noise_px: float,
+    shape: TargetShape = AS_DRAWN,
 ) -> Covariance:
     """The least covariance that any unbiased calibration can have, at the true values.
 
@@ -166,15 +169,16 @@ def cramer_rao(
         seen: (V, cameras, N) which points are measured.
         freedom: what of the rig is unknown.
         noise_px: standard deviation of one coordinate.
+        shape: what of the target's shape is unknown.
 
     Raises:
         CalibrationError: the views do not determine a parameter.
     """
     pixels = np.where(seen[..., None], 0.0, np.nan)
-    problem = CalibrationProblem(pixels, points, rig, freedom)
+    problem = CalibrationProblem(pixels, points, rig, freedom, shape)
     state = problem.state(rig, rig_from_target)
     weights = np.where(problem.seen, 1.0 / noise_px**2, 0.0)
-    return problem.covariance(problem.equations(state, weights))
+    return problem.covariance(problem.equations(state, weights)).marginal(freedom.names(rig))
 
 
 def bound_of(known: Intrinsics) -> Covariance:
@@ -182,7 +186,8 @@ def bound_of(known: Intrinsics) -> Covariance:
     poses, lens = _scene()
     freedom = _freedom(known, replace(_TRUTH, covariance=lens))
     everywhere = np.ones((_VIEWS, 2, len(BOARD)), dtype=np.bool_)
-    return cramer_rao(_TRUTH, BOARD, poses, everywhere, freedom, _NOISE_PX)
+    shape = usual_shape(BOARD)
+    return cramer_rao(_TRUTH, BOARD, poses, everywhere, freedom, _NOISE_PX, shape)
 
 
 def _freedom(known: Intrinsics, start: Rig) -> Freedom:
@@ -222,10 +227,11 @@ def run_trial(seed: int, known: Intrinsics) -> Trial:
 
 def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Freedom) -> Array:
     """The step of Gauss and Newton from the truth: its covariance is the bound."""
-    problem = CalibrationProblem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
+    pixels, shape = stack_views(views, _TRUTH, len(BOARD)), usual_shape(BOARD)
+    problem = CalibrationProblem(pixels, BOARD, _TRUTH, freedom, shape)
     weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
     equations = problem.equations(problem.state(_TRUTH, poses), weights)
-    return equations.step().shared
+    return equations.step().shared[: -len(shape.parameters)]
 
 
 def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIAL) -> Mode:

@@ -114,7 +114,7 @@ PARTS = (
     Part(
         name="camera-calibration",
         module="camera",
-        arguments=lambda _, __: ("--only", "calibration"),
+        arguments=lambda _, __: ("--only", "calibration", "target"),
     ),
     Part(name="planner", module="planner", packages=("coverage_path_planner", "opencoverage")),
     Part(

@@ -21,11 +21,12 @@ from camera_calib.calibration import Calibration, TargetView
 from camera_calib.flat_port import IN_AIR
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, value
 from camera_calib.rig import Rig
-from camera_calib.target_shape import TargetShape
+from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 Array = NDArray[np.float64]
 
 GOAL_OF_SIGMA = (0.8, 1.25)
+MOST_GROWTH = 1.3
 _SIZE = (1600, 1200)
 _LENS = {
     "fx_px": 1702.0, "fy_px": 1699.0, "cx_px": 805.0, "cy_px": 593.0,
@@ -51,11 +52,22 @@ class Target:
     """How far it goes together, over the diagonal of the board."""
     place_m: float = 0.0
     """Noise of the places of corners on the board, along each axis of its plane."""
+    stretch: float = 0.0
+    """Its length along x over that along y, minus 1."""
 
 
 SOUND = Target()
-REAL = Target(together_px=0.12, place_m=2e-5)
-"""But for its bow."""
+_REAL = Target(together_px=0.12, place_m=2e-5)
+TARGETS = {
+    "sound": SOUND,
+    "correlated": _REAL,
+    "correlated, bow 0.25 mm": replace(_REAL, bow_m=2.5e-4),
+    "correlated, bow 0.5 mm": replace(_REAL, bow_m=5e-4),
+    "correlated far, bow 0.25 mm": replace(_REAL, bow_m=2.5e-4, reach=1.0),
+    "correlated near, bow 0.25 mm": replace(_REAL, bow_m=2.5e-4, reach=0.15),
+    "stretched 0.1 %": replace(_REAL, bow_m=2.5e-4, stretch=1e-3),
+}
+"""Boards 240 x 180 mm: what a plate may be, and what photographs of one show."""
 
 
 def drawn() -> Array:
@@ -87,6 +99,7 @@ def bent(target: Target, rng: np.random.Generator) -> Array:
         size = np.ptp(flat, axis=0)
         sag = np.cos(np.pi * flat[:, 0] / size[0]) * np.cos(np.pi * flat[:, 1] / size[1])
         out[:, 2] += 0.2 * target.bow_m * rng.choice([-1.0, 1.0]) * sag
+    out[:, :2] *= [1.0 + target.stretch / 2.0, 1.0 - target.stretch / 2.0]
     out[:, :2] += rng.normal(0.0, target.place_m or 1e-12, (len(out), 2))
     return out + middle
 
@@ -130,7 +143,7 @@ def views_of(target: Target, rng: np.random.Generator, count: int = _VIEWS) -> l
 
 def true_rig() -> Rig:
     """One camera in air."""
-    camera = replace(blank_camera(_SIZE, **IN_AIR), **_LENS)
+    camera = blank_camera(_SIZE, **IN_AIR).with_parameters(_LENS)
     return Rig(
         cameras={"camera": camera},
         cam_from_rig={"camera": RigidTransform.identity()},
@@ -148,7 +161,79 @@ def run_trial(seed: int, target: Target, shape: TargetShape | None = None) -> Ca
 
 
 def scores(found: Calibration) -> Array:
-    """(P,) errors over their sigmas."""
-    truth = true_rig()
-    sigmas = found.rig.sigmas
+    """(P,) errors over their sigmas, of `NAMES`."""
+    truth, sigmas = true_rig(), found.rig.sigmas
     return np.array([(value(found.rig, n) - value(truth, n)) / sigmas[n] for n in NAMES])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """Calibrations from boards with the same faults."""
+
+    name: str
+    trials: int
+    by_sigma: tuple[float, ...]
+    """Root mean square of error over sigma, of `NAMES`."""
+    sigma_fx_px: float
+    sigma_growth: float
+    """Sigma of fx over that of a calibration that takes the board as drawn."""
+    fx_rms_px: float
+    fx_as_drawn_rms_px: float
+    """The same of calibrations that take the board as drawn."""
+
+    def figures(self, *, judged: bool) -> list[Figure]:
+        """Errors over sigmas, and what unknown shapes cost where the board is sound."""
+        low, high = GOAL_OF_SIGMA
+        goal = Goal(least=low, most=high) if judged else None
+        ends = (("least", min(self.by_sigma)), ("most", max(self.by_sigma)))
+        found = [
+            Figure(
+                name=f"board {self.name}: error over sigma, rms, {which} of {len(NAMES)}",
+                value=end, unit="sigmas", goal=goal,
+            )
+            for which, end in ends
+        ]  # fmt: skip
+        if self.name == "sound":
+            most = Goal(most=MOST_GROWTH) if judged else None
+            name = "board sound: sigma of fx over that of a board known as flat"
+            found.append(Figure(name=name, value=self.sigma_growth, unit="1", goal=most))
+        return found
+
+
+def _row(seed: int, target: Target) -> tuple[Array, Array]:
+    """Scores of one trial; fx's sigma, error, and both with the board as drawn."""
+    rows = [run_trial(seed, target, shape) for shape in (None, AS_DRAWN)]
+    numbers = [(c.rig.sigmas[NAMES[0]], value(c.rig, NAMES[0]) - _LENS["fx_px"]) for c in rows]
+    return scores(rows[0]), np.ravel(numbers)
+
+
+def run_case(name: str, seeds: Sequence[int], executor: Executor = SERIAL) -> Case:
+    """All trials of one of `TARGETS`."""
+    work = partial(_row, target=TARGETS[name])
+    rows = list(executor.map(work, seeds, label=f"calibrations, board {name}"))
+    by_sigma = np.sqrt(np.mean([row[0] ** 2 for row in rows], axis=0))
+    sigma, error, sigma_drawn, error_drawn = np.array([row[1] for row in rows]).T
+    return Case(
+        name=name,
+        trials=len(rows),
+        by_sigma=tuple(by_sigma.tolist()),
+        sigma_fx_px=float(sigma.mean()),
+        sigma_growth=float((sigma / sigma_drawn).mean()),
+        fx_rms_px=float(np.sqrt(np.mean(error**2))),
+        fx_as_drawn_rms_px=float(np.sqrt(np.mean(error_drawn**2))),
+    )
+
+
+def table(cases: Sequence[Case]) -> str:
+    """All cases in Markdown."""
+    lines = [
+        "| board | sigma of fx, px | error of fx, rms px | taken as drawn | error / sigma, rms, "
+        f"least to most of {len(NAMES)} |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {c.name} | {c.sigma_fx_px:.2f} | {c.fx_rms_px:.2f} | {c.fx_as_drawn_rms_px:.2f} | "
+        f"{min(c.by_sigma):.2f} to {max(c.by_sigma):.2f} |"
+        for c in cases
+    ]
+    return "\n".join(lines)

@@ -63,6 +63,9 @@ class Spread:
     shared: Array
     """(P, M) factor of the part of it that other views of the same target have in common: errors of
     the priors' means and of the places of corners. The product with its transpose is that part."""
+    of_places: Array
+    """(N, 3, N, 3) information of the views, over that of independent noise, on offsets of the
+    target's points, with poses, rig and shape adjusted to them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,8 +117,10 @@ class Calibration:
 
     @property
     def shared(self) -> Array:
-        """(P, M) factor of the part of the rig's covariance that other views of the same target
-        have in common: by errors of the priors' means and of the places of its corners."""
+        """(P, M) factor of what the rig's covariance has in common with other views of the target.
+
+        That is by errors of the priors' means and of the places of the target's corners.
+        """
         covariance = self.rig.covariance
         if covariance is None:
             return np.zeros((0, 0))

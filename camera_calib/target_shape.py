@@ -1,9 +1,12 @@
 """Departure of a real target from its drawing, as modes with a prior.
 
 Boards bend: paper on a plate, a plate on its stand. A quarter of a millimetre over 200 mm moves a
-focal length by near 1 %, and no view that was held out shows it, for the board is bent in all. The
-modes are polynomials over the target's plane; those of degree 2 are mrcal's (`calobject_warp`: each
-parabola is 0 at its edges) and a twist, higher degrees take up what a real plate leaves of them.
+focal length by near 1 %, and no view that was held out shows it, for the board is bent in all.
+Printers and paper stretch: a sheet longer by 0.1 % along one side moves fx against fy by as much.
+
+Bends are polynomials over the target's plane; those of degree 2 are mrcal's (`calobject_warp`: each
+parabola is 0 at its edges) and a twist, higher degrees take up what a real plate leaves of them. In
+the plane there are a stretch of x over y and a shear; the size as such is the target's.
 """
 
 from dataclasses import dataclass, replace
@@ -18,11 +21,14 @@ from camera_calib.freedom import NO_PRIOR, Prior
 OWNER = "target"
 """Stands in the place of a camera in the names of a target's parameters."""
 BOW_X, BOW_Y, TWIST = f"{OWNER}.bow_x_m", f"{OWNER}.bow_y_m", f"{OWNER}.twist_m"
+STRETCH, SHEAR = f"{OWNER}.stretch", f"{OWNER}.shear"
 _BEND_SHARE = 1.0 / 300.0
 """Prior sigma of a bow over the target's diagonal: 1 mm for 300 mm, as of boards on plates."""
 _PER_DEGREE = 0.25
 """Prior sigma of a mode over that of one degree less: bends of real plates are smooth."""
 _DEGREES = 4
+_IN_PLANE = 1e-3
+"""Prior sigma of stretch and shear, as of paper and office printers."""
 _FLAT_SHARE = 0.02
 """Largest depth over diagonal of a target that can bend as one sheet."""
 
@@ -57,7 +63,8 @@ class TargetShape:
         """(N, 3), or 0 without modes, points minus the drawing."""
         if not self.parameters:
             return np.zeros(3)
-        return np.einsum("k,kni->ni", self.values, self.modes)
+        offsets: Array = np.einsum("k,kni->ni", self.values, self.modes)
+        return offsets
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -89,8 +96,8 @@ def is_sheet(points: Array) -> bool:
     return bool(size[:2].min() > 0.0 and size[2] <= _FLAT_SHARE * np.hypot(size[0], size[1]))
 
 
-def bends(points: Array) -> TargetShape:
-    """Bends of a flat target across its plane; none of a target in space.
+def usual_shape(points: Array) -> TargetShape:
+    """Bends of a flat target, its stretch and its shear; none of a target in space.
 
     Args:
         points: (N, 3) as drawn, metres, the plane being that of x and y.
@@ -111,11 +118,14 @@ def bends(points: Array) -> TargetShape:
                 wave = wave * legendre.legval(y, np.eye(degree + 1)[powers[1]])
                 depths[f"{OWNER}.bend_{powers[0]}{powers[1]}_m"] = wave
                 sigmas.append(_BEND_SHARE * diagonal_m * _PER_DEGREE ** (degree - 2))
-    modes = np.zeros((len(depths), len(points), 3))
-    modes[..., 2] = list(depths.values())
+    bend = np.zeros((len(depths), len(points), 3))
+    bend[..., 2] = list(depths.values())
+    half_x, half_y = (0.5 * (points - points.mean(axis=0))[:, :2]).T
+    plane = np.zeros((2, len(points), 3))
+    plane[:, :, :2] = [np.stack([half_x, -half_y], axis=1), np.stack([half_y, half_x], axis=1)]
     return TargetShape(
-        parameters=tuple(depths),
-        modes=modes,
-        prior_sigmas=np.array(sigmas),
-        values=np.zeros(len(depths)),
+        parameters=(*depths, STRETCH, SHEAR),
+        modes=np.concatenate([bend, plane]),
+        prior_sigmas=np.array([*sigmas, _IN_PLANE, _IN_PLANE]),
+        values=np.zeros(len(sigmas) + 2),
     )

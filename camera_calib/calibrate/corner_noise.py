@@ -119,6 +119,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
         ),
         covariance=Covariance(parameters=problem.names, matrix=0.5 * (matrix + matrix.T)),
         shared=factor,
+        of_places=products.of_places,
     )
 
 
@@ -148,11 +149,12 @@ class _Products:
             for p in self.poses
         ]
 
+        self.of_places = self._of_places()
+
     def variances(self) -> Array:
         """Variances of the parts within pictures, then of places by axes (square metres)."""
         count = len(self.parts)
         size = count + len(_AXES)
-        left = self._left_places()
         table, seen = np.zeros((size, size)), np.zeros(size)
         for i in range(count):
             for j in range(i + 1):
@@ -165,7 +167,9 @@ class _Products:
         for i, axes in enumerate(_AXES):
             seen[count + i] = float((pulled[:, axes] ** 2).sum())
             for j, others in enumerate(_AXES):
-                table[count + i, count + j] = float((left[:, axes][..., others] ** 2).sum())
+                table[count + i, count + j] = float(
+                    (self.of_places[:, axes][..., others] ** 2).sum()
+                )
         scale = 1.0 / np.sqrt(np.diag(table))
         # Under independent errors the products' covariance is twice the table.
         root = np.linalg.cholesky(table * np.outer(scale, scale) + 1e-12 * np.eye(size))
@@ -203,13 +207,13 @@ class _Products:
         square = by_place.T @ by_place
         return total + float(np.trace(inverse @ square @ inverse @ self.by_rig[i]))
 
-    def _left_places(self) -> Array:
+    def _of_places(self) -> Array:
         """(N, 3, N, 3) products of places' slopes, after all unknowns were fitted."""
         rows, count = self.rows, self.by_place.shape[0]
         posed = self.place_of_pose.transpose(1, 2, 0, 3).reshape(3 * count, -1)
         by_place = self.by_place.reshape(3 * count, -1)
         left = -(posed @ posed.T) - by_place @ self.inverse @ by_place.T
-        blocks = left.reshape(count, 3, count, 3)
+        blocks: Array = left.reshape(count, 3, count, 3)
         own = np.einsum("vcnai,vcnaj->nij", rows.by_place, rows.by_place)
         blocks[np.arange(count), :, np.arange(count)] += own
         return blocks

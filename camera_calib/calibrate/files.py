@@ -69,6 +69,16 @@ def summary(calibration: Calibration) -> dict[str, Any]:
             for c, camera in enumerate(names)
             if camera in view.pixels
         ],
+        "target_shape": {
+            name: {"value": value, "sigma": sigma, "prior_sigma": prior}
+            for (name, sigma), value, prior in zip(
+                calibration.shape.sigmas.items(),
+                calibration.shape.values.tolist(),
+                calibration.shape.prior_sigmas.tolist(),
+                strict=True,
+            )
+        },
+        "corner_noise": _noise(calibration),
         "baseline_m": round(rig.baseline_m, 9) if len(names) > 1 else None,
         "held": "all parameters of the rig that are not listed",
         "with_prior": list(calibration.freedom.prior.parameters),
@@ -79,6 +89,19 @@ def summary(calibration: Calibration) -> dict[str, Any]:
             for r in calibration.rejections
         ],
         "warnings": list(calibration.warnings),
+    }
+
+
+def _noise(calibration: Calibration) -> dict[str, Any] | None:
+    """Parts of the corners' noise; pixels of the pictures of mean noise."""
+    if calibration.spread is None:
+        return None
+    noise = calibration.spread.noise
+    return {
+        "alone_px": calibration.noise_px * noise.alone**0.5,
+        "together_px": calibration.noise_px * float(noise.together.sum()) ** 0.5,
+        "places_in_plane_m": noise.place_sigmas_m[0],
+        "places_across_m": noise.place_sigmas_m[1],
     }
 
 

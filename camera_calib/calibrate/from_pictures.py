@@ -33,6 +33,7 @@ from camera_calib.flat_port import IN_AIR, FlatPortCamera
 from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.target_shape import BOW_X, BOW_Y, SHEAR, STRETCH, TWIST
 from camera_calib.targets.target import Target, parse_target
 
 ONE_CAMERA = "camera"
@@ -357,11 +358,34 @@ def calibration_text(
         f"{len(calibration.views)} views, {int(np.isfinite(square).sum())} points, "
         f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
         *_baseline_lines(rig, target),
+        *_shape_lines(calibration),
     ]
     for name in rig.cameras:
         lines += _camera_lines(rig, name)
     lines += _verdict_lines(verdicts, len(calibration.warnings))
     return "\n".join(lines)
+
+
+def _shape_lines(calibration: Calibration) -> Iterator[str]:
+    """How the target differs from its drawing, and how much of the noise goes together."""
+    shape = calibration.shape
+
+    def stated(name: str, scale: float) -> str:
+        number, sigma = shape.known(name)
+        return with_sigma(scale * number, scale * sigma)
+
+    if shape.parameters:
+        yield (
+            f"target: bow over its width {stated(BOW_X, 1e3)} mm, over its height "
+            f"{stated(BOW_Y, 1e3)} mm, twist {stated(TWIST, 1e3)} mm; x over y longer by "
+            f"{stated(STRETCH, 1e2)} %, shear {stated(SHEAR, 1e2)} %"
+        )
+    if calibration.spread is not None:
+        noise = calibration.spread.noise
+        yield (
+            f"noise of corners: {noise.together_share:.0%} goes together in a picture; places on "
+            f"the target err by {1e3 * noise.place_sigmas_m[0]:.3f} mm in its plane"
+        )
 
 
 def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:

@@ -85,11 +85,13 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     held = of_cameras(rig, [name])
     wider = Freedom(free=(*freedom.free, *held), prior=freedom.prior)
     pixels = stack_views(calibration.views, rig, len(calibration.target_points))
-    problem = CalibrationProblem(pixels, calibration.target_points, rig, wider)
+    shape = calibration.shape
+    problem = CalibrationProblem(pixels, calibration.drawn_points, rig, wider, shape)
     weights = np.where(problem.seen, calibration.sigma_px[..., None] ** -2.0, 0.0)
     state = problem.state(rig, calibration.rig_from_target)
     information = problem.equations(state, weights).information
-    adjusted = freedom.names(rig)
+    of_rig = freedom.names(rig)
+    adjusted = (*of_rig, *shape.parameters)
     a = [problem.names.index(n) for n in adjusted]
     b = [problem.names.index(n) for n in held]
     scale = 1.0 / np.sqrt(np.diag(information)[a])
@@ -99,7 +101,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     known = float(information[np.ix_(b, b)].sum() + coupling @ slopes)
     return HeldEffect(
         sigma=1.0 / math.sqrt(known) if known > 0.0 else math.inf,
-        slopes=dict(zip(adjusted, slopes.tolist(), strict=True)),
+        slopes=dict(zip(of_rig, slopes.tolist(), strict=False)),
     )
 
 

@@ -39,7 +39,7 @@ from camera_calib.freedom import (
     pose_names,
 )
 from camera_calib.rig import Rig
-from camera_calib.target_shape import TargetShape, bends
+from camera_calib.target_shape import TargetShape, usual_shape
 
 Intrinsics = Literal["held", "prior", "free"]
 
@@ -83,7 +83,7 @@ def calibrate(
         start: near the truth, such as the design; what is not adjusted is taken from it.
         freedom: what is adjusted.
         source: how, for the rig's `source`.
-        shape: how the target may differ from its drawing; None for bends of a flat one, and
+        shape: how the target may differ from its drawing; None for that of a flat sheet, and
             `AS_DRAWN` for points that are known better.
 
     Raises:
@@ -91,7 +91,7 @@ def calibrate(
     """
     usable, rejections = _usable(views, points)
     _check_served(usable, start)
-    shape = bends(points) if shape is None else shape
+    shape = usual_shape(points) if shape is None else shape
     found = locate_all(start, usable, points + shape.offsets_m)
     for view, pose in zip(usable, found, strict=True):
         if pose is None:

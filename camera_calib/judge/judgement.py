@@ -24,6 +24,7 @@ from camera_calib.judge.fit_quality import (
     spread,
 )
 from camera_calib.judge.homography import HomographyTest, homography_test
+from camera_calib.judge.target_frame import TargetFrame, target_frame
 from camera_calib.judge.uncertainty import (
     ProjectionSigma,
     StereoSigma,
@@ -37,10 +38,12 @@ from camera_calib.judge.uncertainty import (
     stereo_sigma,
 )
 from camera_calib.judge.validation import (
+    HalvesAgreement,
     HalvesDifference,
     HeldOut,
     HoldOutScore,
     LengthErrors,
+    halves_agreement,
     halves_difference,
     length_errors,
     score_hold_out,
@@ -133,6 +136,9 @@ class Judgement:
     held_lengths: LengthErrors | None
     """Errors on held-out views, in the rig calibrated without them."""
     hold_out: HoldOutScore | None
+    halves: HalvesAgreement | None
+    """All parameters of two calibrations, from either half of the views."""
+    target_frame: TargetFrame | None
 
     @property
     def stereo_at_work(self) -> StereoSigma | None:
@@ -203,6 +209,8 @@ def judge(
         lengths=lengths,
         held_lengths=held_lengths,
         hold_out=None if held is None else score_hold_out(held),
+        halves=None if held is None or held.halves is None else halves_agreement(held.halves),
+        target_frame=target_frame(calibration),
     )
 
 

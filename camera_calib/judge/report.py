@@ -11,7 +11,7 @@ from alice_survey.base.run import progress
 from alice_survey.kit.document import Figure, Report, Section, Table, Verdict, worst_first
 from alice_survey.kit.page import render_html
 from alice_survey.kit.words import with_sigma
-from camera_calib.calibration import Calibration
+from camera_calib.calibration import Calibration, CornerNoise
 from camera_calib.judge import plots
 from camera_calib.judge.fit_quality import GATE_SIGMAS, TILTED_DEG
 from camera_calib.judge.judgement import CameraJudgement, Judgement, Parameter, judge, short_label
@@ -61,11 +61,18 @@ def report_json(judged: Judgement, found: Sequence[Verdict]) -> dict[str, Any]:
             "rejections": calibration.rejections,
             "parameters": judged.parameters,
             "baselines_m": judged.baselines_m,
+            "target_frame": _target_numbers(judged),
             "pictures": judged.pictures,
             "cameras": {name: _camera_numbers(c) for name, c in judged.cameras.items()},
             "stereo": judged.stereo,
             "lengths": _length_numbers(judged.lengths),
             "held_out": judged.hold_out,
+            "halves": judged.halves
+            and {
+                "chi2": judged.halves.chi2,
+                "parameters": judged.halves.parameters,
+                "p_value": judged.halves.p_value,
+            },
             "held_out_lengths": _length_numbers(judged.held_lengths),
         }
     )
@@ -93,6 +100,18 @@ def _camera_numbers(camera: CameraJudgement) -> dict[str, Any]:
             "by_radius": test.profile,
         },
         "halves": halves and {"rms_px": halves.rms_px, "expected_px": halves.expected_rms_px},
+    }
+
+
+def _target_numbers(judged: Judgement) -> dict[str, Any] | None:
+    frame = judged.target_frame
+    if frame is None:
+        return None
+    return {
+        "returning_px": frame.returning_px,
+        "p_value": frame.p_value,
+        "in_plane_m": frame.in_plane_m,
+        "likely": frame.cause if frame.returns else None,
     }
 
 
@@ -143,6 +162,8 @@ def _facts(judged: Judgement) -> Iterator[tuple[str, str]]:
 
 def _sections(judged: Judgement) -> Iterator[Section]:
     yield _parameters_section(judged)
+    if judged.calibration.spread is not None:
+        yield _target_section(judged.calibration, judged.calibration.spread.noise)
     yield _residuals_section(judged)
     yield _correlations_section(judged)
     yield _uncertainty_section(judged)
@@ -188,6 +209,38 @@ def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
         return label, f"{parameter.value:.6g}", parameter.unit, "held", ""
     alike = f"{parameter.most_alike} ({parameter.correlation:+.2f})" if parameter.most_alike else ""
     return label, with_sigma(parameter.value, parameter.sigma), parameter.unit, known, alike
+
+
+def _target_section(calibration: Calibration, noise: CornerNoise) -> Section:
+    """The target's shape, and what the noise of its corners is made of."""
+    shape, rows = calibration.shape, []
+    for name, prior in zip(shape.parameters, shape.prior_sigmas.tolist(), strict=True):
+        scale, unit = (1e3, "mm") if name.endswith("_m") else (1e2, "%")
+        value, sigma = shape.known(name)
+        known = with_sigma(scale * value, scale * sigma)
+        rows.append((short_label(name.rpartition(".")[2]), known, unit, f"{scale * prior:.2g}"))
+    tables = [
+        Table(
+            title="Departure from the drawing",
+            header=("mode", "value", "unit", "sigma before"),
+            rows=rows,
+        )
+    ]
+    return Section(
+        title="Target",
+        text=(
+            "The target's shape is found with the cameras: bow x and y are the depth of its middle "
+            "behind the ends of its width and height, twist of its corners; bend 30 to 04 are "
+            "ripples by their degree over width and height; stretch is the length of x over that "
+            "of y, shear what its right angle lacks. Sigmas of the cameras include those of the "
+            "shape.",
+            f"Of the noise's variance {noise.together_share:.0%} goes together between corners of "
+            f"a picture or view, and corners lie {1e3 * noise.place_sigmas_m[0]:.3f} mm (one "
+            "sigma, each axis) off their places in the target's plane. All sigmas include that; "
+            "counted as independent, errors would look smaller than they are.",
+        ),
+        tables=tables if rows else [],
+    )
 
 
 def _residuals_section(judged: Judgement) -> Section:
@@ -300,7 +353,7 @@ def _uncertainty_section(judged: Judgement) -> Section:
             alt="Maps of the projection's standard deviation over each frame",
             shows="One sigma, in its worst direction, of where a point is projected, from the "
             "calibration alone. Above, the point is fixed to the targets seen, and the pose that "
-            "fits best takes up what it can (mrcal's uncertainty): what surveys suffer whose poses "
+            "fits best takes up what it can: what surveys suffer whose poses "
             "come from the pictures. Below, the point is fixed to the camera.",
             good="Above: less than the noise of a point over most of the frame.",
             otherwise="Dark corners need points there; dark everywhere needs more views.",
@@ -403,7 +456,14 @@ def _hold_out_section(judged: Judgement) -> Section:
                 alt="Maps and arrows: difference of projection between two calibrations",
                 shows="Two calibrations, from every other view each: how far apart they project "
                 f"at {judged.working_range_m:.3g} m, after the best pose between them.",
-                good="No more than about twice the expected rms in the titles.",
+                good="No more than about twice the expected rms in the titles."
+                + (
+                    ""
+                    if judged.halves is None
+                    else f" All parameters together differ by chi2 {judged.halves.chi2:.1f} for "
+                    f"{judged.halves.parameters} (p = {judged.halves.p_value:.2g}); below 0.01 is "
+                    "rarely chance."
+                ),
                 otherwise="Much more: the sigmas are too small, as the model is wrong or the "
                 "target moved; do not trust the maps above.",
             )

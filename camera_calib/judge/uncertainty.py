@@ -83,7 +83,7 @@ def compensation(rig: Rig, camera: str, anchors_cam: Array) -> Array:
     """Change of the best-fitting pose with each parameter's error, (6, P).
 
     A rotation and a translation of the anchors, small, in the camera's frame, chosen so that their
-    projections move least overall. mrcal's reprojection uncertainty does the same with the boards.
+    projections move least overall.
 
     Raises:
         CalibrationError: the anchors do not determine a pose.
@@ -122,8 +122,11 @@ class ProjectionSigma:
     plain_px: Array
     """Uncertainty of a point fixed to the camera: applies to a rig that measures by itself."""
     compensated_px: Array
-    """Uncertainty of a point fixed to the scene, after the best-fitting pose compensates:
-    applies to pictures with poses estimated from them. mrcal reports this one."""
+    """Uncertainty of a point fixed to the scene, after the pose that projects the targets most
+    alike compensates: applies to pictures with poses estimated from them. Errors of the targets'
+    own poses do not count; in mrcal 2.2 (`projection_uncertainty`) they do, as a point is there
+    fixed to the mean of all boards. Both agree towards the edges; in the middle of the frame, at
+    distances where no board was, mrcal's is several times larger."""
 
 
 def projection_sigma(

@@ -39,7 +39,7 @@ from camera_calib.triangulate import triangulate
 _EVERY = 5
 """One view in this many is held out."""
 _LEAST_KNOWN = 1e-12
-"""Least eigenvalue, over the largest, of a covariance scaled to unit variances: less is rounding."""
+"""Least eigenvalue over the largest of a covariance scaled to unit variances; less is rounding."""
 
 Calibrate = Callable[[Sequence[TargetView]], Calibration]
 Locate = Callable[[Rig, TargetView, Array], RigidTransform]

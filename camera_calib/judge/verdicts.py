@@ -8,7 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from alice_survey.kit.document import Level, Verdict, worst_first
+from alice_survey.kit.words import with_sigma
 from camera_calib.judge.judgement import CameraJudgement, Judgement
+from camera_calib.target_shape import BOW_X, BOW_Y
 
 _ODD_PICTURE = 2.0
 _MOST_OUTLIERS = 0.01
@@ -16,6 +18,14 @@ _MOST_OUTLIERS = 0.01
 _HELD_LOOK, _HELD_BAD = 1.2, 2.0
 _HALVES_LOOK, _HALVES_BAD = 2.0, 3.5
 """One difference is a single draw from what is expected."""
+_P_LOOK, _P_BAD = 1e-2, 1e-6
+"""Probabilities of the difference of two halves."""
+_OPEN = 0.5
+"""Share of its prior's sigma above which the views do not show a bow."""
+_VERY_BENT = 2.0
+"""Bow over its prior's sigma."""
+_RETURNING = 0.5
+"""Residuals that return in the target's frame, over the noise of a coordinate."""
 _SIGMAS = 3.0
 _TREND_LOOK, _TREND_BAD = 0.35, 1.0
 _SIGMA_LOOK, _SIGMA_BAD = 3.0, 10.0
@@ -31,8 +41,9 @@ def _lines(judged: Judgement) -> Iterator[Verdict]:
     yield from _fit_verdicts(judged)
     yield from _hold_out_verdicts(judged)
     yield from _length_verdicts(judged)
+    yield from _target_verdicts(judged)
     for name, camera in judged.cameras.items():
-        yield from _homography_verdicts(name, camera)
+        yield from _homography_verdicts(judged, name, camera)
     yield from _uncertainty_verdicts(judged)
 
 
@@ -99,6 +110,66 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 f"rms over the frame, {found / expected:.2f} times what their covariances promise",
             )
 
+    if judged.halves is not None:
+        halves = judged.halves
+        level: Level = "good" if halves.p_value >= _P_LOOK else "look"
+        level = level if halves.p_value >= _P_BAD else "bad"
+        plausible = "plausible" if level == "good" else "not plausible"
+        yield Verdict(
+            level=level,
+            text=f"parameters from either half of the views differ by chi2 {halves.chi2:.1f} for "
+            f"{halves.parameters} (p = {halves.p_value:.2g}): {plausible}"
+            + ("" if level == "good" else ", the sigmas are too small: is a view wrong, or did "
+               "lens, port or target change?"),
+        )  # fmt: skip
+
+
+def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Verdicts on the target itself."""
+    shape, frame = judged.calibration.shape, judged.target_frame
+    for name in (BOW_X, BOW_Y):
+        if name in shape.parameters:
+            bow_m, sigma_m = shape.known(name)
+            at = shape.parameters.index(name)
+            usual_m, along = float(shape.prior_sigmas[at]), "width" if name == BOW_X else "height"
+            known = f"{with_sigma(1e3 * bow_m, 1e3 * sigma_m)} mm"
+            if sigma_m > _OPEN * usual_m:
+                yield Verdict(
+                    level="look",
+                    text=f"the views hardly show how the target bends over its {along}: {known}; "
+                    "the sigmas include that; tilt it more",
+                )
+            elif abs(bow_m) > _VERY_BENT * usual_m:
+                yield Verdict(
+                    level="look",
+                    text=f"the target is bent over its {along} by {known}: more than a board "
+                    f"should ({_VERY_BENT * 1e3 * usual_m:.1f} mm); it is taken into account, but "
+                    "such a board may bend differently in every view: use a stiff one",
+                )
+    if frame is None:
+        return
+    noise_px = judged.calibration.noise_px
+    if not frame.returns:
+        yield Verdict(
+            level="good",
+            text="in the target's frame residuals average to nothing"
+            + (": it is as drawn, but for the shape that was found" if shape.parameters else ""),
+        )
+        return
+    small = frame.returning_px <= _RETURNING * noise_px
+    cause = {
+        "shape": "the target is bent or stretched, and its shape was not adjusted",
+        "corners": "a few of its corners are out of their places, or damaged",
+        "uneven": "its print or paper is uneven, or it bends where no smooth sheet would",
+    }[frame.cause]
+    yield Verdict(
+        level="good" if small and frame.cause != "shape" else "look",
+        text=f"in the target's frame {frame.returning_px:.3f} px of the residuals return in view "
+        f"after view (p = {frame.p_value:.1g}), {1e3 * frame.in_plane_m:.2f} mm rms in its plane: "
+        f"likely {cause}"
+        + ("; small against the noise, and in the sigmas" if small else "; use a better target"),
+    )
+
 
 def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for lengths, which in ((judged.held_lengths, "held-out"), (judged.lengths, "used")):
@@ -116,16 +187,25 @@ def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
         )
 
 
-def _homography_verdicts(name: str, camera: CameraJudgement) -> Iterator[Verdict]:
-    test = camera.homography
-    if test is not None and np.isfinite(test.outer_px):
-        ratio = test.excess_px / max(test.inner_px, 1e-12)
-        yield Verdict(
-            level=_graded(ratio, _TREND_LOOK, _TREND_BAD),
-            text=f"{name}: homographies leave {test.inner_px:.3f} px within and {test.outer_px:.3f}"
-            f" px beyond {test.outer_from_px:.0f} px from the centre"
-            + ("" if ratio <= _TREND_LOOK else "; the model of lens or port does not fit"),
-        )
+def _homography_verdicts(
+    judged: Judgement, name: str, camera: CameraJudgement
+) -> Iterator[Verdict]:
+    test, frame = camera.homography, judged.target_frame
+    if test is None or not np.isfinite(test.outer_px):
+        return
+    ratio = test.excess_px / max(test.inner_px, 1e-12)
+    cause = "the model of lens or port does not fit"
+    if frame is not None and frame.returns:
+        if frame.cause == "shape":
+            cause = "the target is not as drawn (above)"
+        elif frame.returning_px > _RETURNING * judged.calibration.noise_px:
+            cause = f"the target is uneven (above), or {cause}"
+    yield Verdict(
+        level=_graded(ratio, _TREND_LOOK, _TREND_BAD),
+        text=f"{name}: homographies leave {test.inner_px:.3f} px within and {test.outer_px:.3f}"
+        f" px beyond {test.outer_from_px:.0f} px from the centre"
+        + ("" if ratio <= _TREND_LOOK else f"; {cause}"),
+    )
 
 
 def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:

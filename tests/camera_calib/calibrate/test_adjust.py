@@ -41,6 +41,7 @@ from tests.camera_calib.calibration_scenes import (
     built_rig,
     in_air,
     scene,
+    tilted,
     views_of,
     with_pixels,
     with_values,
@@ -321,3 +322,35 @@ def test_unknown_names_are_refused() -> None:
     with pytest.raises(CalibrationError, match="top"):
         other = [replace(views[0], pixels={"top": views[0].pixels["left"]})]
         adjust(other, points, rig, poses[[0]], HELD)
+
+
+def test_a_start_from_which_points_leave_the_model_does_not_pass_as_settled() -> None:
+    """Light goes through a tank, as glass, whose far wall must move past the board's near edge."""
+    tank = replace(
+        DESIGN.cameras["left"],
+        port_distance_m=0.10, glass_thickness_m=0.26, n_glass=1.33, n_water=1.0,
+        normal=tilted(11.0, 0.0),
+    )  # fmt: skip
+    truth = Rig(
+        cameras={"tank": tank},
+        cam_from_rig={"tank": RigidTransform.identity()},
+        body_from_rig=RigidTransform.identity(),
+        source="tank",
+    )
+    rng = np.random.default_rng(1)
+    poses = board_poses(truth, 3, rng, near_m=0.6, far_m=0.65, points=board(5, 4, 0.03))
+    points = board(5, 4, 0.03)
+    views = views_of(truth, poses, 0.3, rng, points)
+    free = Freedom(free=("tank.glass_thickness_m", "tank.normal_x", "tank.normal_y"))
+
+    good = adjust(views, points, with_values(truth, {"tank.glass_thickness_m": 0.2}), poses, free)
+    assert good.is_settled
+    assert value(good.rig, "tank.glass_thickness_m") == pytest.approx(0.26, abs=0.03)
+
+    # A slab moves pixels by its thickness, wherever it stands: held too far, it has no room.
+    far = with_values(truth, {"tank.port_distance_m": 0.38, "tank.glass_thickness_m": 0.1})
+    stuck = adjust(views, points, far, poses, free, at_most=40)
+    assert np.nanmax(np.abs(stuck.residuals_px)) > 3.0
+    assert not stuck.is_settled
+    with pytest.raises(CalibrationError, match="stuck"):
+        adjust(views, points, far, poses, free)

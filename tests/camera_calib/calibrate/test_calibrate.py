@@ -30,6 +30,7 @@ from camera_calib.freedom import (
     value,
 )
 from camera_calib.rig import Rig
+from camera_calib.target_shape import usual_shape
 from tests.camera_calib.calibration_scenes import (
     BOARD,
     DESIGN,
@@ -275,8 +276,8 @@ def test_parts_of_the_views_calibrate_alike_and_a_view_is_located() -> None:
     assert half.rig.sigmas["left.fx_px"] > whole.rig.sigmas["left.fx_px"]
     off = scores(half.rig, whole.rig, "distance_m", "_px")
     assert np.abs(off).max() < 4
-    pose = locate(half.rig, views[1], BOARD)
-    assert np.linalg.norm(pose.translation - poses[1].translation) < 2e-3
+    pose = locate(half.rig, views[1], half.target_points)
+    assert np.linalg.norm(pose.translation - poses[1].translation) < 3e-3
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.3])
@@ -374,6 +375,7 @@ def test_what_views_show_of_the_water_counts_pictures_as_the_calibration_did() -
     both = adjust(
         views, BOARD, found.rig, found.rig_from_target,
         Freedom(free=found.freedom.free, prior=prior), at_most=1, blur=found.blur,
+        shape=found.shape,
     ).rig  # fmt: skip
 
     assert both.sigmas["left.n_water"] == pytest.approx(stated / np.sqrt(2), rel=0.05)
@@ -384,11 +386,14 @@ def test_sharp_pictures_weigh_more_than_dull_ones() -> None:
     """Nearly as good as knowing which they are."""
     views, poses, blur = views_of_uneven_noise()
     found = calibrate_through_ports(views, BOARD, TRUTH, "held")
-    alike = adjust(views, BOARD, TRUTH, poses, found.freedom)
-    known = adjust(views, BOARD, TRUTH, poses, found.freedom, blur=blur / np.sqrt(np.mean(blur**2)))
+    true = blur / np.sqrt(np.mean(blur**2))
+    alike, known = (
+        adjust(views, BOARD, TRUTH, poses, found.freedom, blur=some, shape=usual_shape(BOARD))
+        for some in (None, true)
+    )
     for name, sigma in found.rig.sigmas.items():
         assert sigma < 0.9 * alike.rig.sigmas[name]
-        assert sigma == pytest.approx(known.rig.sigmas[name], rel=0.1)
+        assert sigma == pytest.approx(known.rig.sigmas[name], rel=0.2)
     assert found.noise_px == pytest.approx(np.sqrt(np.mean(blur**2)), rel=0.1)
     assert found.rejections == ()
 

@@ -93,7 +93,7 @@ def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
     rig = read_rig(folder / "rig.json")
     assert rig.cameras["left"].fx_px == pytest.approx(533.4, abs=2.0)
     assert rig.cameras["right"].fx_px == pytest.approx(537.0, abs=2.0)
-    assert 0.1 < rig.sigmas["left.fx_px"] < 1.0
+    assert 0.4 < rig.sigmas["left.fx_px"] < 1.5
     assert 1e-4 < rig.sigmas["right.x_m"] < 5e-3
 
     # OpenCV's own definition of the rms, from the file of corners.
@@ -107,7 +107,7 @@ def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
 
 
 def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
-    """The same corners in cv2.stereoCalibrate give the same rig, within three sigmas."""
+    """The same corners in cv2.stereoCalibrate give the same rig, within two sigmas."""
     folder, _, found = real
     rig = read_rig(folder / "rig.json")
     seen: dict[tuple[str, str], np.ndarray] = {}
@@ -128,13 +128,14 @@ def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
         objects, left, right, alone[0][1], alone[0][2], alone[1][1], alone[1][2], (640, 480),
         flags=cv2.CALIB_USE_INTRINSIC_GUESS,
     )  # fmt: skip
-    assert rms == pytest.approx(found["rms_px"], abs=0.01)
+    # OpenCV takes the board as flat and even, which costs it a tenth.
+    assert 0.85 * rms < found["rms_px"] < rms
     sigmas = rig.sigmas
     for name, matrix in (("left", k1), ("right", k2)):
         camera = rig.cameras[name]
-        assert abs(camera.fx_px - matrix[0, 0]) < 3 * sigmas[f"{name}.fx_px"]
-        assert abs(camera.cx_px - 0.5 - matrix[0, 2]) < 3 * sigmas[f"{name}.cx_px"]
-    assert abs(rig.baseline_m - np.linalg.norm(shift)) < 3 * sigmas["right.x_m"]
+        assert abs(camera.fx_px - matrix[0, 0]) < 2 * sigmas[f"{name}.fx_px"]
+        assert abs(camera.cx_px - 0.5 - matrix[0, 2]) < 2 * sigmas[f"{name}.cx_px"]
+    assert abs(rig.baseline_m - np.linalg.norm(shift)) < 2 * sigmas["right.x_m"]
 
 
 @pytest.fixture
