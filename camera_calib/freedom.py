@@ -90,10 +90,9 @@ def wanted_slopes(names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
 
 def at_bound(rig: Rig, names: Sequence[str]) -> Flags:
     """Which parameters of a rig have their least value; those of something else have none."""
-    lows = [_LOW.get(name.split(".")[1]) for name in names]
-    return np.array(
-        [low is not None and value(rig, name) <= low for name, low in zip(names, lows, strict=True)]
-    )
+    lows = {name: _LOW.get(name.split(".")[1]) for name in names}
+    bound = [low is not None and value(rig, name) <= low for name, low in lows.items()]
+    return np.array(bound, dtype=np.bool_)
 
 
 def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:

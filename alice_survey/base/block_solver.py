@@ -309,11 +309,11 @@ class Minimum(Generic[Guess, Normal]):
     noise: Array
     """(N,) scales of the loss there."""
     length: float
-    """Of the last step, in sigmas."""
+    """Of the last step, in sigmas, as if it were not damped."""
     is_settled: bool
-    """Whether that is as short as requested, damped or not, and the noise is steady."""
+    """Whether that is as short as requested, and the noise is steady."""
     is_stuck: bool
-    """Whether no step improves, however short: longer ones lose observations."""
+    """Whether it is not, though only short steps improve: longer ones lose observations."""
 
 
 def minimise(
@@ -335,7 +335,7 @@ def minimise(
         damping: of the first step, as a share of the diagonal; less where steps are good.
         least_damping: with which it may settle.
     """
-    guess, noise, is_stuck = start, problem.noise(start), False
+    guess, noise = start, problem.noise(start)
     for _ in range(most_steps):
         equations, cost = problem.linearised(guess, noise), problem.cost(guess, noise)
         pinned = problem.at_bound(guess) & (equations.shared[:-1, -1] > 0)
@@ -351,17 +351,15 @@ def minimise(
             damping = max(10.0 * damping, 1e-9)
         guess = tried if drop >= 0 else guess
         before, noise = noise, problem.noise(guess)
-        is_settled = short and bool(np.all(np.abs(noise / before - 1.0) < settled))
-        if is_settled and drop < 0:  # damping shortens any step
-            step = equations.step(least_damping, pinned)
-            is_settled, is_stuck = step.length < settled, step.length >= settled
+        steady = bool(np.all(np.abs(noise / before - 1.0) < settled))
+        if short and steady and (damping <= least_damping or drop < 0):
             break
-        if is_settled and damping <= least_damping:
-            break
-        is_settled = False
         good = short or drop > 0.25 * step.gain
         damping = max(damping * (0.01 if good else 0.5), _LEAST_DAMPING)
+    if damping > least_damping or drop < 0:  # damping shortens any step
+        step = equations.step(least_damping, pinned)
+    is_short = step.length < settled
     return Minimum(
-        guess=guess, equations=equations, noise=noise, length=step.length, is_settled=is_settled,
-        is_stuck=is_stuck,
+        guess=guess, equations=equations, noise=noise, length=step.length,
+        is_settled=is_short and steady, is_stuck=short and not is_short,
     )  # fmt: skip
