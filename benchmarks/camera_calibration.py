@@ -231,8 +231,7 @@ def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Fr
     problem = CalibrationProblem(pixels, BOARD, _TRUTH, freedom, shape)
     weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
     equations = problem.equations(problem.state(_TRUTH, poses), weights)
-    step: Array = equations.step().shared
-    return step[: len(step) - len(shape.parameters)]
+    return equations.step().shared[: -len(shape.parameters)]
 
 
 def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIAL) -> Mode:

@@ -10,10 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Indices, inverse_of
+from alice_survey.base.block_solver import Flags, Indices, inverse_of
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.lenses.fisheye import FisheyeLens
@@ -77,8 +76,9 @@ def value(rig: Rig, name: str) -> float:
     if field in rig.cameras[camera].parameters:
         return rig.cameras[camera].parameter(field)
     pose = rig.cam_from_rig[camera]
-    vector = np.concatenate([pose.rotation.as_rotvec(), pose.translation])
-    return float(vector[POSE.index(field)])
+    if field in _SHIFT:
+        return float(pose.translation[_SHIFT.index(field)])
+    return float(pose.rotation.as_rotvec()[_TURN.index(field)])
 
 
 def wanted_slopes(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
@@ -94,13 +94,11 @@ def wanted_slopes(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices,
     return columns, at
 
 
-def at_bound(rig: Rig, names: Sequence[str]) -> NDArray[np.bool_]:
-    """Which parameters of a rig have their least value."""
-    lows = [lowest(name.split(".")[1]) for name in names]
-    return np.array(
-        [low > -np.inf and value(rig, name) <= low for name, low in zip(names, lows, strict=True)],
-        dtype=bool,
-    )
+def at_bound(rig: Rig, names: Sequence[str]) -> Flags:
+    """Which parameters of a rig have their least value; those of something else have none."""
+    lows = {name: lowest(name.split(".")[1]) for name in names}
+    bound = [low > -np.inf and value(rig, name) <= low for name, low in lows.items()]
+    return np.array(bound, dtype=np.bool_)
 
 
 def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
@@ -109,25 +107,20 @@ def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
     Raises:
         CalibrationError: a parameter leaves the range of a real camera.
     """
-    steps: dict[str, dict[str, float]] = {camera: {} for camera in rig.cameras}
-    for name, change in zip(names, step.tolist(), strict=True):
-        owner, field = name.split(".")
-        steps[owner][field] = change
-    cameras, poses = dict(rig.cameras), dict(rig.cam_from_rig)
-    for name, mine in steps.items():
-        camera, pose = cameras[name], poses[name]
+    cameras, poses = {}, {}
+    for name, camera in rig.cameras.items():
+        parts = [(n.partition("."), change) for n, change in zip(names, step, strict=True)]
+        mine = {field: float(change) for (owner, _, field), change in parts if owner == name}
+        turn, shift = ([mine.pop(axis, 0.0) for axis in axes] for axes in (_TURN, _SHIFT))
         changed = {
             field: max(camera.parameter(field) + change, lowest(field))
             for field, change in mine.items()
-            if field not in POSE
         }
-        if changed:
-            cameras[name] = camera.with_parameters(changed)
-        if len(changed) < len(mine):
-            turn, shift = ([mine.get(axis, 0.0) for axis in axes] for axes in (_TURN, _SHIFT))
-            poses[name] = RigidTransform.from_components(
-                pose.translation + shift, Rotation.from_rotvec(turn) * pose.rotation
-            )
+        cameras[name] = camera.with_parameters(changed) if changed else camera
+        pose = rig.cam_from_rig[name]
+        poses[name] = RigidTransform.from_components(
+            pose.translation + shift, Rotation.from_rotvec(turn) * pose.rotation
+        )
     return replace(rig, cameras=cameras, cam_from_rig=poses)
 
 
@@ -166,7 +159,7 @@ class Prior:
 
     def misfit(self, rig: Rig) -> Array:
         """(K,) a rig's parameters minus the mean; a turn counts from the mean's rotation."""
-        found = np.array([value(rig, name) for name in self.parameters]) - self.mean
+        found = np.array([n.endswith(_TURN) or value(rig, n) for n in self.parameters]) - self.mean
         for camera in {n.split(".")[0] for n in self.parameters if n.endswith(_TURN)}:
             at = [self.parameters.index(f"{camera}.{axis}") for axis in _TURN]
             turn = rig.cam_from_rig[camera].rotation * Rotation.from_rotvec(self.mean[at]).inv()

@@ -10,6 +10,7 @@ algorithm: implementation and theory").
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, Protocol, Self, TypeVar
@@ -20,6 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
+from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 
 Flags = NDArray[np.bool_]
@@ -200,13 +202,13 @@ class PoseFactor:
         order, factor = self._sparse
         place = np.argsort(order)
         rows, columns = self.equations.rows, self.equations.columns
-        later = _fill(place[rows], place[columns], count)
-        waiting = np.bincount([met[0] for met in later if len(met)], minlength=count)
+        meets = _fill(place[rows], place[columns], count)
+        waiting = np.bincount([met[1] for met in meets if len(met) > 1], minlength=count)
         upper: Any = bsr_matrix(factor.U.tocsr(), blocksize=(wide, wide))
         keys, found = rows * count + columns, np.zeros_like(self.blocks)
         known: dict[int, Array] = {}
         for j in range(count - 1, -1, -1):
-            met = np.concatenate([[j], later[j]])
+            met = meets[j]
             stored = slice(upper.indptr[j], upper.indptr[j + 1])
             row = np.zeros((wide, len(met), wide))
             row[:, np.searchsorted(met, upper.indices[stored])] = upper.data[stored].swapaxes(0, 1)
@@ -215,13 +217,12 @@ class PoseFactor:
             inverse = np.empty((len(met), wide, len(met), wide))
             if len(met) > 1:
                 parent = int(met[1])
-                at = np.searchsorted(np.concatenate([[parent], later[parent]]), met[1:])
+                at = np.searchsorted(meets[parent], met[1:])
                 inverse[1:, :, 1:] = known[parent][at][:, :, at]
                 waiting[parent] -= 1
                 if not waiting[parent]:
                     del known[parent]
-            theirs = inverse[1:, :, 1:].reshape(follow.shape[1], follow.shape[1])
-            across = follow @ theirs
+            across = follow @ inverse[1:, :, 1:].reshape(follow.shape[1], follow.shape[1])
             inverse[0, :, 0] = (back * np.diag(row[:, 0])) @ back.T + across @ follow.T
             inverse[0, :, 1:] = across.reshape(wide, -1, wide)
             inverse[1:, :, 0] = inverse[0, :, 1:].transpose(1, 2, 0)
@@ -261,7 +262,7 @@ def _factor(matrix: csc_matrix, order: str) -> Any:
 
 
 def _fill(rows: Indices, columns: Indices, count: int) -> list[Indices]:
-    """What meets each unknown when those before it are eliminated in order, sorted.
+    """Each unknown, and what meets it later when those before it are eliminated in order; sorted.
 
     Args:
         rows: (B,) of the blocks of a symmetric matrix.
@@ -270,12 +271,12 @@ def _fill(rows: Indices, columns: Indices, count: int) -> list[Indices]:
     """
     met: list[set[int]] = [set() for _ in range(count)]
     for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
-        if column > row:
+        if column >= row:
             met[row].add(column)
-    for own in met:
-        if own:
-            first = min(own)
-            met[first] |= own - {first}
+    for row, own in enumerate(met):
+        later = own - {row}
+        if later:
+            met[min(later)] |= later
     return [np.array(sorted(own), dtype=np.int64) for own in met]
 
 
@@ -291,8 +292,8 @@ class Problem(Protocol[Guess, Normal]):
     def linearised(self, guess: Guess, noise: Array) -> Normal:
         """Normal equations at a guess, weights and priors included."""
 
-    def moved(self, guess: Guess, equations: Normal, step: BlockStep) -> Guess | None:
-        """The guess after a step that its equations gave; None beyond what can be."""
+    def moved(self, guess: Guess, equations: Normal, step: BlockStep) -> Guess:
+        """The guess after a step that its equations gave; an `AliceError` beyond what can be."""
 
     def at_bound(self, guess: Guess) -> Flags:
         """(G,) which shared parameters may not become less."""
@@ -308,11 +309,11 @@ class Minimum(Generic[Guess, Normal]):
     noise: Array
     """(N,) scales of the loss there."""
     length: float
-    """Of the last step, in sigmas."""
+    """Of the last step, in sigmas, as if it were not damped."""
     is_settled: bool
-    """Whether that is as short as requested, damped or not, and the noise is steady."""
+    """Whether that is as short as requested, and the noise is steady."""
     is_stuck: bool
-    """Whether no step improves, however short: longer ones lose observations."""
+    """Whether it is not, though only short steps improve: longer ones lose observations."""
 
 
 def minimise(
@@ -334,32 +335,31 @@ def minimise(
         damping: of the first step, as a share of the diagonal; less where steps are good.
         least_damping: with which it may settle.
     """
-    guess, noise, is_stuck = start, problem.noise(start), False
+    guess, noise = start, problem.noise(start)
     for _ in range(most_steps):
         equations, cost = problem.linearised(guess, noise), problem.cost(guess, noise)
         pinned = problem.at_bound(guess) & (equations.shared[:-1, -1] > 0)
         while True:
             step = equations.step(damping, pinned)
             short = step.length < settled
-            tried = problem.moved(guess, equations, step)
-            drop = -math.inf if tried is None else cost - problem.cost(tried, noise)
+            tried, drop = guess, -math.inf
+            with suppress(AliceError):
+                tried = problem.moved(guess, equations, step)
+                drop = cost - problem.cost(tried, noise)
             if drop >= 0 or short:
                 break
             damping = max(10.0 * damping, 1e-9)
-        if tried is not None and drop >= 0:
-            guess = tried
+        guess = tried if drop >= 0 else guess
         before, noise = noise, problem.noise(guess)
-        is_settled = short and bool(np.all(np.abs(noise / before - 1.0) < settled))
-        if is_settled and drop < 0:  # damping shortens any step
-            step = equations.step(least_damping, pinned)
-            is_settled, is_stuck = step.length < settled, step.length >= settled
+        steady = bool(np.all(np.abs(noise / before - 1.0) < settled))
+        if short and steady and (damping <= least_damping or drop < 0):
             break
-        if is_settled and damping <= least_damping:
-            break
-        is_settled = False
         good = short or drop > 0.25 * step.gain
         damping = max(damping * (0.01 if good else 0.5), _LEAST_DAMPING)
+    if damping > least_damping or drop < 0:  # damping shortens any step
+        step = equations.step(least_damping, pinned)
+    is_short = step.length < settled
     return Minimum(
-        guess=guess, equations=equations, noise=noise, length=step.length, is_settled=is_settled,
-        is_stuck=is_stuck,
+        guess=guess, equations=equations, noise=noise, length=step.length,
+        is_settled=is_short and steady, is_stuck=short and not is_short,
     )  # fmt: skip

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.block_solver import BlockStep, Equations, Flags, Minimum, minimise
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import RAYLEIGH_MEDIAN
 from camera_calib.calibrate.normal_equations import CalibrationProblem, State
 from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom, at_bound
@@ -24,8 +25,6 @@ from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 HUBER = 3.0
 """Length, in sigmas of a coordinate, beyond which a residual's influence is constant."""
-RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
-"""Median residual length, in sigmas of a coordinate, for normal noise."""
 _LEAST_NOISE_PX = 1e-6
 """Smallest noise: below it the rounding of projections shows."""
 _STEPS = 100
@@ -136,17 +135,13 @@ class _Solver(CalibrationProblem):
         weights = self.weights(guess, noise)
         return self.equations(guess.state, weights / (noise * self.blur) ** 2)
 
-    def moved(self, guess: _Guess, equations: Equations, step: BlockStep) -> _Guess | None:
-        """The guess after a step; None where a camera would leave its range."""
-        try:
-            return self.seen_from(self.stepped(guess.state, step))
-        except CalibrationError:
-            return None
+    def moved(self, guess: _Guess, equations: Equations, step: BlockStep) -> _Guess:
+        """The guess after a step."""
+        return self.seen_from(self.stepped(guess.state, step))
 
     def at_bound(self, guess: _Guess) -> Flags:
-        """Parameters that have their least value; those of the shape have none."""
-        shape = np.zeros(len(self.shape_at), dtype=np.bool_)
-        return np.concatenate([at_bound(guess.state.rig, self.rig_names), shape])
+        """Parameters that have their least value."""
+        return at_bound(guess.state.rig, self.names)
 
     @property
     def spare(self) -> int:

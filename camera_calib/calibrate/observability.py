@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.block_solver import inverse_of
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibration import Calibration, stack_views
@@ -99,10 +100,8 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     adjusted = (*of_rig, *shape.parameters)
     a = [problem.names.index(n) for n in adjusted]
     b = [problem.names.index(n) for n in held]
-    scale = 1.0 / np.sqrt(np.diag(information)[a])
     coupling = information[np.ix_(a, b)].sum(axis=1)
-    inner = information[np.ix_(a, a)] * np.outer(scale, scale)
-    slopes = -scale * np.linalg.solve(inner, scale * coupling)
+    slopes = -inverse_of(information[np.ix_(a, a)]) @ coupling
     known = float(information[np.ix_(b, b)].sum() + coupling @ slopes)
     return HeldEffect(
         sigma=1.0 / math.sqrt(known) if known > 0.0 else math.inf,

@@ -1,10 +1,12 @@
 """A COLMAP model's observations as arrays."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from reconstruct.views.model_files import keypoints_of
@@ -55,6 +57,13 @@ def frames_of(model: pycolmap.Reconstruction) -> Indices:
     """Ids of the frames that have a posed picture, ascending."""
     frames = {image.frame_id for image in model.images.values() if image.has_pose}
     return np.array(sorted(frames), dtype=np.int64)
+
+
+def rig_poses(model: pycolmap.Reconstruction, frames: Indices) -> RigidTransform:
+    """Poses (F,) `rig_from_world` of frames."""
+    poses: list[Any] = [model.frames[frame].rig_from_world for frame in frames.tolist()]
+    turns = Rotation.from_quat(np.array([pose.rotation.quat for pose in poses]))
+    return RigidTransform.from_components(np.array([pose.translation for pose in poses]), turns)
 
 
 def first_pictures(model: pycolmap.Reconstruction, given: Array | None = None) -> dict[int, int]:

@@ -14,11 +14,10 @@ from alice_survey.base.frames import Array
 from camera_calib.camera import pose_jacobian
 from camera_calib.freedom import wanted_slopes
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Indices, observed
+from reconstruct.mapping.arrays import Indices, observed, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import LinearObservations
-from reconstruct.views.model_files import as_transform
 
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
@@ -116,17 +115,15 @@ def start_state(
     """
     model, pinhole_from_cam = mapped.model, mapped.warps[names[0]].pinhole_from_cam
     reference = rig.cam_from_rig[names[0]]
-    poses = [
-        as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
-    ]
+    poses = rig_poses(model, frames).inv() * pinhole_from_cam
     return RigState(
         rig=replace(
             rig,
             cameras={name: rig.cameras[name] for name in names},
             cam_from_rig={name: rig.cam_from_rig[name] * reference.inv() for name in names},
         ),
-        turns=np.array([p.rotation.as_matrix() for p in poses]),
-        centres=np.array([p.translation for p in poses]),
+        turns=poses.rotation.as_matrix(),
+        centres=poses.translation,
         points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
         lever=np.asarray((reference * rig.body_from_rig.inv()).translation),
     )
@@ -141,17 +138,21 @@ def exact_observations(
     rest = np.zeros((len(arm), 2, len(fields) + 3 * lever + 1))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
-        source, target = (np.append(at, -1) for at in wanted_slopes(state.rig, fields, name))
+        source, target = wanted_slopes(state.rig, fields, name)
+        target = np.append(target, -1)
         every = np.flatnonzero(pixels.camera == c)
         for first in range(0, len(every), _BLOCK):
             rows = every[first : first + _BLOCK]
-            turned = _in_rig(arm, rows, pixels.station, state.turns) @ turn.T
+            world_from_rig = state.turns[pixels.station[rows]]
+            turned = np.einsum("nij,ni->nj", world_from_rig, arm[rows]) @ turn.T
             at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
-            miss = (at - pixels.taken[rows])[..., None]
-            slopes = np.concatenate([by_camera, pose_jacobian(by_cam, turned), miss], axis=2)
+            slopes = by_camera
+            if source.max(initial=0) >= by_camera.shape[2]:  # it may move on the rig
+                slopes = np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2)
+            miss = (at - pixels.taken[rows])[:, :, None]
             _put(
-                rows, by_cam @ turn, state.turns, pixels.station, slopes, source, target,
-                by_point, rest,
+                rows, by_cam @ turn, world_from_rig,
+                np.concatenate([slopes[:, :, source], miss], axis=2), target, by_point, rest,
             )  # fmt: skip
     return LinearObservations(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm, rest=rest
@@ -159,31 +160,18 @@ def exact_observations(
 
 
 @compiled
-def _in_rig(arm: Array, rows: Indices, station: Indices, turns: Array) -> Array:
-    """Some observations' arms (N, 3) along the axes of their rigs."""
-    found = np.empty((rows.shape[0], 3))
-    for i in range(rows.shape[0]):
-        turn, o = turns[station[rows[i]]], rows[i]
-        for j in range(3):
-            found[i, j] = turn[0, j] * arm[o, 0] + turn[1, j] * arm[o, 1] + turn[2, j] * arm[o, 2]
-    return found
-
-
-@compiled
 def _put(
-    rows: Indices, by_rig: Array, turns: Array, station: Indices, slopes: Array, source: Indices,
-    target: Indices, by_point: Array, rest: Array,
+    rows: Indices, by_rig: Array, turns: Array, slopes: Array, target: Indices, by_point: Array,
+    rest: Array,
 ) -> None:  # fmt: skip
     """Put what one camera sees in its rows, in place; what it does not see stays as it is.
 
     Args:
         rows: (N,) observations of the camera.
         by_rig: (N, 2, 3) slopes by the point along the axes of the rig.
-        turns: (F, 3, 3) of `world_from_rig`.
-        station: (O,).
-        slopes: (N, 2, K) by all that the camera may depend on, last the miss; NaN if not seen.
-        source: (G',) which of the K are wanted.
-        target: (G',) and where in `rest` they go.
+        turns: (N, 3, 3) of `world_from_rig`.
+        slopes: (N, 2, K) by what is wanted of the camera, last the miss; NaN if not seen.
+        target: (K,) where in `rest` they go.
         by_point: (O, 2, 3) to fill.
         rest: (O, 2, G + 1) the same way.
     """
@@ -191,10 +179,10 @@ def _put(
         o = rows[i]
         if not np.isfinite(slopes[i, 0, -1] + slopes[i, 1, -1]):
             continue
-        turn = turns[station[o]]
+        turn = turns[i]
         for row in range(2):
             u, v, w = by_rig[i, row, 0], by_rig[i, row, 1], by_rig[i, row, 2]
             for j in range(3):
                 by_point[o, row, j] = u * turn[j, 0] + v * turn[j, 1] + w * turn[j, 2]
-            for g in range(source.shape[0]):
-                rest[o, row, target[g]] = slopes[i, row, source[g]]
+            for k in range(target.shape[0]):
+                rest[o, row, target[k]] = slopes[i, row, k]

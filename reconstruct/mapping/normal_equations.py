@@ -40,6 +40,11 @@ class LinearObservations:
     """(O, 2, G + 1) slopes by what all share, then computed pixel minus the observed one."""
 
     @property
+    def arrays(self) -> tuple[Indices, Indices, Array, Array, Array]:
+        """All of it, as kernels take it."""
+        return self.starts, self.station, self.by_point, self.arm, self.rest
+
+    @property
     def miss(self) -> Array:
         """(O, 2) computed pixel minus the observed one."""
         return self.rest[..., -1]
@@ -70,11 +75,7 @@ class PointEquations(Equations):
 
     def follow(self, poses: Array, rest: Array) -> Array:
         """Motions (P, 3) of points by steps (F, 6) of stations and (G + 1,) of the `rest`."""
-        linear = self.linear
-        return _follow(
-            linear.starts, linear.station, linear.by_point, linear.arm, linear.rest,
-            self.point_inverse, poses, rest,
-        )  # fmt: skip
+        return _follow(*self.linear.arrays, self.point_inverse, poses, rest)
 
     def point_covariances(self, blocks: Array) -> Array:
         """Covariance of every point, (P, 3, 3), from those of its stations.
@@ -84,11 +85,8 @@ class PointEquations(Equations):
         Args:
             blocks: (B, 6, 6) covariances between the stations that see a point in common.
         """
-        linear = self.linear
-        return _point_covariances(
-            linear.starts, linear.station, linear.by_point, linear.arm, self.point_inverse,
-            self.pointers, self.columns, blocks,
-        )  # fmt: skip
+        pattern = self.pointers, self.columns
+        return _point_covariances(*self.linear.arrays, self.point_inverse, *pattern, blocks)
 
 
 def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
@@ -103,9 +101,7 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
     rows, columns = np.nonzero(meets)
     pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
     columns = columns.astype(np.int64)
-    blocks, border, shared, inverse = _reduce(
-        linear.starts, linear.station, linear.by_point, linear.arm, linear.rest, pointers, columns
-    )
+    blocks, border, shared, inverse = _reduce(*linear.arrays, pointers, columns)
     return PointEquations(
         pointers=pointers, columns=columns, blocks=blocks, border=border, shared=shared,
         free=np.ones((stations, POSE), dtype=np.bool_), linear=linear, point_inverse=inverse,
@@ -164,9 +160,7 @@ def _reduce(
     pointers: Indices, columns: Indices,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, rest.shape[2]
-    longest = 0
-    for p in range(points):
-        longest = max(longest, starts[p + 1] - starts[p])
+    longest = np.diff(starts).max()
     blocks = np.zeros((columns.shape[0], 6, 6))
     border, shared = np.zeros((stations, 6, count)), np.zeros((count, count))
     inverse = np.empty((points, 3, 3))
@@ -270,14 +264,12 @@ def _follow(
 
 @compiled
 def _point_covariances(
-    starts: Indices, station: Indices, by_point: Array, arm: Array, inverse: Array,
+    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array, inverse: Array,
     pointers: Indices, columns: Indices, blocks: Array,
 ) -> Array:  # fmt: skip
     points = starts.shape[0] - 1
     found = inverse.copy()
-    longest = 0
-    for p in range(points):
-        longest = max(longest, starts[p + 1] - starts[p])
+    longest = np.diff(starts).max()
     follow, pose = np.empty((longest, 3, 6)), np.empty((2, 6))
     for p in range(points):
         first, end = starts[p], starts[p + 1]

@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.block_solver import BlockStep, Flags, inverse_of, minimise
 from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import CalibrationError, ReconstructionError, warn
+from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PortRecord
 from alice_survey.base.run import progress
@@ -159,7 +159,7 @@ def fit_rig(
     weights = cauchy_weights(found.guess.linear.miss, sigma_px)
     return RigFit(
         rig=_as_rig(rig, names, state, problem.fields, covariance, problem.fixes is not None),
-        parameters=(*problem.fields, *(_LEVER if problem.fixes is not None else ())),
+        parameters=problem.names,
         before=problem.values(problem.start.state),
         after=problem.values(state),
         prior_sigmas=np.sqrt(np.diag(inverse_of(problem.information))),
@@ -167,8 +167,7 @@ def fit_rig(
         sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
         stations=tuple(
-            RigidTransform.from_components(c, Rotation.from_matrix(r))
-            for r, c in zip(state.turns, state.centres, strict=True)
+            RigidTransform.from_components(state.centres, Rotation.from_matrix(state.turns))
         ),
         points=state.points,
         point_ids=ids,
@@ -181,8 +180,8 @@ class _RigGuess:
 
     state: RigState
     linear: LinearObservations
-    lost: Indices
-    """Observations that no ray explains."""
+    lost: int
+    """Observations that no ray explains: they do not count."""
 
 
 class _SurveyProblem:
@@ -193,7 +192,8 @@ class _SurveyProblem:
     ) -> None:
         self.pixels, self.prior, self.fields = pixels, prior, prior.parameters
         self.fixes = None if fixes is None else _with_correlation(fixes, state)
-        self.information = np.zeros((len(self.fields) + 3 * (fixes is not None),) * 2)
+        self.names = (*self.fields, *(_LEVER if fixes is not None else ()))
+        self.information = np.zeros((len(self.names),) * 2)
         self.information[: len(self.fields), : len(self.fields)] = prior.information
         if fixes is not None:
             self.information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
@@ -215,7 +215,7 @@ class _SurveyProblem:
 
     def _seen(self, state: RigState) -> _RigGuess:
         linear = exact_observations(state, self.pixels, self.fields, lever=self.fixes is not None)
-        lost = np.flatnonzero(~linear.by_point[:, 0].any(axis=1))
+        lost = int((~linear.by_point[:, 0].any(axis=1)).sum())
         return _RigGuess(state=state, linear=linear, lost=lost)
 
     def values(self, state: RigState) -> Array:
@@ -247,7 +247,7 @@ class _SurveyProblem:
 
     def cost(self, guess: _RigGuess, noise: Array) -> float:
         """Half of Cauchy's loss, prior and fixes."""
-        if np.setdiff1d(guess.lost, self.start.lost).size:
+        if guess.lost > self.start.lost:
             return math.inf
         sigma, variance = noise
         off, fixes = self.misfit(guess.state), self.fix_rows(guess.state)[..., -1]
@@ -257,9 +257,8 @@ class _SurveyProblem:
     def linearised(self, guess: _RigGuess, noise: Array) -> PointEquations:
         """Normal equations with the points eliminated."""
         sigma, variance = noise
-        weights = cauchy_weights(guess.linear.miss, sigma)
-        weights[self.start.lost] = 0.0
-        found = reduce_points(guess.linear.weighted(weights / variance), len(guess.state.centres))
+        weights = cauchy_weights(guess.linear.miss, sigma) / variance
+        found = reduce_points(guess.linear.weighted(weights), len(guess.state.centres))
         found.shared[:-1, :-1] += self.information
         found.shared[:-1, -1] += self.information @ self.misfit(guess.state)
         if self.fixes is None:
@@ -274,18 +273,12 @@ class _SurveyProblem:
         found.shared[-4:, -4:] += square[:, POSE:, POSE:].sum(axis=0)
         return found.knowing(square[:, :POSE, :POSE])
 
-    def moved(
-        self, guess: _RigGuess, equations: PointEquations, step: BlockStep
-    ) -> _RigGuess | None:
-        """The guess after a step; None where a camera would leave its range."""
+    def moved(self, guess: _RigGuess, equations: PointEquations, step: BlockStep) -> _RigGuess:
+        """The guess after a step."""
         state, count = guess.state, len(self.fields)
-        try:
-            rig = moved(state.rig, self.fields, step.shared[:count])
-        except CalibrationError:
-            return None
         return self._seen(
             RigState(
-                rig=rig,
+                rig=moved(state.rig, self.fields, step.shared[:count]),
                 turns=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ state.turns,
                 centres=state.centres + step.poses[:, 3:],
                 points=state.points + equations.point_steps(step),
@@ -294,10 +287,8 @@ class _SurveyProblem:
         )
 
     def at_bound(self, guess: _RigGuess) -> Flags:
-        """Parameters that have their least value; the lever arm has none."""
-        bound = np.zeros(len(self.information), dtype=np.bool_)
-        bound[: len(self.fields)] = at_bound(guess.state.rig, self.fields)
-        return bound
+        """Parameters that have their least value."""
+        return at_bound(guess.state.rig, self.names)
 
 
 def _with_correlation(fixes: NavigationFixes, state: RigState) -> NavigationFixes:

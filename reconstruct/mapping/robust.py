@@ -11,11 +11,9 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.frames import Array
-from alice_survey.base.robust import CAUCHY_TUNING
+from alice_survey.base.robust import CAUCHY_TUNING, RAYLEIGH_MEDIAN
 from reconstruct.mapping.arrays import Indices, observed
 
-_RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a plane vector whose components have unit sigma."""
 _LEAST_SIGMA_PX = 1e-3
 _WELL_SEEN = 4
 _MOST_ADAPTED = 0.9
@@ -46,7 +44,7 @@ def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
     left = (1.0 - 1.5 / counts) * by_station
     well_seen = counts >= min(_WELL_SEEN, int(np.median(counts)))
     median = float(np.median(np.linalg.norm(misses[well_seen], axis=1) / np.sqrt(left[well_seen])))
-    return max(median / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
+    return max(median / RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
 
 
 def loss_scale(sigma_px: float) -> float:

@@ -17,12 +17,10 @@ order stations and points move with the rig's parameters as the adjustment's nor
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from alice_survey.base.contents import read_arrays, taken_from
 from alice_survey.base.errors import ReconstructionError, warn
@@ -30,7 +28,14 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Indices, Observed, first_pictures, frames_of, observed
+from reconstruct.mapping.arrays import (
+    Indices,
+    Observed,
+    first_pictures,
+    frames_of,
+    observed,
+    rig_poses,
+)
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_observations import (
     calibrated_parameters,
@@ -143,13 +148,11 @@ def estimate(
     weights = cauchy_weights(linear.miss, sigma)
     variance = variance_of(linear.miss, weights, left)
     linear = linear.weighted(weights / variance)
-    gauge = Gauge(
-        _centres(model, frames), float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free
-    )
+    centres = rig_poses(model, frames).inv().translation
+    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
     given = navigation_information(model, position_sigmas)
     loose = np.bincount(linear.station, minlength=len(frames)) < LEAST_POINTS
-    equations = reduce_points(linear, len(frames))
-    equations = replace(equations, free=~(gauge.held | loose[:, None]))
+    equations = replace(reduce_points(linear, len(frames)), free=~(gauge.held | loose[:, None]))
     if given is not None:
         equations = gauge.placed(equations, given * ~loose[:, None])
     blocks = gauge.shape_blocks(equations)
@@ -244,7 +247,7 @@ def pinhole_observations(
     order = np.argsort(seen.point, kind="stable")
     station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
     rest = np.empty((len(order), 2, 1))
-    centres = _centres(model, frames)
+    centres = rig_poses(model, frames).inv().translation
     for n, number in enumerate(seen.pictures.tolist()):
         image, rows = model.images[number], seen.of(n)
         fx, fy, cx, cy = image.camera.params
@@ -281,13 +284,6 @@ def navigation_information(model: pycolmap.Reconstruction, sigmas: Array | None)
         row = int(np.searchsorted(frames, frame))
         given[row] = [*[TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
     return given if given.any() else None
-
-
-def _centres(model: pycolmap.Reconstruction, frames: Indices) -> Array:
-    """Origins of the rigs in the world, (F, 3)."""
-    poses: list[Any] = [model.frames[int(f)].rig_from_world for f in frames]
-    turns = Rotation.from_quat(np.array([p.rotation.quat for p in poses]))
-    return -turns.inv().apply(np.array([p.translation for p in poses]))
 
 
 def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indices) -> list[int]:
@@ -330,31 +326,21 @@ def calibration_part(
     linear = exact_observations(state, pixels, fields, lever=False)
     sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
     linear = linear.weighted(cauchy_weights(linear.miss, sigma) / sigma**2)
-    stations, points = _response(linear, len(frames), given)
-    at = [rig.covariance.parameters.index(name) for name in fields]
+    equations = reduce_points(linear, len(frames))
+    equations.free[np.bincount(linear.station, minlength=len(frames)) < LEAST_POINTS] = False
+    if given is None:
+        equations.free[0] = False
+    else:
+        equations = equations.knowing(given[:, :, None] * np.eye(POSE))
+    stations = equations.response
+    points = [
+        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
+        for g, unit in enumerate(np.eye(len(fields), len(fields) + 1))
+    ]
     return CalibrationPart(
         frames=frames,
         stations=stations,
         places=state.points,
-        points=points,
-        covariance=rig.covariance.matrix[np.ix_(at, at)],
+        points=np.stack(points, axis=-1),
+        covariance=rig.covariance.marginal(fields).matrix,
     )
-
-
-def _response(linear: LinearObservations, count: int, given: Array | None) -> tuple[Array, Array]:
-    """Slopes of stations (F, 6, G) and points (P, 3, G) by what is shared, in some gauge."""
-    equations = reduce_points(linear, count)
-    seeing = np.bincount(linear.station, minlength=count) >= LEAST_POINTS
-    free = np.repeat(seeing[:, None], POSE, axis=1)
-    if given is None:
-        free[0] = False
-    else:
-        equations = equations.knowing(given[:, :, None] * np.eye(POSE))
-    equations = replace(equations, free=free)
-    stations = equations.response
-    count = stations.shape[2]
-    points = [
-        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
-        for g, unit in enumerate(np.eye(count, count + 1))
-    ]
-    return stations, np.stack(points, axis=-1)
