@@ -9,6 +9,7 @@ import numpy as np
 
 from alice_survey.kit.document import Level, Verdict, worst_first
 from camera_calib.judge.judgement import CameraJudgement, Judgement
+from camera_calib.rig import Rig
 
 _ODD_PICTURE = 2.0
 _MOST_OUTLIERS = 0.01
@@ -28,12 +29,26 @@ def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
 
 
 def _lines(judged: Judgement) -> Iterator[Verdict]:
+    yield from _side_verdicts(judged.calibration.rig)
     yield from _fit_verdicts(judged)
     yield from _hold_out_verdicts(judged)
     yield from _length_verdicts(judged)
     for name, camera in judged.cameras.items():
         yield from _homography_verdicts(name, camera)
     yield from _uncertainty_verdicts(judged)
+
+
+def _side_verdicts(rig: Rig) -> Iterator[Verdict]:
+    """A verdict where the pictures of the left and the right camera seem to be swapped."""
+    if set(rig.cameras) != {"left", "right"}:
+        return
+    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+    if x < -max(abs(y), abs(z)):
+        yield Verdict(
+            level="bad",
+            text=f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left "
+            "and --right, unless the cameras hang upside down",
+        )
 
 
 def _graded(ratio: float, look: float, bad: float) -> Level:
