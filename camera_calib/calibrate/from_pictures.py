@@ -16,6 +16,7 @@ import numpy as np
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import CalibrationError, WorkspaceError
 from alice_survey.base.executor import Executor, local_executor
+from alice_survey.base.records import CalibrationRecord
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
@@ -165,17 +166,25 @@ def calibrate_pictures(
             warn_of_unseen(found)
         # In the order of the options: the first camera is the reference.
         found = replace(found, sizes={name: found.sizes[name] for name in lists})
-        calibration = finish(partial, _calibrated(settings, found, target, start), found)
+        calibration = _calibrated(settings, found, target, start)
+        rig = calibration.rig
+        source = "; ".join([rig.source, *_clock_lines(clocks, rig.reference)])
+        calibration = finish(partial, replace(calibration, rig=replace(rig, source=source)), found)
+        CalibrationRecord.save(
+            partial / "calibration.json",
+            {
+                **summary(calibration),
+                "clocks": {name: asdict(offset) for name, offset in clocks.items()},
+            },
+        )
         if settings.carry_to_n is not None:
             write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
     _check_useful(calibration, found, output)
     verdicts = read_json(output / "report.json")["verdicts"]
     text = calibration_text(calibration, target, verdicts)
-    data = summary(calibration)
-    if clocks:
-        data["clocks"] = {name: asdict(offset) for name, offset in clocks.items()}
-    lines = [*_clock_lines(clocks, calibration.rig.reference), text]
-    return "\n".join([*lines, *_next(calibration, output, settings)]), data
+    clock_lines = _clock_lines(clocks, calibration.rig.reference)
+    text = "\n".join([text, *clock_lines, *_next(calibration, output, settings)])
+    return text, read_json(output / "calibration.json")
 
 
 def _on_one_clock(

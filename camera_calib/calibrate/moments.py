@@ -50,7 +50,7 @@ class ClockOffset:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
+class CameraTrack:
     """Pictures of one camera, in the order of their times."""
 
     time_s: Array
@@ -69,10 +69,10 @@ class Track:
         return [run for run in runs if run.stop - run.start >= _SHORTEST]
 
 
-class _Motion:
+class _PoseCurve:
     """Poses of a track at any time; not known outside of its motions."""
 
-    def __init__(self, track: Track) -> None:
+    def __init__(self, track: CameraTrack) -> None:
         self._runs = []
         for run in track.motions():
             time_s, poses = track.time_s[run], track.cam_from_target[run]
@@ -101,7 +101,7 @@ def track_of(
     views: Sequence[TargetView],
     times_s: Mapping[str, float],
     points: Array,
-) -> Track:
+) -> CameraTrack:
     """The track of one camera.
 
     Args:
@@ -122,7 +122,7 @@ def track_of(
             f"{name}: {len(order)} pictures of the target with {len(set(time_s.tolist()))} times; "
             f"clocks need {_FEWEST} or more of different times, such as frames of a video"
         )
-    return Track(
+    return CameraTrack(
         time_s=time_s,
         pixels=np.stack([views[v].pixels[name] for v in order]),
         cam_from_target=RigidTransform.concatenate([found[v] for v in order]),
@@ -130,7 +130,11 @@ def track_of(
 
 
 def clock_offset(
-    names: tuple[str, str], first: Track, other: Track, camera: FlatPortCamera, points: Array
+    names: tuple[str, str],
+    first: CameraTrack,
+    other: CameraTrack,
+    camera: FlatPortCamera,
+    points: Array,
 ) -> ClockOffset:
     """The offset of a camera's clock from the first one's.
 
@@ -144,7 +148,7 @@ def clock_offset(
     Raises:
         CalibrationError: their pictures have too little motion in common.
     """
-    motion = _Motion(first)
+    motion = _PoseCurve(first)
     coarse_s, step_s = _search(names, motion, first, other)
     _, known = motion.at(other.time_s + coarse_s)
     for margin_s in (-step_s, step_s):
@@ -182,12 +186,12 @@ def clock_offset(
     )
 
 
-def _range_m(track: Track) -> float:
+def _range_m(track: CameraTrack) -> float:
     return float(np.median(np.linalg.norm(track.cam_from_target.translation, axis=1)))
 
 
 def _search(
-    names: tuple[str, str], motion: _Motion, first: Track, other: Track
+    names: tuple[str, str], motion: _PoseCurve, first: CameraTrack, other: CameraTrack
 ) -> tuple[float, float]:
     """The best of all offsets at which the pictures share enough, and the step between offsets."""
     chosen = np.unique(np.linspace(0, len(other.time_s) - 1, _TRIED).astype(int))
@@ -217,7 +221,7 @@ def _search(
 
 
 def views_at_moments(
-    tracks: Mapping[str, Track], offsets: Mapping[str, ClockOffset]
+    tracks: Mapping[str, CameraTrack], offsets: Mapping[str, ClockOffset]
 ) -> tuple[TargetView, ...]:
     """Views of one moment each: when the first camera took its pictures.
 
@@ -240,7 +244,7 @@ def views_at_moments(
     )
 
 
-def _interpolated(track: Track, time_s: Array) -> Array:
+def _interpolated(track: CameraTrack, time_s: Array) -> Array:
     """(T, N, 2) pixels at other times, by cubics through four pictures; NaN where one lacks."""
     found = np.full((len(time_s), *track.pixels.shape[1:]), np.nan)
     for run in track.motions():
