@@ -1,8 +1,10 @@
 """Picture files: checked before they are decoded, and decoded within bounds."""
 
+import re
 import struct
 import warnings
 import zlib
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ PILLOW_FAULTS = (
     ArithmeticError, MemoryError, EOFError, RuntimeError, struct.error, zlib.error,
 )  # fmt: skip
 """Errors that Pillow raises on damaged files, by format and version."""
+_YEARS = range(1970, 2200)
+"""Years in which a digital camera can have taken a picture."""
+_EXIF, _DATE, _SUBSECOND, _OFFSET = 0x8769, 0x9003, 0x9291, 0x9011
 
 
 def pixels_too_many(path: Path) -> int:
@@ -58,6 +63,40 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
             raise memory_shortage(path) from None
         return None  # more pixels than OpenCV takes
     return pixels
+
+
+def exif_time(exif: Any) -> datetime | None:
+    """When a picture was taken, with fractions of a second and the zone where EXIF has them."""
+    details = exif.get_ifd(_EXIF)
+    text = details.get(_DATE) or exif.get(_DATE)
+    try:
+        time = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    if time.year not in _YEARS:
+        return None
+    digits = re.match(r"\d+", str(details.get(_SUBSECOND, "")))
+    if digits:
+        time += timedelta(seconds=float(f"0.{digits[0]}"))
+    zone = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(details.get(_OFFSET, "")).strip("\0 "))
+    if zone:
+        shift = timedelta(hours=int(zone[2]), minutes=int(zone[3]))
+        if shift < timedelta(hours=24):
+            time = time.replace(tzinfo=timezone(-shift if zone[1] == "-" else shift))
+    return time
+
+
+def time_taken(path: Path) -> datetime | None:
+    """The time in a picture's EXIF, with or without a zone; None where it has none."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as image:
+                return exif_time(image.getexif())
+    except (*PILLOW_FAULTS, Image.DecompressionBombError):
+        return None
 
 
 def is_cut_short(path: Path) -> bool:

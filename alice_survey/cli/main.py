@@ -246,6 +246,8 @@ def target(
         "calibrate -w reef",
         "calibrate --left 'left*.jpg' --right 'right*.jpg' --target 'chessboard 9x6 25mm' -o air",
         "calibrate --pictures dry --target 'charuco 12x9 40mm 30mm' --lens rational -o one",
+        "calibrate --camera bow=B --camera port=P --camera down=D --target board.json -o three",
+        "calibrate --left L --right R --own-clocks --target board.json -o air",
         "calibrate --left L --right R --target board.json --water --start air/rig.json"
         " --glass 10 -o pool",
     )
@@ -255,6 +257,16 @@ def calibrate(
     left: Annotated[str | None, typer.Option(help="Folder or 'pattern' of pictures.")] = None,
     right: Annotated[str | None, typer.Option(help="Pictures of the right camera.")] = None,
     pictures: Annotated[str | None, typer.Option(help="Pictures of a single camera.")] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=FOLDER of a camera, for each of up to 8; the reference first."),
+    ] = None,
+    own_clocks: Annotated[
+        bool,
+        typer.Option(
+            "--own-clocks", help="No common trigger: find clock offsets from the target's motion."
+        ),
+    ] = False,
     target: Annotated[str | None, typer.Option(help="A target in words, or target.json.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     lens: Annotated[
@@ -313,11 +325,12 @@ def calibrate(
     from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 
     options = CalibrateOptions(
-        left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
-        water=water, start=start, known=intrinsics, port=port, dome_radius_mm=dome_radius,
-        port_distance_mm=port_distance, glass_mm=glass,
-        glass_sigma_mm=glass_sigma, n_glass=n_glass, n_glass_sigma=n_glass_sigma, n_water=n_water,
-        n_water_sigma=n_water_sigma, carry_to_n=carry_to_n,
+        left=left, right=right, pictures=pictures, cameras=tuple(camera or ()),
+        own_clocks=own_clocks, target=target, output=output, lens=lens, water=water, start=start,
+        known=intrinsics, port=port, dome_radius_mm=dome_radius,
+        port_distance_mm=port_distance, glass_mm=glass, glass_sigma_mm=glass_sigma, n_glass=n_glass,
+        n_glass_sigma=n_glass_sigma, n_water=n_water, n_water_sigma=n_water_sigma,
+        carry_to_n=carry_to_n,
     )  # fmt: skip
     if options != CalibrateOptions():
         result = calibrate_pictures(options, executor_of(threads))

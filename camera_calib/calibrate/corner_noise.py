@@ -97,7 +97,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
             kernel = np.exp(-0.5 * squares / (reach * diagonal_m) ** 2)
             parts.append(_Part(kernel=kernel, in_all=in_all))
     # In units of the covariance's root the unknowns are independent, each of variance 1.
-    root: Array = np.linalg.cholesky(found.covariance.matrix)
+    root = np.asarray(np.linalg.cholesky(found.covariance.matrix), dtype=np.float64)
     products = _Products(rows, parts, root)
     theta = products.variances()
     pictures, places = theta[: len(parts)], theta[len(parts) :]

@@ -2,11 +2,12 @@
 
 import contextlib
 import math
+import re
 import shlex
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.artefacts import read_json
-from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
+from alice_survey.base.errors import CalibrationError, WorkspaceError
 from alice_survey.base.executor import Executor, local_executor
+from alice_survey.base.records import CalibrationRecord
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
@@ -25,7 +27,14 @@ from camera_calib.calibrate.housing import (
     housing_lines,
     likely_port,
 )
-from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
+from camera_calib.calibrate.moments import ClockOffset, clock_offset, track_of, views_at_moments
+from camera_calib.calibrate.picture_sets import (
+    PictureSet,
+    check_own,
+    find_pictures,
+    pair_pictures,
+    picture_times_s,
+)
 from camera_calib.calibrate.solve import (
     Intrinsics,
     blank_camera,
@@ -54,6 +63,11 @@ _WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
 """Files of this command; a folder with other files is not replaced."""
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
+_MOST_CAMERAS = 8
+_MOST_FIRST_VIEWS = 30
+_FEWEST_FITTING = 0.5
+"""Share of a camera's pictures that must fit those of the others."""
 _GUESSED_PORT_M = 0.02
 _USUAL_DOME_M = 0.08
 _FRESH_WATER = 1.34
@@ -69,6 +83,10 @@ class CalibrateOptions:
     right: str | None = None
     pictures: str | None = None
     """Pictures of a single camera, instead."""
+    cameras: tuple[str, ...] = ()
+    """`NAME=PLACE` of each camera, the reference first, where left and right do not do."""
+    own_clocks: bool = False
+    """Whether the cameras took their pictures by clocks of their own, without a common trigger."""
     target: str | None = None
     """Target, as `parse_target` reads it."""
     output: Path | None = None
@@ -106,18 +124,31 @@ class CalibrateOptions:
         stereo = {"left": self.left, "right": self.right}
         given = {camera: place for camera, place in stereo.items() if place is not None}
         if self.pictures is not None:
-            if given:
-                raise CalibrationError("give --left and --right, or --pictures, not both")
+            if given or self.cameras:
+                raise CalibrationError(
+                    "give --left and --right, or --camera, or --pictures, not two of them"
+                )
             return {ONE_CAMERA: self.pictures}
         if len(given) == 1:
             raise CalibrationError(
                 "give both --left and --right, or --pictures for a single camera"
             )
+        for text in self.cameras:
+            name, is_there, place = text.partition("=")
+            if not (is_there and place and _NAME.fullmatch(name)):
+                raise CalibrationError(
+                    f"--camera {text}: write NAME=FOLDER, a name of letters, digits, - and _ first"
+                )
+            if name in given:
+                raise CalibrationError(f"--camera {text}: two cameras are called {name}")
+            given[name] = place
         if not given:
             raise CalibrationError(
-                "these options are for pictures: give --left and --right, or --pictures; the pool "
-                "of a survey takes none of them"
+                "these options are for pictures: give --left and --right, --pictures, or --camera; "
+                "the pool of a survey takes none of them"
             )
+        if len(given) > _MOST_CAMERAS:
+            raise CalibrationError(f"{len(given)} cameras are given, {_MOST_CAMERAS} at most")
         return given
 
 
@@ -143,16 +174,96 @@ def calibrate_pictures(
     start = None if settings.start is None else read_rig(settings.start)
     _check_settings(settings, start)
     lists = {camera: find_pictures(place) for camera, place in places.items()}
+    check_own(lists)
+    clocks: Mapping[str, ClockOffset] = {}
     with _replacing(output) as partial:
-        found = detect_views(pair_pictures(lists), target, executor or local_executor())
-        warn_of_unseen(found)
-        calibration = finish(partial, calibrated(settings, found, target, start), found)
-        _check_sides(calibration.rig)
+        if settings.own_clocks:
+            found, clocks = _on_one_clock(settings, lists, target, start, executor)
+        else:
+            found = detect_views(pair_pictures(lists), target, executor or local_executor())
+            warn_of_unseen(found)
+        # In the order of the options: the first camera is the reference.
+        found = replace(found, sizes={name: found.sizes[name] for name in lists})
+        calibration = calibrated(settings, found, target, start)
+        rig = calibration.rig
+        source = "; ".join([rig.source, *_clock_lines(clocks, rig.reference)])
+        calibration = finish(partial, replace(calibration, rig=replace(rig, source=source)), found)
+        CalibrationRecord.save(
+            partial / "calibration.json",
+            {
+                **summary(calibration),
+                "clocks": {name: asdict(offset) for name, offset in clocks.items()},
+            },
+        )
         if settings.carry_to_n is not None:
             write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
+    _check_useful(calibration, found, output)
     verdicts = read_json(output / "report.json")["verdicts"]
     text = calibration_text(calibration, target, verdicts)
-    return "\n".join([text, *_next(calibration, output, settings)]), summary(calibration)
+    clock_lines = _clock_lines(clocks, calibration.rig.reference)
+    text = "\n".join([text, *clock_lines, *_next(calibration, output, settings)])
+    return text, read_json(output / "calibration.json")
+
+
+def _on_one_clock(
+    settings: CalibrateOptions,
+    lists: Mapping[str, Sequence[Path]],
+    target: Target,
+    start: Rig | None,
+    executor: Executor | None,
+) -> tuple[Detections, dict[str, ClockOffset]]:
+    """What the cameras saw when the first took its pictures, and the offsets of their clocks.
+
+    Raises:
+        CalibrationError: the target or the pictures do not show the clocks.
+    """
+    if len(lists) == 1 or target.is_ambiguous:
+        raise CalibrationError(
+            "--own-clocks needs two cameras or more, and a target whose corners have one numbering:"
+            " an odd and an even count, such as 'chessboard 9x6 25mm', or markers"
+        )
+    times_s, sets = {}, []
+    for name, paths in lists.items():
+        for path, time_s in zip(paths, picture_times_s(name, paths), strict=True):
+            sets.append(PictureSet(name=f"{name} {path.name}", paths={name: path}))
+            times_s[sets[-1].name] = time_s
+    found = detect_views(sets, target, executor or local_executor())
+    warn_of_unseen(found)
+    points = target.points
+    start = None if start is None else _matching(start, found.sizes)
+    kind = _kind(settings, start) if settings.water else NoPort.shape
+    cameras = _cameras(settings, found.sizes, start, kind)
+    if start is None:
+        some = [
+            view
+            for name in cameras
+            for view in _spread([v for v in found.views if name in v.pixels])
+        ]
+        cameras = first_cameras(some, points, cameras, settings.lens)
+    tracks = {
+        name: track_of(name, camera, found.views, times_s, points)
+        for name, camera in cameras.items()
+    }
+    first, *others = tracks
+    clocks = {
+        name: clock_offset((first, name), tracks[first], tracks[name], cameras[name], points)
+        for name in others
+    }
+    return replace(found, views=views_at_moments(tracks, clocks)), clocks
+
+
+def _spread(views: Sequence[TargetView]) -> list[TargetView]:
+    """Some views, evenly: enough for a first camera."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, _MOST_FIRST_VIEWS).astype(int))
+    return [views[v] for v in chosen]
+
+
+def _clock_lines(clocks: Mapping[str, ClockOffset], reference: str) -> Iterator[str]:
+    for name, offset in clocks.items():
+        yield (
+            f"clock of {name}: add {with_sigma(offset.seconds, offset.sigma_s)} s to its times to "
+            f"get those of {reference} (from {offset.pictures} pictures)"
+        )
 
 
 def carried(rig: Rig, n_water: float) -> Rig:
@@ -217,10 +328,8 @@ def calibrated(
     points, lens = target.points, settings.lens
     start = None if start is None else _matching(start, found.sizes)
     if not settings.water:
-        bare = {name: blank_camera(size, lens) for name, size in found.sizes.items()}
-        if start is not None:
-            bare = {name: camera.in_air() for name, camera in start.cameras.items()}
-            start = replace(start, cameras=bare)
+        bare = _cameras(settings, found.sizes, start, NoPort.shape)
+        start = None if start is None else replace(start, cameras=bare)
         views = _numbered(found, target, bare, lens, known=start is not None)
         return calibrate_in_air(views, points, found.sizes, lens, start)
     ratios: dict[str, float] = {}
@@ -231,8 +340,7 @@ def calibrated(
         found_by = {kind: partial(_through, settings, found, target, start, kind) for kind in PORTS}
         calibration = compare_housings(found_by)
     else:
-        old = NO_PORT if start is None else next(iter(start.cameras.values())).port
-        kind = settings.port or (old.shape if old.parameters else FlatPort.shape)
+        kind = _kind(settings, start)
         try:
             calibration = _through(settings, found, target, start, kind)
         except CalibrationError as error:
@@ -273,14 +381,7 @@ def _through(
 ) -> Calibration:
     """The calibration under water through ports of one kind."""
     points, lens = target.points, settings.lens
-    if start is None:
-        port = _port(kind, NO_PORT, settings)
-        cameras = {name: blank_camera(size, lens, port) for name, size in found.sizes.items()}
-    else:
-        cameras = {
-            name: replace(camera, port=_port(kind, camera.port, settings))
-            for name, camera in start.cameras.items()
-        }
+    cameras = _cameras(settings, found.sizes, start, kind)
     views = _numbered(found, target, cameras, lens, known=start is not None)
     known_to = {
         "glass_thickness_m": _metres(settings.glass_sigma_mm),
@@ -302,6 +403,27 @@ def _through(
 
 def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
+
+
+def _kind(settings: CalibrateOptions, start: Rig | None) -> str:
+    """The kind of port that is named, or that of the start, or a flat one."""
+    if settings.port in PORTS:
+        return str(settings.port)
+    old = NO_PORT if start is None else next(iter(start.cameras.values())).port
+    return old.shape if old.parameters else FlatPort.shape
+
+
+def _cameras(
+    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None, kind: str
+) -> dict[str, Camera]:
+    """Cameras of the start, or blank ones, behind ports of one kind."""
+    if start is None:
+        port = _port(kind, NO_PORT, settings)
+        return {name: blank_camera(size, settings.lens, port) for name, size in sizes.items()}
+    return {
+        name: replace(camera, port=_port(kind, camera.port, settings))
+        for name, camera in start.cameras.items()
+    }
 
 
 def _port(kind: str, old: PortValues, settings: CalibrateOptions) -> PortValues:
@@ -356,7 +478,10 @@ def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) ->
     if settings.water:
         lines.append(f"next: alice-survey camera uncertainty {rig}")
     else:
-        places = "--pictures P" if ONE_CAMERA in calibration.rig.cameras else "--left L --right R"
+        given = {"pictures": settings.pictures, "left": settings.left, "right": settings.right}
+        short = [f"--{option} {option[0].upper()}" for option, place in given.items() if place]
+        long = [f"--camera {text.partition('=')[0]}=FOLDER" for text in settings.cameras]
+        places = " ".join([*short, *long])
         lines.append(
             f"next, behind ports, with pictures under water: alice-survey calibrate {places} "
             f"--target T --water --glass MM --start {rig} -o DIR"
@@ -364,16 +489,22 @@ def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) ->
     return lines
 
 
-def _check_sides(rig: Rig) -> None:
-    """Warn when the pictures of the two cameras seem to be swapped."""
-    if set(rig.cameras) != {"left", "right"}:
-        return
-    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
-    if x < -max(abs(y), abs(z)):
-        warn(
-            f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left and "
-            "--right, unless the cameras hang upside down"
-        )
+def _check_useful(calibration: Calibration, found: Detections, output: Path) -> None:
+    """Reject a result that is no calibration, after its files are written for a look.
+
+    Raises:
+        CalibrationError: most pictures of a camera do not fit those of the others.
+    """
+    for name in calibration.rig.cameras:
+        seen = sum(name in view.pixels for view in found.views)
+        fits = sum(name in view.pixels for view in calibration.views)
+        if fits < _FEWEST_FITTING * seen:
+            raise CalibrationError(
+                f"only {fits} of {seen} pictures of {name} fit those of the other cameras: are "
+                "pictures of one number, or of one place in the lists, of one moment, and did the "
+                f"cameras stay as they were to each other? ({output} shows more; do not use its "
+                "rig.json)"
+            )
 
 
 def _check_output(output: Path, start: Path | None) -> None:
@@ -420,7 +551,7 @@ def _replacing(output: Path) -> Iterator[Path]:
 def calibration_text(
     calibration: Calibration, target: Target, verdicts: Sequence[Mapping[str, str]]
 ) -> str:
-    """Fit, baseline, lenses, ports and verdicts of a calibration; lengths in millimetres.
+    """What is bad, fit, baselines, lenses, ports and verdicts; lengths in millimetres.
 
     Args:
         calibration: with its rig's covariance.
@@ -428,7 +559,9 @@ def calibration_text(
         verdicts: `level` and `text` of each, the worst first, as in `report.json`.
     """
     rig, square = calibration.rig, (calibration.residuals_px**2).sum(axis=-1)
+    bad = [f"bad: {verdict['text']}" for verdict in verdicts if verdict["level"] == "bad"]
     lines = [
+        *bad,
         f"{len(calibration.views)} views, {int(np.isfinite(square).sum())} points, "
         f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
         *_baseline_lines(rig, target),
@@ -468,8 +601,9 @@ def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:
         length_m = float(np.linalg.norm(rig.cam_from_rig[name].translation))
         sigma_m = baseline_sigma_m(rig, name)
         unit = "tags" if target.kind == "apriltag" else "squares"
+        to = f" from {rig.reference} to {name}" if len(rig.cameras) > 2 else ""
         yield (
-            f"baseline {with_sigma(1e3 * length_m, 1e3 * sigma_m)} mm = "
+            f"baseline{to} {with_sigma(1e3 * length_m, 1e3 * sigma_m)} mm = "
             f"{with_sigma(length_m / target.size_m, sigma_m / target.size_m)} {unit} of "
             f"{1e3 * target.size_m:g} mm"
         )
@@ -523,5 +657,5 @@ def _verdict_lines(verdicts: Sequence[Mapping[str, str]], warnings: int) -> Iter
     words = [f"{counts[level]} {level}" for level in _LEVELS if counts[level]]
     yield f"verdicts: {', '.join(words)}; {warnings} warnings"
     for verdict in verdicts:
-        if verdict["level"] != "good":
-            yield f"  {verdict['level']}: {verdict['text']}"
+        if verdict["level"] == "look":
+            yield f"  look: {verdict['text']}"

@@ -1,17 +1,23 @@
 """Pictures of a calibration: which files there are, and which were taken at the same moment."""
 
+import hashlib
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC
 from pathlib import Path
 
+from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import CalibrationError, warn
+from camera_calib.picture_files import time_taken
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 _LEAST_PAIRED = 0.5
-"""Share of the longer list whose numbers must be in the other for names to pair."""
+"""Share of each list whose numbers must be in another for names to pair."""
 _NAMED = 3
+_MANIFEST = "manifest.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +52,9 @@ def find_pictures(place: str) -> list[Path]:
 def pair_pictures(lists: Mapping[str, Sequence[Path]]) -> list[PictureSet]:
     """Which pictures of two or more cameras belong together.
 
-    By the last number in their names where these agree for most pictures; else by their order,
-    where all cameras have the same count. A picture without partners still shows its camera alone.
+    By the last number in their names where most pictures of each camera share theirs with another
+    camera; else by their order, where all cameras have the same count. A picture without partners
+    still shows its camera alone.
 
     Args:
         lists: by camera, in the order of their names.
@@ -59,16 +66,15 @@ def pair_pictures(lists: Mapping[str, Sequence[Path]]) -> list[PictureSet]:
         ((camera, paths),) = lists.items()
         return [PictureSet(name=path.stem, paths={camera: path}) for path in paths]
     numbered = {camera: _by_number(paths) for camera, paths in lists.items()}
-    longest = max(len(paths) for paths in lists.values())
     if all(numbered.values()):
-        shared = set.intersection(*(set(found) for found in numbered.values()))
-        if len(shared) >= _LEAST_PAIRED * longest:
+        counts = Counter(number for found in numbered.values() for number in found)
+        shared = {c: sum(counts[n] > 1 for n in found) for c, found in numbered.items()}
+        if all(shared[c] >= _LEAST_PAIRED * len(found) for c, found in numbered.items()):
             return _paired_by_number(numbered)
-    counts = {camera: len(paths) for camera, paths in lists.items()}
-    if len(set(counts.values())) > 1:
+    if len({len(paths) for paths in lists.values()}) > 1:
         described = ", ".join(
-            f"{count} of {camera} ({_some([p.name for p in lists[camera]])})"
-            for camera, count in counts.items()
+            f"{len(paths)} of {camera} ({_some([p.name for p in paths])})"
+            for camera, paths in lists.items()
         )
         raise CalibrationError(
             f"pictures do not pair: {described}: name those of one moment with one number, or "
@@ -83,6 +89,73 @@ def pair_pictures(lists: Mapping[str, Sequence[Path]]) -> list[PictureSet]:
     ]
 
 
+def picture_times_s(camera: str, paths: Sequence[Path]) -> list[float]:
+    """When pictures were taken, seconds on their camera's clock, to fractions of a second.
+
+    From `manifest.csv` (columns `image`, `time_s`) in their folder or the one above, as
+    `import-images` writes it, or else from EXIF.
+
+    Raises:
+        CalibrationError: a picture has no time, or they have whole seconds only.
+    """
+    stated: dict[Path, float] = {}
+    for folder in {path.parent for path in paths}:
+        for place in (folder, folder.parent):
+            if (place / _MANIFEST).is_file():
+                stated |= _manifest_times_s(place / _MANIFEST)
+                break
+    times = []
+    for path in paths:
+        known = stated.get(path.resolve())
+        if known is None:
+            taken = time_taken(path)
+            if taken is None:
+                raise CalibrationError(
+                    f"{path} of {camera} has no time, in {_MANIFEST} (columns image, time_s) or in "
+                    "EXIF: --own-clocks needs the time of every picture"
+                )
+            known = taken.replace(tzinfo=taken.tzinfo or UTC).timestamp()
+        times.append(known)
+    if all(time.is_integer() for time in times):
+        raise CalibrationError(
+            f"times of {camera} are whole seconds, {paths[0].name} and all others: --own-clocks "
+            f"needs fractions, from EXIF's sub-seconds or from {_MANIFEST} (columns image, time_s)"
+        )
+    return times
+
+
+def _manifest_times_s(path: Path) -> dict[Path, float]:
+    _, rows = read_csv(path, ("image", "time_s"), exact=True, fault=CalibrationError)
+    times = {}
+    for line, row in rows:
+        try:
+            times[(path.parent / row["image"]).resolve()] = float(row["time_s"] or "nan")
+        except ValueError:
+            raise CalibrationError(f"{path} line {line}: time_s {row['time_s']!r}") from None
+    return {picture: time for picture, time in times.items() if math.isfinite(time)}
+
+
+def check_own(lists: Mapping[str, Sequence[Path]]) -> None:
+    """Check that no two cameras have the same pictures, be it as copies.
+
+    Raises:
+        CalibrationError: they have.
+    """
+    owners: dict[bytes, tuple[str, Path]] = {}
+    sizes = Counter(path.stat().st_size for paths in lists.values() for path in paths)
+    for camera, paths in lists.items():
+        for path in paths:
+            if sizes[path.stat().st_size] == 1:
+                continue
+            content = hashlib.sha256(path.read_bytes()).digest()
+            owner, other = owners.setdefault(content, (camera, path))
+            if owner != camera:
+                raise CalibrationError(
+                    f"{owner} and {camera} have the same picture, {other} and {path}: give each "
+                    "camera the pictures that it took"
+                )
+
+
 def _by_number(paths: Sequence[Path]) -> dict[int, Path]:
     """Pictures by the last number in their names; empty where not each has one of its own."""
     numbers = [re.findall(r"\d+", path.stem) for path in paths]
@@ -94,7 +167,7 @@ def _by_number(paths: Sequence[Path]) -> dict[int, Path]:
 
 def _paired_by_number(numbered: Mapping[str, Mapping[int, Path]]) -> list[PictureSet]:
     everywhere = Counter(number for found in numbered.values() for number in found)
-    alone = [number for number, count in everywhere.items() if count < len(numbered)]
+    alone = [number for number, count in everywhere.items() if count == 1]
     if alone:
         odd = [found[n].name for found in numbered.values() for n in sorted(alone) if n in found]
         warn(f"{len(odd)} pictures without a partner serve their camera alone: {_some(odd)}")

@@ -34,6 +34,8 @@ _THINNEST = 0.02
 """Least width over length of the seen part of a target: points in one row give no pose."""
 _CLEAR = 2.0
 """A second pose with residuals this many times larger than the first is ignored."""
+_ALIKE = 0.3
+"""Largest difference of poses between cameras that is an error: radians and share of the range."""
 _ROUGHLY = 0.3
 """Convergence limit, in sigmas, of poses that only serve as a start."""
 _STEPS = 30
@@ -203,7 +205,8 @@ def first_cam_from_rig(
         points: (N, 3) of the target, metres.
 
     Raises:
-        CalibrationError: no chain of shared views joins a camera to the first.
+        CalibrationError: no chain of shared views joins a camera to the first, or in most views it
+            stands elsewhere than in the others.
     """
     poses = {name: poses_alone(name, camera, views, points) for name, camera in cameras.items()}
     names = list(cameras)
@@ -223,8 +226,21 @@ def first_cam_from_rig(
         between = RigidTransform.concatenate(
             [poses[new][v] * poses[known][v].inv() for v in sorted(both)]
         )
+        ranges_m = [np.linalg.norm(poses[known][v].translation) for v in sorted(both)]
+        _check_alike(known, new, between, float(np.median(ranges_m)))
         found[new] = _middle(between) * found[known]
     return {name: found[name] for name in names}
+
+
+def _check_alike(known: str, new: str, between: RigidTransform, range_m: float) -> None:
+    """Reject views that show different moments to two cameras: no rig explains them."""
+    alike = int((poses_apart(between, range_m) < _ALIKE).sum(axis=1).max())
+    if alike < len(between) / 2.0:
+        raise CalibrationError(
+            f"{new} stands to {known} in one way in {alike} of the {len(between)} views of both, "
+            "and elsewhere in the others: are pictures of one number, or of one place in the "
+            "lists, of one moment, and did the cameras stay as they were to each other?"
+        )
 
 
 def poses_alone(
@@ -246,10 +262,10 @@ def poses_alone(
 def _middle(poses: RigidTransform) -> RigidTransform:
     """The pose that differs least from the others, turn and place together."""
     scale = float(np.median(np.linalg.norm(poses.translation, axis=1))) + 1e-12
-    return poses[int(np.argmin(_apart(poses, scale).sum(axis=1)))]
+    return poses[int(np.argmin(poses_apart(poses, scale).sum(axis=1)))]
 
 
-def _apart(poses: RigidTransform, scale: float) -> Array:
+def poses_apart(poses: RigidTransform, scale: float) -> Array:
     """Differences of all poses from each other, (N, N): radians and lengths over the scale."""
     turns = poses.rotation.as_matrix()
     cosines = (np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0
@@ -311,6 +327,6 @@ def _choices(
         [poses[v] * turn.inv() * reference[v].inv() for v in views for turn in turns]
     )
     scale = float(np.median([np.linalg.norm(reference[v].translation) for v in views]))
-    distance = _apart(between, scale).reshape(len(between), len(views), len(turns))
+    distance = poses_apart(between, scale).reshape(len(between), len(views), len(turns))
     best = distance[int(np.argmin(distance.min(axis=2).sum(axis=1)))]
     return dict(zip(views, best.argmin(axis=1).tolist(), strict=True))

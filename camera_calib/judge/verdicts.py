@@ -11,6 +11,7 @@ from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.housing import likely_port
 from camera_calib.judge.judgement import CameraJudgement, Judgement
+from camera_calib.rig import Rig
 from camera_calib.target_shape import BOW_X, BOW_Y
 
 _ODD_PICTURE = 2.0
@@ -45,6 +46,7 @@ def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
 
 
 def _lines(judged: Judgement) -> Iterator[Verdict]:
+    yield from _side_verdicts(judged.calibration.rig)
     yield from _fit_verdicts(judged)
     yield from _housing_verdicts(judged)
     yield from _hold_out_verdicts(judged)
@@ -53,6 +55,19 @@ def _lines(judged: Judgement) -> Iterator[Verdict]:
     for name, camera in judged.cameras.items():
         yield from _homography_verdicts(judged, name, camera)
     yield from _uncertainty_verdicts(judged)
+
+
+def _side_verdicts(rig: Rig) -> Iterator[Verdict]:
+    """A verdict where the pictures of the left and the right camera seem to be swapped."""
+    if set(rig.cameras) != {"left", "right"}:
+        return
+    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+    if x < -max(abs(y), abs(z)):
+        yield Verdict(
+            level="bad",
+            text=f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left "
+            "and --right, unless the cameras hang upside down",
+        )
 
 
 def _graded(ratio: float, look: float, bad: float) -> Level:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from datetime import UTC, datetime, tzinfo
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import ImageError
-from camera_calib.picture_files import PILLOW_FAULTS, pixels_too_many, read_pixels
+from camera_calib.picture_files import PILLOW_FAULTS, exif_time, pixels_too_many, read_pixels
 
 PLAIN = (".jpg", ".jpeg", ".png")
 TIFF = (".tif", ".tiff")
@@ -38,10 +38,7 @@ _ADVICE = {
     "other files": "their names are not those of pictures",
 }
 _NAMED = 3
-_YEARS = range(1970, 2200)
-"""Years in which a digital camera can have taken a picture."""
-_GPS, _EXIF = 0x8825, 0x8769
-_DATE, _SUBSECOND, _OFFSET, _FOCAL_35 = 0x9003, 0x9291, 0x9011, 0xA405
+_GPS, _EXIF, _FOCAL_35 = 0x8825, 0x8769, 0xA405
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,35 +236,16 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
     try:
         with _pillow(facts.path) as image:
             exif = image.getexif()
-            details, gps = exif.get_ifd(_EXIF), exif.get_ifd(_GPS)
+            gps, time_local = exif.get_ifd(_GPS), exif_time(exif)
     except ImageError:
         return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
     return replace(
         facts,
-        time_local=_time(details, exif),
+        time_local=time_local,
         latitude_deg=_angle(gps, 2, 1, "S"),
         longitude_deg=_angle(gps, 4, 3, "W"),
         altitude_m=_altitude(gps),
     )
-
-
-def _time(details: Any, exif: Any) -> datetime | None:
-    text = details.get(_DATE) or exif.get(_DATE)
-    try:
-        time = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        return None
-    if time.year not in _YEARS:
-        return None
-    digits = re.match(r"\d+", str(details.get(_SUBSECOND, "")))
-    if digits:
-        time += timedelta(seconds=float(f"0.{digits[0]}"))
-    zone = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(details.get(_OFFSET, "")).strip("\0 "))
-    if zone:
-        shift = timedelta(hours=int(zone[2]), minutes=int(zone[3]))
-        if shift < timedelta(hours=24):
-            time = time.replace(tzinfo=timezone(-shift if zone[1] == "-" else shift))
-    return time
 
 
 def _number(value: Any) -> float | None:

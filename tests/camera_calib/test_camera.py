@@ -157,7 +157,7 @@ def changed_radius(port: DomePort) -> DomePort:
 def test_a_fisheye_is_that_of_opencv_and_colmap() -> None:
     camera = camera_of(FISHEYE, NO_PORT)
     points = np.random.default_rng(4).uniform([-3, -3, 0.3], [3, 3, 2], (500, 3))
-    k = np.array([FISHEYE.k1, FISHEYE.k2, FISHEYE.k3, FISHEYE.k4])
+    k = np.array([FISHEYE.lens.k1, FISHEYE.lens.k2, FISHEYE.lens.k3, FISHEYE.lens.k4])
     matrix = np.array([[600.0, 0.0, 804.5], [0.0, 604.0, 589.5], [0.0, 0.0, 1.0]])
     opencv = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, k)[0]
     np.testing.assert_allclose(camera.project(points), opencv[:, 0] + 0.5, atol=1e-9)

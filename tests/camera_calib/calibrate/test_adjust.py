@@ -18,6 +18,7 @@ from benchmarks.camera_calibration import (
     run_mode,
     run_trial,
 )
+from tests.cameras import changed
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.solve import Intrinsics
 from camera_calib.calibrate.start import locate_all
@@ -327,7 +328,7 @@ def test_unknown_names_are_refused() -> None:
 
 def test_a_start_from_which_points_leave_the_model_does_not_pass_as_settled() -> None:
     """Light goes through a tank, as glass, whose far wall must move past the board's near edge."""
-    tank = replace(
+    tank = changed(
         DESIGN.cameras["left"],
         port_distance_m=0.10, glass_thickness_m=0.26, n_glass=1.33, n_water=1.0,
         normal=tilted(11.0, 0.0),

@@ -14,6 +14,7 @@ import pytest
 from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.base.executor import SERIAL
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
+from camera_calib.calibrate import from_pictures
 from camera_calib.calibrate.detect_views import detect_views
 from camera_calib.calibrate.from_pictures import (
     CalibrateOptions,
@@ -341,13 +342,65 @@ def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
     assert (tmp_path / "air" / "rig.json").is_file()
 
 
-@pytest.mark.usefixtures("quick")
-def test_swapped_lists_are_reported(
-    dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
     swapped = {"left": str(dry / "right"), "right": str(dry / "left")}
-    for pictures, warnings in ((both(dry), 0), (swapped, 1)):
+    for pictures, is_bad in ((both(dry), False), (swapped, True)):
         settings = CalibrateOptions(**pictures, target=POOL_BOARD, lens="k2")
+        text, _ = calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
+        first = json.loads((tmp_path / "out" / "report.json").read_text())["verdicts"][0]
+        assert (first["level"] == "bad" and " 100 mm " in first["text"]) == is_bad
+        assert (text.splitlines()[0] == f"bad: {first['text']}") == is_bad
+
+
+def test_the_same_folder_twice_is_one_clear_line(dry: Path, tmp_path: Path) -> None:
+    place = str(dry / "left")
+    message = refuses(CalibrateOptions(left=place, right=place, target=POOL_BOARD), tmp_path)
+    assert "left and right have the same picture" in message
+
+
+@pytest.mark.usefixtures("quick")
+def test_pictures_of_other_moments_are_no_calibration(dry: Path, tmp_path: Path) -> None:
+    """No rig explains them: that shows before anything is adjusted."""
+    shutil.copytree(dry, tmp_path / "in")
+    for view in range(12):
+        (tmp_path / "in" / "right" / f"{view:02d}.png").rename(
+            tmp_path / "in" / "right" / f"new{(view + 5) % 12:02d}.png"
+        )
+    settings = CalibrateOptions(**both(tmp_path / "in"), target=POOL_BOARD, lens="k2")
+    assert "of the 12 views of both" in refuses(settings, tmp_path)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_camera_of_which_most_pictures_do_not_fit_is_no_calibration(
+    dry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files stay for a look, the exit says that they are no use."""
+
+    def with_few(*arguments: Any) -> Any:
+        found = calibrated(*arguments)
+        few = [
+            view if v < 5 else replace(view, pixels={"left": view.pixels["left"]})
+            for v, view in enumerate(found.views)
+        ]
+        return replace(found, views=tuple(few))
+
+    calibrated = from_pictures._calibrated
+    monkeypatch.setattr(from_pictures, "_calibrated", with_few)
+    settings = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="k2")
+    with pytest.raises(CalibrationError, match="only 5 of 12 pictures of right") as caught:
         calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
-        shown = capsys.readouterr().err
-        assert shown.count(" 100 mm ") == warnings
+    assert len(str(caught.value).splitlines()) == 1
+    assert (tmp_path / "out" / "report.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "named"),
+    [
+        (("bow",), "NAME=FOLDER"),
+        (("b.c=x",), "b.c=x"),
+        (("a=x", "a=y"), "two cameras are called a"),
+        (tuple(f"c{i}=x" for i in range(9)), "9 cameras"),
+    ],
+)
+def test_cameras_that_cannot_be(cameras: tuple[str, ...], named: str, tmp_path: Path) -> None:
+    assert named in refuses(CalibrateOptions(cameras=cameras, target=POOL_BOARD), tmp_path)

@@ -3,9 +3,15 @@
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
+from camera_calib.calibrate.picture_sets import (
+    check_own,
+    find_pictures,
+    pair_pictures,
+    picture_times_s,
+)
 
 
 def paths(*names: str) -> list[Path]:
@@ -50,6 +56,38 @@ def test_lists_of_other_lengths_without_common_numbers_do_not_pair() -> None:
         pair_pictures({"left": paths("a1.png", "a2.png"), "right": paths("b8.png")})
 
 
+def test_pictures_of_four_cameras_pair_where_each_shares_most_with_another(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The last camera saw only some of the moments, and one that nobody else saw."""
+    sets = pair_pictures(
+        {
+            "a": paths("1.png", "2.png", "3.png", "4.png"),
+            "b": paths("x1.png", "x2.png", "x3.png"),
+            "c": paths("y2.png", "y3.png", "y4.png"),
+            "d": paths("z3.png", "z4.png", "z9.png"),
+        }
+    )
+    together = {one.name: "".join(one.paths) for one in sets}
+    assert together == {"1": "ab", "2": "abc", "3": "abcd", "4": "acd", "9": "d"}
+    assert "z9.png" in capsys.readouterr().err
+
+
+def test_the_same_pictures_are_not_two_cameras(tmp_path: Path) -> None:
+    for folder in "ab":
+        (tmp_path / folder).mkdir()
+        for number in range(3):
+            (tmp_path / folder / f"{number}.png").write_bytes(f"{folder} {number}".encode())
+    a, b = (find_pictures(str(tmp_path / folder)) for folder in "ab")
+    check_own({"left": a, "right": b})
+    for lists in ({"left": a, "right": a}, {"left": a, "mid": b, "right": b}):
+        with pytest.raises(CalibrationError, match=r"and right have the same picture"):
+            check_own(lists)
+    (tmp_path / "b" / "7.png").write_bytes(a[1].read_bytes())  # a copy by another name
+    with pytest.raises(CalibrationError, match=r"1\.png.*7\.png"):
+        check_own({"left": a, "right": find_pictures(str(tmp_path / "b"))})
+
+
 def test_one_camera_needs_no_pairs() -> None:
     sets = pair_pictures({"camera": paths("a.png", "b.png")})
     assert [(one.name, list(one.paths)) for one in sets] == [("a", ["camera"]), ("b", ["camera"])]
@@ -79,3 +117,36 @@ def test_pairs_by_order_of_pictures_with_other_numbers_are_reported(
     shown = capsys.readouterr().err
     assert "a1.png" in shown and "b51.png" in shown
     assert len(shown.splitlines()) == 1
+
+
+def shot(path: Path, date: str, fraction: str) -> Path:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x9003: date, 0x9291: fraction})
+    Image.new("L", (8, 6)).save(path, exif=exif)
+    return path
+
+
+def test_times_are_those_of_exif_or_of_a_manifest(tmp_path: Path) -> None:
+    first = shot(tmp_path / "1.jpg", "2024:05:06 07:08:09", "25")
+    second = shot(tmp_path / "2.jpg", "2024:05:06 07:09:09", "5")
+    one, two = picture_times_s("left", [first, second])
+    assert two - one == pytest.approx(60.25, abs=1e-6)
+
+    (tmp_path / "manifest.csv").write_text("image,time_s\n1.jpg,3.5\n2.jpg,4.25\n")
+    assert picture_times_s("left", [second, first]) == [4.25, 3.5]
+    (tmp_path / "left").mkdir()
+    below = shot(tmp_path / "left" / "3.jpg", "2024:05:06 07:08:09", "0")
+    (tmp_path / "manifest.csv").write_text("image,camera,time_s\nleft/3.jpg,left,0.125\n")
+    assert picture_times_s("left", [below]) == [0.125]
+
+
+def test_pictures_without_fine_times_are_named(tmp_path: Path) -> None:
+    Image.new("L", (8, 6)).save(tmp_path / "a.png")
+    with pytest.raises(CalibrationError, match=r"a\.png of right has no time"):
+        picture_times_s("right", [tmp_path / "a.png"])
+    coarse = [shot(tmp_path / f"{i}.jpg", f"2024:05:06 07:08:0{i}", "") for i in range(3)]
+    with pytest.raises(CalibrationError, match=r"whole seconds.*0\.jpg"):
+        picture_times_s("right", coarse)
+    (tmp_path / "manifest.csv").write_text("image,time_s\na.png,soon\n")
+    with pytest.raises(CalibrationError, match=r"line 2.*soon"):
+        picture_times_s("right", [tmp_path / "a.png"])

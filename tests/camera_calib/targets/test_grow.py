@@ -77,7 +77,7 @@ def test_a_board_at_a_slant_is_found(steps: tuple[tuple[float, float], ...]) -> 
 
 
 def test_a_faint_board_in_noise_is_found() -> None:
-    """What a fit leaves is noise, not another shape; nothing beyond is taken for a corner."""
+    """What a fit leaves is noise; nothing beyond the board is taken for a corner."""
     seen = seen_from(BOARD, SIZE, (20, 10, 5), 0.7)
     light = picture_light(BOARD, seen, SIZE, fine=4, blur_px=1.0)
     light = 0.3 + 0.06 * (light - 0.3) + np.random.default_rng(2).normal(0, 0.01, light.shape)

@@ -1,0 +1,178 @@
+"""Rigs of many cameras, of other sizes, lenses and directions: from corners, and from pictures."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.executor import SERIAL
+from tests.cameras import changed
+from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+from camera_calib.calibrate.solve import calibrate_in_air
+from camera_calib.calibration import TargetView
+from camera_calib.camera import IN_AIR, Camera, flat_port_camera
+from camera_calib.rig import Rig, read_rig
+from camera_calib.targets.target import Target, parse_target
+from tests.oracles_targets import picture_light, to_srgb
+
+TARGET = parse_target("chessboard 9x6 40mm")
+NOISE_PX = 0.1
+
+
+def camera(width: int, height: int, focal: float, k1: float) -> Camera:
+    return flat_port_camera(
+        width_px=width, height_px=height, fx_px=focal, fy_px=1.002 * focal, cx_px=0.51 * width,
+        cy_px=0.49 * height, k1=k1, **IN_AIR,
+    )  # fmt: skip
+
+
+def four_cameras() -> Rig:
+    """A stereo pair that looks down, one that looks 30 degrees ahead and one 35 degrees aside."""
+    cameras = {
+        "left": camera(640, 480, 620.0, -0.08),
+        "right": camera(800, 600, 700.0, -0.05),
+        "bow": camera(480, 640, 560.0, 0.04),
+        "side": camera(720, 540, 540.0, -0.12),
+    }
+    turns = {
+        "left": [0, 0, 0], "right": [1.0, -2.0, 0.5], "bow": [30, 2, 88], "side": [-3, 35, -4],
+    }  # fmt: skip
+    places = {
+        "left": [0, 0, 0], "right": [0.18, 0.01, 0.0], "bow": [0.05, -0.35, 0.03],
+        "side": [-0.4, 0.02, 0.05],
+    }  # fmt: skip
+    return Rig(
+        cameras=cameras,
+        cam_from_rig={
+            name: RigidTransform.from_components(
+                places[name], Rotation.from_euler("xyz", turns[name], degrees=True)
+            ).inv()
+            for name in cameras
+        },
+        body_from_rig=RigidTransform.identity(),
+        source="truth",
+    )
+
+
+def poses_before(rig: Rig, target: Target, count: int, rng: np.random.Generator) -> RigidTransform:
+    """Poses `rig_from_target` that two cameras or more see whole."""
+    poses: list[RigidTransform] = []
+    middle = target.points.mean(axis=0)
+    while len(poses) < count:
+        turn = Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True)
+        place = rng.uniform([-0.6, -1.0, 0.7], [0.8, 0.4, 1.4])
+        pose = RigidTransform.from_components(place - turn.apply(middle), turn)
+        if sum(is_whole(rig, name, pose, target) for name in rig.cameras) >= 2:
+            poses.append(pose)
+    return RigidTransform.concatenate(poses)
+
+
+def pixels_of(rig: Rig, name: str, pose: RigidTransform, target: Target) -> np.ndarray:
+    return rig.cameras[name].project((rig.cam_from_rig[name] * pose).apply(target.points))
+
+
+def is_whole(rig: Rig, name: str, pose: RigidTransform, target: Target) -> bool:
+    pixels = pixels_of(rig, name, pose, target)
+    size = rig.cameras[name].width_px, rig.cameras[name].height_px
+    with np.errstate(invalid="ignore"):
+        return bool(np.all((pixels > 25) & (pixels < np.array(size) - 25)))
+
+
+def matrix_of(rig: Rig, name: str, pose: RigidTransform) -> np.ndarray:
+    """(3, 3) `pixels_from_board` of a camera without distortion."""
+    one, cam_from_target = rig.cameras[name], (rig.cam_from_rig[name] * pose).as_matrix()
+    inner = np.array([[one.fx_px, 0, one.cx_px], [0, one.fy_px, one.cy_px], [0, 0, 1.0]])
+    return inner @ cam_from_target[:3, [0, 1, 3]]
+
+
+def differences(found: Rig, truth: Rig) -> dict[str, float]:
+    """Found minus true values of all parameters that have a sigma."""
+    errors = {}
+    for key in found.sigmas:
+        name, field = key.split(".")
+        if field in ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m"):
+            off = found.cam_from_rig[name] * truth.cam_from_rig[name].inv()
+            turn = off.rotation.as_rotvec()
+            shift = found.cam_from_rig[name].translation - truth.cam_from_rig[name].translation
+            values = dict(zip(("rx_rad", "ry_rad", "rz_rad"), turn, strict=True))
+            values |= dict(zip(("x_m", "y_m", "z_m"), shift, strict=True))
+            errors[key] = float(values[field])
+        else:
+            true = truth.cameras[name].parameter(field)
+            errors[key] = found.cameras[name].parameter(field) - true
+    return errors
+
+
+def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
+    """From nothing but corners; no view is seen by all of them."""
+    truth, rng = four_cameras(), np.random.default_rng(5)
+    poses = poses_before(truth, TARGET, 40, rng)
+    views = []
+    for v in range(len(poses)):
+        pixels = {}
+        for name in truth.cameras:
+            if is_whole(truth, name, poses[v], TARGET):
+                seen = pixels_of(truth, name, poses[v], TARGET)
+                pixels[name] = seen + rng.normal(0.0, NOISE_PX, seen.shape)
+        views.append(TargetView(name=f"{v:02d}", pixels=pixels))
+    assert {len(view.pixels) for view in views} >= {2, 3}
+    sizes = {name: (c.width_px, c.height_px) for name, c in truth.cameras.items()}
+
+    found = calibrate_in_air(views, TARGET.points, sizes, "k2")
+
+    assert list(found.rig.cameras) == list(truth.cameras)
+    assert len(found.views) == 40 and not found.rejections
+    assert found.noise_px == pytest.approx(NOISE_PX, rel=0.05)
+    errors, sigmas = differences(found.rig, truth), found.rig.sigmas
+    over = np.array([errors[key] / sigmas[key] for key in errors])
+    assert len(over) == 4 * 6 + 3 * 6
+    assert np.abs(over).max() < 4.0
+    assert 0.6 < np.sqrt(np.mean(over**2)) < 1.4
+    for name in ("right", "bow", "side"):
+        assert sigmas[f"{name}.x_m"] < 2e-3
+        assert sigmas[f"{name}.rx_rad"] < 1e-3
+
+
+@pytest.mark.slow
+def test_four_cameras_from_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rendered pictures; those in which a camera sees no whole board are not in its folder."""
+    rig, rng = four_cameras(), np.random.default_rng(3)
+    straight = {name: changed(c, k1=0.0) for name, c in rig.cameras.items()}
+    truth = replace(rig, cameras=straight)
+    poses = poses_before(truth, TARGET, 30, rng)
+    for v in range(len(poses)):
+        for name, one in truth.cameras.items():
+            (tmp_path / name).mkdir(exist_ok=True)
+            if not is_whole(truth, name, poses[v], TARGET):
+                continue
+            matrix = matrix_of(truth, name, poses[v])
+            light = picture_light(TARGET, matrix, (one.width_px, one.height_px), fine=3)
+            light += rng.normal(0, 0.004, light.shape)
+            cv2.imwrite(str(tmp_path / name / f"{name}_{v:03d}.png"), to_srgb(light))
+    options = CalibrateOptions(
+        cameras=tuple(f"{name}={tmp_path / name}" for name in truth.cameras),
+        target=TARGET.description, lens="pinhole", output=tmp_path / "out",
+    )  # fmt: skip
+
+    text, found = calibrate_pictures(options, executor=SERIAL)
+
+    assert found["views"] >= 28
+    rig = read_rig(tmp_path / "out" / "rig.json")
+    assert list(rig.cameras) == list(truth.cameras)
+    for name, one in truth.cameras.items():
+        assert rig.cameras[name].fx_px == pytest.approx(one.fx_px, rel=2e-3)
+    errors = differences(rig, truth)
+    over = np.array([errors[key] / sigma for key, sigma in rig.sigmas.items()])
+    assert np.sqrt(np.mean(over**2)) < 2.0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert set(report["cameras"]) == set(truth.cameras)
+    assert set(report["baselines_m"]) == {"right", "bow", "side"}
+    page = (tmp_path / "out" / "report.html").read_text()
+    for name in ("right", "bow", "side"):
+        assert f"baseline from left to {name}" in text
+        assert f"baseline to {name}" in page
+    assert "--camera left=FOLDER --camera right=FOLDER" in text
