@@ -18,7 +18,6 @@ from benchmarks.camera_calibration import (
     run_mode,
     run_trial,
 )
-from tests.cameras import changed
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.solve import Intrinsics
 from camera_calib.calibrate.start import locate_all

@@ -10,13 +10,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL
-from tests.cameras import changed
 from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
 from camera_calib.camera import IN_AIR, Camera, flat_port_camera
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import Target, parse_target
+from tests.cameras import changed
 from tests.oracles_targets import picture_light, to_srgb
 
 TARGET = parse_target("chessboard 9x6 40mm")

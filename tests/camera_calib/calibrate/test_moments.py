@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import SERIAL
-from tests.cameras import changed
 from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 from camera_calib.calibrate.moments import clock_offset, track_of, views_at_moments
 from camera_calib.calibrate.solve import calibrate_in_air
@@ -25,6 +24,7 @@ from tests.camera_calib.calibrate.test_many_cameras import (
     matrix_of,
     pixels_of,
 )
+from tests.cameras import changed
 from tests.oracles_targets import picture_light, to_srgb
 
 NOISE_PX = 0.1
