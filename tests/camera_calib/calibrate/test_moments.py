@@ -88,7 +88,7 @@ def test_an_offset_is_found_to_its_sigma(offset_s: float) -> None:
             ("left", "right"), tracks["left"], tracks["right"], rig.cameras["right"], TARGET.points
         )
         assert found.pictures > 60
-        assert 1e-5 < found.sigma_s < 2e-3
+        assert 2e-5 < found.sigma_s < 1e-4
         over.append((found.seconds - offset_s) / found.sigma_s)
     assert np.abs(over).max() < 4.0
     assert np.sqrt(np.mean(np.square(over))) > 0.1
