@@ -54,7 +54,7 @@ class CornerNoise:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CornerSpread:
+class ErrorBudget:
     """Covariance of a calibration under the noise that its residuals show."""
 
     noise: CornerNoise
@@ -122,7 +122,7 @@ class Calibration:
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
     housing: HousingJudgement = HousingJudgement()
-    spread: CornerSpread | None = None
+    spread: ErrorBudget | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 
     def __post_init__(self) -> None:

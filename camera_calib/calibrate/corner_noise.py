@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import Adjustment
 from camera_calib.calibrate.normal_equations import CalibrationProblem
-from camera_calib.calibration import CornerNoise, CornerSpread
+from camera_calib.calibration import CornerNoise, ErrorBudget
 from camera_calib.rig import Covariance
 
 _REACHES = (0.12, 0.3, 0.8)
@@ -49,7 +49,7 @@ class _Part:
         return out
 
 
-class _CornerRows:
+class _Weighted:
     """Weighted slopes and residuals of all views; 0 where unseen."""
 
     def __init__(self, problem: CalibrationProblem, found: Adjustment) -> None:
@@ -81,14 +81,14 @@ class _CornerRows:
         self.missed -= np.einsum("vcnak,vk->vcna", self.poses, taken_px)
 
 
-def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
+def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
     """Estimate the noise from the residuals of an adjustment, and propagate it.
 
     Args:
         problem: whose pixels and parameters were adjusted.
         found: the result.
     """
-    rows = _CornerRows(problem, found)
+    rows = _Weighted(problem, found)
     diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
     squares = cdist(problem.points, problem.points, "sqeuclidean")
     parts = [_Part(kernel=np.eye(len(problem.points)), in_all=False)]
@@ -97,7 +97,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
             kernel = np.exp(-0.5 * squares / (reach * diagonal_m) ** 2)
             parts.append(_Part(kernel=kernel, in_all=in_all))
     # In units of the covariance's root the unknowns are independent, each of variance 1.
-    root = np.asarray(np.linalg.cholesky(found.covariance.matrix), dtype=np.float64)
+    root = np.linalg.cholesky(found.covariance.matrix).astype(np.float64)
     products = _Products(rows, parts, root)
     theta = products.variances()
     pictures, places = theta[: len(parts)], theta[len(parts) :]
@@ -113,7 +113,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> CornerSpread:
         shared.append(found.covariance.matrix[:, at] @ known)
     factor = np.concatenate(shared, axis=1)
     matrix = root @ meat @ root.T + factor @ factor.T
-    return CornerSpread(
+    return ErrorBudget(
         noise=CornerNoise(
             alone=float(pictures[0]),
             together=pictures[1:],
@@ -132,7 +132,7 @@ class _Products:
     matrices, the mean of r^T K_i r is the sum of v_j tr(K_i M K_j M).
     """
 
-    def __init__(self, rows: _CornerRows, parts: list[_Part], root: Array) -> None:
+    def __init__(self, rows: _Weighted, parts: list[_Part], root: Array) -> None:
         views, size = len(rows.seen), len(root)
         self.rows, self.parts = rows, parts
         by_rig = rows.by_rig @ root
