@@ -129,8 +129,15 @@ def sides_of(shapefile: Path) -> list[Path]:
 PortTilt = Annotated[float, Field(ge=-15, le=15)]
 
 
+_DOME_M = 0.08
+
+
 class CameraConfig(Config):
-    """The stereo pair as designed: two Manta G-917 behind flat ports (paper, section III.B)."""
+    """The stereo pair as designed: two Manta G-917 behind flat ports (paper, section III.B).
+
+    Lens, kind of port and dome are left out where they are as usual: workspaces made before there
+    was a choice stay as they are.
+    """
 
     width_px: int = Field(3384, ge=64, le=20_000)
     height_px: int = Field(2710, ge=64, le=20_000)
@@ -138,12 +145,14 @@ class CameraConfig(Config):
     focal_mm: float = Field(12.5, gt=0, le=500)
     f_number: float = Field(4.0, ge=0.7, le=64)
     baseline_m: float = Field(0.1, gt=0, le=2)
-    lens: Literal["opencv", "fisheye"] = "opencv"
-    port: Literal["flat", "dome", "none"] = "flat"
+    lens: Literal["opencv", "fisheye"] = Field("opencv", exclude_if="opencv".__eq__)
+    port: Literal["flat", "dome", "none"] = Field("flat", exclude_if="flat".__eq__)
     port_distance_m: float = Field(0.02, ge=0, le=0.5)
     port_tilt_deg: tuple[PortTilt, PortTilt] = (0.0, 0.0)
-    dome_radius_m: float = Field(0.08, gt=0, le=1)
-    dome_centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    dome_radius_m: float = Field(_DOME_M, gt=0, le=1, exclude_if=lambda r: r == _DOME_M)
+    dome_centre_m: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), exclude_if=lambda c: not any(c)
+    )
     glass_thickness_m: float = Field(0.01, ge=0, le=0.5)
     n_glass: float = Field(1.52, ge=1, le=2)
     position_body_m: tuple[float, float, float] = (0.55, -0.05, 0.08)

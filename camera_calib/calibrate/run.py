@@ -34,7 +34,8 @@ def run_calibrate(
     found = detect_views(_pool_pictures(pool), target, executor)
     warn_of_unseen(found)
     start = design_rig(camera, water, _scale(found.sizes["left"], camera))
-    calibration = calibrate_through_ports(found.views, target.points, start, "free")
+    lens = "fisheye" if camera.lens == "fisheye" else "opencv5"
+    calibration = calibrate_through_ports(found.views, target.points, start, "free", lens)
     finish(folder, calibration, found)
 
 
