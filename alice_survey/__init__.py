@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from alice_survey.base.errors import AliceError
     from alice_survey.base.frames import Datum
     from alice_survey.base.seawater import n_water
-    from camera_calib.camera import Camera, flat_port_camera
+    from camera_calib.camera import Camera
     from camera_calib.lenses.fisheye import FisheyeLens
     from camera_calib.lenses.opencv import OpenCVLens
     from camera_calib.ports.dome import DomePort
@@ -41,7 +41,7 @@ _HOMES = {
     "alice_survey.base.errors": ("AliceError",),
     "alice_survey.base.frames": ("Datum",),
     "alice_survey.base.seawater": ("n_water",),
-    "camera_calib.camera": ("Camera", "flat_port_camera"),
+    "camera_calib.camera": ("Camera",),
     "camera_calib.lenses.fisheye": ("FisheyeLens",),
     "camera_calib.lenses.opencv": ("OpenCVLens",),
     "camera_calib.ports.dome": ("DomePort",),
@@ -72,7 +72,6 @@ __all__ = [
     "Triangulation",
     "View",
     "design_rig",
-    "flat_port_camera",
     "load_config",
     "n_water",
     "plot_dem",

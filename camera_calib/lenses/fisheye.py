@@ -26,7 +26,15 @@ _LIMIT = 8
 
 @dataclass(frozen=True, kw_only=True)
 class FisheyeLens(LensValues):
-    """A fisheye lens of Kannala and Brandt, as OpenCV and Kalibr write it."""
+    """A fisheye lens of Kannala and Brandt, as OpenCV and Kalibr write it.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> lens = alice.FisheyeLens(fx_px=300, fy_px=300, cx_px=500, cy_px=400)
+        >>> camera = alice.Camera(width_px=1000, height_px=800, lens=lens)
+        >>> camera.project([[1.0, 0.0, 0.0]]).round(1)  # at a right angle to its axis
+        array([[971.2, 400. ]])
+    """
 
     model: ClassVar[str] = "fisheye"
     kind: ClassVar[int] = 1

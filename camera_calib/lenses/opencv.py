@@ -33,7 +33,14 @@ _COUNT = 4 + len(COEFFICIENTS)
 
 @dataclass(frozen=True, kw_only=True)
 class OpenCVLens(LensValues):
-    """A pinhole with the distortion terms of OpenCV."""
+    """A pinhole with the distortion terms of OpenCV.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> lens = alice.OpenCVLens(fx_px=1500, fy_px=1500, cx_px=800, cy_px=600, k1=-0.1)
+        >>> lens.model
+        'opencv'
+    """
 
     model: ClassVar[str] = "opencv"
     kind: ClassVar[int] = 0

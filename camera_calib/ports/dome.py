@@ -27,7 +27,14 @@ _SETTLED = 1e-8
 
 @dataclass(frozen=True, kw_only=True)
 class DomePort(PortValues):
-    """Spherical glass before the lens, centred on the pupil or not."""
+    """Spherical glass before the lens, centred on the pupil or not.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> dome = alice.DomePort(outer_radius_m=0.08, glass_thickness_m=0.006, dome_z_m=0.005)
+        >>> dome.refracts, round(dome.magnification, 3)
+        (True, 0.982)
+    """
 
     shape: ClassVar[str] = "dome"
     kind: ClassVar[int] = 2

@@ -32,6 +32,11 @@ class FlatPort(PortValues):
     """A plane glass before the lens.
 
     Without distance and thickness in water of index n it makes a pinhole magnified by n.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.FlatPort(port_distance_m=0.02, glass_thickness_m=0.01).magnification
+        1.34
     """
 
     shape: ClassVar[str] = "flat"
