@@ -4,6 +4,7 @@ import re
 import struct
 import warnings
 import zlib
+from collections.abc import Sequence
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import memory_shortage
+from alice_survey.base.errors import ImageError, memory_shortage
 
 MOST_PIXELS = 104_000_000
 """Most pixels of a picture: 0.8 GB of 4 channels and 16 bits. A small file can state any size."""
@@ -25,6 +26,31 @@ PILLOW_FAULTS = (
 _YEARS = range(1970, 2200)
 """Years in which a digital camera can have taken a picture."""
 _EXIF, _DATE, _SUBSECOND, _OFFSET = 0x8769, 0x9003, 0x9291, 0x9011
+
+
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
+_MOST_CAMERAS = 8
+
+
+def places_of_cameras(texts: Sequence[str]) -> dict[str, str]:
+    """Folder or pattern by camera, from values of `--camera`: NAME=FOLDER.
+
+    Raises:
+        ImageError: one is not of this form, a name is given twice, or there are too many.
+    """
+    places: dict[str, str] = {}
+    for text in texts:
+        name, is_there, place = text.partition("=")
+        if not (is_there and place and _NAME.fullmatch(name)):
+            raise ImageError(
+                f"--camera {text}: write NAME=FOLDER, a name of letters, digits, - and _ first"
+            )
+        if name in places:
+            raise ImageError(f"--camera {text}: two cameras are called {name}")
+        places[name] = place
+    if len(places) > _MOST_CAMERAS:
+        raise ImageError(f"{len(places)} cameras are given, {_MOST_CAMERAS} at most")
+    return places
 
 
 def pixels_too_many(path: Path) -> int:

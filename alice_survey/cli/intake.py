@@ -34,6 +34,9 @@ def import_images(
     ] = None,
     left: Annotated[Path | None, typer.Option(help="Pictures of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="Pictures of the right camera.")] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option(help="NAME=FOLDER of a camera, for each of a rig.")
+    ] = None,
     video: Annotated[Path | None, typer.Option(help="A video to take frames from.")] = None,
     every: Annotated[float, typer.Option(min=0.01, help="Seconds between frames.")] = 1.0,
     navigation: Annotated[Path | None, typer.Option(help="CSV: time, position, ...")] = None,
@@ -49,12 +52,16 @@ def import_images(
 ) -> None:
     """Bring in real pictures.
 
-    Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
+    Pictures of one camera or of a rig of up to eight, or a video, with a navigation log, GPS from
+    EXIF, or nothing at all.
     """
+    from camera_calib.picture_files import places_of_cameras
     from reconstruct.pictures.importing import import_images as work
 
+    pair = {name: side for name, side in (("left", left), ("right", right)) if side is not None}
+    named = {name: Path(place) for name, place in places_of_cameras(camera or ()).items()}
     found = work(
-        workspace, folders or [], left=left, right=right, video=video, every_s=every,
+        workspace, folders or [], cameras=pair | named, video=video, every_s=every,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
         vertical_datum=vertical_datum, rig=rig, masks=masks, executor=executor_of(threads),
     )  # fmt: skip

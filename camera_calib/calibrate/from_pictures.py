@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import re
 import shlex
 import shutil
 from collections import Counter
@@ -49,6 +48,7 @@ from camera_calib.camera import Camera
 from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.optics import PORTS
+from camera_calib.picture_files import places_of_cameras
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT, NoPort
@@ -63,8 +63,6 @@ _WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
 """Files of this command; a folder with other files is not replaced."""
-_NAME = re.compile(r"[A-Za-z0-9_-]+")
-_MOST_CAMERAS = 8
 _MOST_FIRST_VIEWS = 30
 _FEWEST_FITTING = 0.5
 """Share of a camera's pictures that must fit those of the others."""
@@ -133,22 +131,15 @@ class CalibrateOptions:
             raise CalibrationError(
                 "give both --left and --right, or --pictures for a single camera"
             )
-        for text in self.cameras:
-            name, is_there, place = text.partition("=")
-            if not (is_there and place and _NAME.fullmatch(name)):
-                raise CalibrationError(
-                    f"--camera {text}: write NAME=FOLDER, a name of letters, digits, - and _ first"
-                )
-            if name in given:
-                raise CalibrationError(f"--camera {text}: two cameras are called {name}")
-            given[name] = place
+        named = places_of_cameras(self.cameras)
+        if set(given) & set(named):
+            raise CalibrationError("--camera names left or right, which is given too")
+        given |= named
         if not given:
             raise CalibrationError(
                 "these options are for pictures: give --left and --right, --pictures, or --camera; "
                 "the pool of a survey takes none of them"
             )
-        if len(given) > _MOST_CAMERAS:
-            raise CalibrationError(f"{len(given)} cameras are given, {_MOST_CAMERAS} at most")
         return given
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -89,8 +90,7 @@ def import_images(
     workspace: Path,
     folders: Sequence[Path],
     *,
-    left: Path | None = None,
-    right: Path | None = None,
+    cameras: Mapping[str, Path] = MappingProxyType({}),
     video: Path | None = None,
     every_s: float = 1.0,
     navigation: Path | None = None,
@@ -101,7 +101,7 @@ def import_images(
     masks: Path | None = None,
     executor: Executor = SERIAL,
 ) -> ImportedPictures:
-    """Write `images/` from pictures of one camera, of a stereo pair, or from a video.
+    """Write `images/` from pictures of one camera, of cameras on a rig, or from a video.
 
     A picture that cannot be decoded to its end is left out with a warning; the other picture of its
     stereo station stays. HEIC, videos, folders inside and other files are left out with a warning
@@ -111,8 +111,8 @@ def import_images(
     Args:
         workspace: folder of the survey.
         folders: folders of one camera's pictures, in order.
-        left: pictures of the left camera, paired with the right ones in order of their names.
-        right: pictures of the right camera.
+        cameras: folder of each camera of a rig by its name, such as left and right; the pictures of
+            one moment are paired in order of their names.
         video: a video to take frames from.
         every_s: seconds between frames.
         navigation: CSV with time and position (see `read_navigation`).
@@ -134,12 +134,16 @@ def import_images(
         NavigationError: the navigation log cannot be used, or a level is named without one.
         CalibrationError: the rig file is wrong or not that of the pictures.
     """
-    _check_sources(folders, left, right, video, every_s)
+    _check_sources(folders, cameras, video, every_s)
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
     zone = find_zone(time_zone)
     logged_level = _checked_level(vertical_datum, navigation)
-    given = [*folders, *(p for p in (left, right, video, navigation, rig, masks) if p is not None)]
+    given = [
+        *folders,
+        *cameras.values(),
+        *(p for p in (video, navigation, rig, masks) if p is not None),
+    ]
     for path in given:
         if not path.exists():
             raise ImageError(f"{path}: no such file or folder")
@@ -152,7 +156,7 @@ def import_images(
                 f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
                 "choose another workspace with -w"
             )
-    sides = _look_into(folders, left, right, [*given, workspace])
+    sides = _look_into(folders, cameras, [*given, workspace])
     folders_read = [each for side in sides.values() for each in side]
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
@@ -160,7 +164,8 @@ def import_images(
         version=1,
         settings={
             "folders": len(folders),
-            "stereo": left is not None,
+            "stereo": bool(cameras),
+            **({} if set(cameras) <= {"left", "right"} else {"cameras": list(cameras)}),
             "every_s": every_s if video is not None else None,
             "navigation": navigation is not None,
             "clock_offset_s": clock_offset_s,
@@ -169,7 +174,7 @@ def import_images(
             "rig": rig is not None,
             "masks": masks is not None,
         },
-        inputs=[*files, *(path for path in given if path not in (*folders, left, right))],
+        inputs=[*files, *(path for path in given if path not in (*folders, *cameras.values()))],
     )
 
     def work(partial: Path) -> None:
@@ -185,7 +190,7 @@ def import_images(
             entries = _find_entries(sides, known_rig, executor)
         _check_entries(entries, known_rig)
         entries = _named(entries)
-        entries = [replace(e, mask=_mask_of(e, masks, left is not None)) for e in entries]
+        entries = [replace(e, mask=_mask_of(e, masks, bool(cameras))) for e in entries]
         if video is None:
             notes += _copy_all(entries, partial, executor)
         records = [_record(entry, partial) for entry in entries]
@@ -238,31 +243,32 @@ def _counted(counts: Mapping[str, int]) -> str:
 
 
 def _look_into(
-    folders: Sequence[Path], left: Path | None, right: Path | None, apart: Sequence[Path]
+    folders: Sequence[Path], cameras: Mapping[str, Path], apart: Sequence[Path]
 ) -> dict[str, list[PictureFolder]]:
     """Contents of the folders of each camera; of one camera whose name follows later, `_MONO`."""
-    if left is not None and right is not None:
-        return {"left": [look_into(left, apart)], "right": [look_into(right, apart)]}
+    if cameras:
+        return {name: [look_into(folder, apart)] for name, folder in cameras.items()}
     return {_MONO: [look_into(folder, apart) for folder in folders]} if folders else {}
 
 
 def _check_sources(
-    folders: Sequence[Path],
-    left: Path | None,
-    right: Path | None,
-    video: Path | None,
-    every_s: float,
+    folders: Sequence[Path], cameras: Mapping[str, Path], video: Path | None, every_s: float
 ) -> None:
-    if (left is None) != (right is None):
-        raise ImageError("stereo pictures need both --left and --right")
-    if sum([bool(folders), left is not None, video is not None]) != 1:
-        raise ImageError("give folders of pictures, or --left and --right, or --video: one of them")
+    if len(cameras) == 1:
+        raise ImageError(
+            f"pictures of a rig need two cameras, --left and --right or --camera, not just "
+            f"{next(iter(cameras))}"
+        )
+    if sum([bool(folders), bool(cameras), video is not None]) != 1:
+        raise ImageError(
+            "give folders of pictures, or --left and --right, or --camera for each, or --video: "
+            "one of them"
+        )
     if not every_s > 0:
         raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
-    if left is not None and right is not None and left.resolve() == right.resolve():
-        raise ImageError(f"--left and --right are both {left}: give each camera's own folder")
-    places = [folder.resolve() for folder in folders]
-    twice = [folder for folder in folders if places.count(folder.resolve()) > 1]
+    every = [*folders, *cameras.values()]
+    places = [folder.resolve() for folder in every]
+    twice = [folder for folder in every if places.count(folder.resolve()) > 1]
     if twice:
         raise ImageError(f"{twice[0]} is given twice")
 
@@ -293,10 +299,10 @@ def _find_entries(
     found = {side: [p for one in folders for p in one.pictures] for side, folders in sides.items()}
     counts = {side: len(paths) for side, paths in found.items()}
     if len(set(counts.values())) > 1:
-        left, right = (folders[0].folder for folders in sides.values())
+        numbers = [f"{counts[name]} in {folders[0].folder}" for name, folders in sides.items()]
         raise ImageError(
-            f"{counts['left']} pictures in {left} but {counts['right']} in {right}: "
-            "they are paired in order of their names, so every picture needs its partner"
+            f"pictures of a rig are paired in order of their names, so every picture needs its "
+            f"partner, but there are {', '.join(numbers)}"
         )
     if len(found) == 1:
         found = {_mono_name(rig): paths for paths in found.values()}

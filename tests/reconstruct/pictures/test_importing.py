@@ -167,13 +167,32 @@ def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
     for number in range(3):
         draw(tmp_path / "port" / f"p{number}.png", number)
         draw(tmp_path / "star" / f"s{number + 5}.png", number + 10)
-    import_images(tmp_path / "w", [], left=tmp_path / "port", right=tmp_path / "star")
+    import_images(
+        tmp_path / "w", [], cameras={"left": tmp_path / "port", "right": tmp_path / "star"}
+    )
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
     assert [(r.image, r.station) for r in records] == [
         (f"{side}/{letter}{n + first}.png", n)
         for n in range(3)
         for side, letter, first in (("left", "p", 0), ("right", "s", 5))
     ]
+
+
+def test_cameras_of_a_rig_pair_in_order(tmp_path: Path, draw: Draw) -> None:
+    names = ("bow", "port", "down")
+    for side in names:
+        for number in range(2):
+            draw(tmp_path / side / f"{number}.png", number)
+    import_images(tmp_path / "w", [], cameras={name: tmp_path / name for name in names})
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert {(r.camera, r.station) for r in records} == {(c, n) for c in names for n in range(2)}
+    draw(tmp_path / "down" / "2.png", 3)
+    with pytest.raises(ImageError, match=r"2 in .*bow, 2 in .*port, 3 in .*down"):
+        import_images(tmp_path / "w", [], cameras={name: tmp_path / name for name in names})
+    with pytest.raises(ImageError, match="is given twice"):
+        import_images(tmp_path / "w", [], cameras=dict.fromkeys(names, tmp_path / "bow"))
+    with pytest.raises(ImageError, match="not just bow"):
+        import_images(tmp_path / "w", [], cameras={"bow": tmp_path / "bow"})
 
 
 def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
@@ -186,7 +205,9 @@ def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
     (tmp_path / "left" / "1.jpg").write_bytes(whole[: len(whole) * 2 // 3])  # truncated
     (tmp_path / "right" / "2.jpg").write_bytes(b"no picture at all")
     (tmp_path / "right" / "3.jpg").write_bytes(b"")
-    import_images(tmp_path / "w", [], left=tmp_path / "left", right=tmp_path / "right")
+    import_images(
+        tmp_path / "w", [], cameras={"left": tmp_path / "left", "right": tmp_path / "right"}
+    )
     shown = capsys.readouterr().err
     for name in ("left/1.jpg", "right/2.jpg", "right/3.jpg"):
         assert name in shown

@@ -223,7 +223,7 @@ def test_real_stereo_without_calibration_gets_one_rigid_rig(
             small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
             cv2.imwrite(str(tmp_path / side / f"{number:03d}.png"), small)
     folder = tmp_path / "w"
-    import_images(folder, [], left=tmp_path / "left", right=tmp_path / "right")
+    import_images(folder, [], cameras={"left": tmp_path / "left", "right": tmp_path / "right"})
     reconstruct(folder, QUICK, local_executor(2))
     found = read_json(folder / "sparse" / "registration.json")
     assert found["registered"] == 10
