@@ -63,7 +63,7 @@ def main() -> None:
             figures=tuple(f for mode in modes for f in mode.figures(judged=judged))
         )
     if "target" in options.only:
-        count = 40 if options.quick else 200
+        count = 20 if options.quick else 100
         cases = [
             target_calibration.run_case(name, range(count), local_executor(options.threads))
             for name in target_calibration.TARGETS

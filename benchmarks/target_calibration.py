@@ -39,7 +39,7 @@ _WAVES = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Target:
+class Board:
     """What is wrong with a board and its corners."""
 
     bow_m: float = 0.0
@@ -56,8 +56,8 @@ class Target:
     """Its length along x over that along y, minus 1."""
 
 
-SOUND = Target()
-_REAL = Target(together_px=0.12, place_m=2e-5)
+SOUND = Board()
+_REAL = Board(together_px=0.12, place_m=2e-5)
 TARGETS = {
     "sound": SOUND,
     "correlated": _REAL,
@@ -77,7 +77,7 @@ def drawn() -> Array:
     return points
 
 
-def bent(target: Target, rng: np.random.Generator) -> Array:
+def bent(target: Board, rng: np.random.Generator) -> Array:
     """(N, 3) the board as it is: bent on a cylinder, sagging between its edges, misprinted.
 
     The paper keeps its lengths on the cylinder. Four fifths of the bow are the cylinder's.
@@ -114,7 +114,7 @@ def _waves(points: Array, reach: float, rng: np.random.Generator) -> Array:
     return field
 
 
-def views_of(target: Target, rng: np.random.Generator, count: int = _VIEWS) -> list[TargetView]:
+def views_of(target: Board, rng: np.random.Generator, count: int = _VIEWS) -> list[TargetView]:
     """Views of one board, all of it in the frame."""
     board, plain = bent(target, rng), drawn()
     matrix = np.array(
@@ -152,7 +152,7 @@ def true_rig() -> Rig:
     )
 
 
-def run_trial(seed: int, target: Target, shape: TargetShape | None = None) -> Calibration:
+def run_trial(seed: int, target: Board, shape: TargetShape | None = None) -> Calibration:
     """Calibrate once; `shape` as of `calibrate`."""
     views = views_of(target, np.random.default_rng([seed, 17]))
     rig = true_rig()
@@ -167,7 +167,7 @@ def scores(found: Calibration) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class Trials:
     """Calibrations from boards with the same faults."""
 
     name: str
@@ -200,20 +200,20 @@ class Case:
         return found
 
 
-def _row(seed: int, target: Target) -> tuple[Array, Array]:
+def _row(seed: int, target: Board) -> tuple[Array, Array]:
     """Scores of one trial; fx's sigma, error, and both with the board as drawn."""
     rows = [run_trial(seed, target, shape) for shape in (None, AS_DRAWN)]
     numbers = [(c.rig.sigmas[NAMES[0]], value(c.rig, NAMES[0]) - _LENS["fx_px"]) for c in rows]
     return scores(rows[0]), np.ravel(numbers)
 
 
-def run_case(name: str, seeds: Sequence[int], executor: Executor = SERIAL) -> Case:
+def run_case(name: str, seeds: Sequence[int], executor: Executor = SERIAL) -> Trials:
     """All trials of one of `TARGETS`."""
     work = partial(_row, target=TARGETS[name])
     rows = list(executor.map(work, seeds, label=f"calibrations, board {name}"))
     by_sigma = np.sqrt(np.mean([row[0] ** 2 for row in rows], axis=0))
     sigma, error, sigma_drawn, error_drawn = np.array([row[1] for row in rows]).T
-    return Case(
+    return Trials(
         name=name,
         trials=len(rows),
         by_sigma=tuple(by_sigma.tolist()),
@@ -224,7 +224,7 @@ def run_case(name: str, seeds: Sequence[int], executor: Executor = SERIAL) -> Ca
     )
 
 
-def table(cases: Sequence[Case]) -> str:
+def table(cases: Sequence[Trials]) -> str:
     """All cases in Markdown."""
     lines = [
         "| board | sigma of fx, px | error of fx, rms px | taken as drawn | error / sigma, rms, "

@@ -54,7 +54,7 @@ class CornerNoise:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Spread:
+class ErrorBudget:
     """Covariance of a calibration under the noise that its residuals show."""
 
     noise: CornerNoise
@@ -98,7 +98,7 @@ class Calibration:
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
-    spread: Spread | None = None
+    spread: ErrorBudget | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 
     def __post_init__(self) -> None:

@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import Adjustment
 from camera_calib.calibrate.normal_equations import CalibrationProblem
-from camera_calib.calibration import CornerNoise, Spread
+from camera_calib.calibration import CornerNoise, ErrorBudget
 from camera_calib.rig import Covariance
 
 _REACHES = (0.12, 0.3, 0.8)
@@ -49,7 +49,7 @@ class _Part:
         return out
 
 
-class _Rows:
+class _Weighted:
     """Weighted slopes and residuals of all views; 0 where unseen."""
 
     def __init__(self, problem: CalibrationProblem, found: Adjustment) -> None:
@@ -81,14 +81,14 @@ class _Rows:
         self.missed -= np.einsum("vcnak,vk->vcna", self.poses, taken_px)
 
 
-def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
+def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
     """Estimate the noise from the residuals of an adjustment, and propagate it.
 
     Args:
         problem: whose pixels and parameters were adjusted.
         found: the result.
     """
-    rows = _Rows(problem, found)
+    rows = _Weighted(problem, found)
     diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
     squares = cdist(problem.points, problem.points, "sqeuclidean")
     parts = [_Part(kernel=np.eye(len(problem.points)), in_all=False)]
@@ -96,22 +96,24 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> Spread:
         for reach in _REACHES:
             kernel = np.exp(-0.5 * squares / (reach * diagonal_m) ** 2)
             parts.append(_Part(kernel=kernel, in_all=in_all))
-    inverse = found.covariance.matrix
-    products = _Products(rows, parts, inverse)
+    # In units of the covariance's root the unknowns are independent, each of variance 1.
+    root = np.linalg.cholesky(found.covariance.matrix).astype(np.float64)
+    products = _Products(rows, parts, root)
     theta = products.variances()
     pictures, places = theta[: len(parts)], theta[len(parts) :]
     pictures[0] = max(pictures[0], _LEAST_ALONE)
     meat = np.einsum("k,kpq->pq", pictures, products.by_rig)
-    prior_at = problem.prior_at
     shared = [
-        inverse @ products.by_place[:, axes].reshape(-1, len(inverse)).T * np.sqrt(variance)
+        root @ products.by_place[:, axes].reshape(-1, len(root)).T * np.sqrt(variance)
         for axes, variance in zip(_AXES, places, strict=True)
     ]
-    if prior_at.size:
-        shared.append(inverse[:, prior_at] @ np.linalg.cholesky(problem.prior_information))
+    at = problem.prior_at
+    if at.size:
+        known = np.linalg.cholesky(problem.prior_information)
+        shared.append(found.covariance.matrix[:, at] @ known)
     factor = np.concatenate(shared, axis=1)
-    matrix = inverse @ meat @ inverse + factor @ factor.T
-    return Spread(
+    matrix = root @ meat @ root.T + factor @ factor.T
+    return ErrorBudget(
         noise=CornerNoise(
             alone=float(pictures[0]),
             together=pictures[1:],
@@ -130,46 +132,38 @@ class _Products:
     matrices, the mean of r^T K_i r is the sum of v_j tr(K_i M K_j M).
     """
 
-    def __init__(self, rows: _Rows, parts: list[_Part], inverse: Array) -> None:
-        views, size = len(rows.seen), len(inverse)
-        self.rows, self.parts, self.inverse = rows, parts, inverse
-        self.smoothed = [part.smoothed(rows.by_rig, rows.seen) for part in parts]
-        self.poses = [part.smoothed(rows.poses, rows.seen) for part in parts]
-        flat = rows.by_rig.reshape(-1, size)
-        self.by_rig = np.stack([flat.T @ s.reshape(-1, size) for s in self.smoothed])
+    def __init__(self, rows: _Weighted, parts: list[_Part], root: Array) -> None:
+        views, size = len(rows.seen), len(root)
+        self.rows, self.parts = rows, parts
+        by_rig = rows.by_rig @ root
+        smoothed = np.stack([part.smoothed(by_rig, rows.seen) for part in parts])
+        poses = np.stack([part.smoothed(rows.poses, rows.seen) for part in parts])
+        self.smoothed, self.poses = smoothed, poses
+        self.by_rig = by_rig.reshape(-1, size).T @ smoothed.reshape(len(parts), -1, size)
         """(K, P, P) slopes' products under every part within pictures."""
-        self.by_place = np.einsum("vcnai,vcnap->nip", rows.by_place, rows.by_rig, optimize=True)
+        self.by_place = np.einsum("vcnai,vcnap->nip", rows.by_place, by_rig, optimize=True)
         """(N, 3, P)."""
         self.place_of_pose = np.einsum("vcnai,vcnak->vnik", rows.by_place, rows.poses)
-        self.crossed = [
-            np.einsum("vcnak,vcnap->vkp", rows.poses, s, optimize=True) for s in self.smoothed
-        ]
-        self.overlap = [
-            rows.poses.reshape(views, -1, 6).transpose(0, 2, 1) @ p.reshape(views, -1, 6)
-            for p in self.poses
-        ]
-
+        turned = rows.poses.reshape(views, -1, 6).transpose(0, 2, 1)
+        self.crossed = turned @ smoothed.reshape(len(parts), views, -1, size)
+        self.overlap = turned @ poses.reshape(len(parts), views, -1, 6)
         self.of_places = self._of_places()
 
     def variances(self) -> Array:
         """Variances of the parts within pictures, then of places by axes (square metres)."""
-        count = len(self.parts)
+        count, rows = len(self.parts), self.rows
         size = count + len(_AXES)
         table, seen = np.zeros((size, size)), np.zeros(size)
-        for i in range(count):
-            for j in range(i + 1):
-                table[i, j] = table[j, i] = self._of_pictures(i, j)
-            for j, axes in enumerate(_AXES):
-                table[i, count + j] = table[count + j, i] = self._of_both(i, axes)
-            smooth = self.parts[i].smoothed(self.rows.missed[..., None], self.rows.seen)
-            seen[i] = float((self.rows.missed * smooth[..., 0]).sum())
-        pulled = np.einsum("vcnai,vcna->ni", self.rows.by_place, self.rows.missed)
-        for i, axes in enumerate(_AXES):
-            seen[count + i] = float((pulled[:, axes] ** 2).sum())
-            for j, others in enumerate(_AXES):
-                table[count + i, count + j] = float(
-                    (self.of_places[:, axes][..., others] ** 2).sum()
-                )
+        table[:count, :count] = self._of_pictures()
+        pulled = np.einsum("vcnai,vcna->ni", rows.by_place, rows.missed)
+        for i, part in enumerate(self.parts):
+            table[i, count:] = table[count:, i] = self._of_both(i)
+            smooth = part.smoothed(rows.missed[..., None], rows.seen)
+            seen[i] = float((rows.missed * smooth[..., 0]).sum())
+        for i, axes in enumerate(_AXES, start=count):
+            seen[i] = float((pulled[:, axes] ** 2).sum())
+            for j, others in enumerate(_AXES, start=count):
+                table[i, j] = float((self.of_places[:, axes][..., others] ** 2).sum())
         scale = 1.0 / np.sqrt(np.diag(table))
         # Under independent errors the products' covariance is twice the table.
         root = np.linalg.cholesky(table * np.outer(scale, scale) + 1e-12 * np.eye(size))
@@ -177,43 +171,53 @@ class _Products:
         variances: Array = found * scale
         return variances
 
-    def _of_pictures(self, i: int, j: int) -> float:
-        seen, inverse = self.rows.seen, self.inverse
-        both = self.parts[i].kernel * self.parts[j].kernel
-        if self.parts[i].in_all and self.parts[j].in_all:
-            seen = seen.sum(axis=1, keepdims=True)
-        total = 2.0 * float(np.einsum("vcn,nm,vcm->", seen, both, seen, optimize=True))
-        total -= 2.0 * float((self.poses[i] * self.poses[j]).sum())
-        total += float((self.overlap[i] * self.overlap[j]).sum())
-        size = len(inverse)
-        through = self.smoothed[j].reshape(-1, size).T @ self.smoothed[i].reshape(-1, size)
-        through -= np.einsum("vkp,vkq->pq", self.crossed[j], self.crossed[i])
-        total -= 2.0 * float((inverse * through).sum())
-        return total + float(np.trace(inverse @ self.by_rig[j] @ inverse @ self.by_rig[i]))
+    def _of_pictures(self) -> Array:
+        """(K, K) tr(K_i M K_j M) of the parts within pictures."""
+        table = np.zeros((len(self.parts), len(self.parts)))
+        for i, one in enumerate(self.parts):
+            for j, other in enumerate(self.parts[: i + 1]):
+                seen = self.rows.seen
+                if one.in_all and other.in_all:
+                    seen = seen.sum(axis=1, keepdims=True)
+                both = one.kernel * other.kernel
+                table[i, j] = table[j, i] = 2.0 * float(((seen @ both) * seen).sum())
+        table -= 2.0 * (_inner(self.poses) + _inner(self.smoothed) - _inner(self.crossed))
+        total: Array = table + _inner(self.overlap) + _inner(self.by_rig)
+        return total
 
-    def _of_both(self, i: int, axes: slice) -> float:
-        rows, inverse = self.rows, self.inverse
-        places = rows.by_place[..., axes]
-        posed = self.place_of_pose[:, :, axes]
-        alike = places.sum(axis=1) if self.parts[i].in_all else places
-        total = float((alike**2).sum())
-        returned = np.einsum("vcnai,vnik->vcnak", places, posed)
-        total -= 2.0 * float((self.poses[i] * returned).sum())
-        total += float((self.overlap[i] * np.einsum("vnik,vnil->vkl", posed, posed)).sum())
-        through = np.einsum("vcnai,vcnap->nip", places, self.smoothed[i], optimize=True)
+    def _of_both(self, i: int) -> list[float]:
+        """Of one part within pictures and the places, by axes."""
+        rows, posed = self.rows, self.place_of_pose
+        alike = rows.by_place.sum(axis=1) if self.parts[i].in_all else rows.by_place
+        of_pose = np.einsum("vcnai,vcnak->vnik", rows.by_place, self.poses[i], optimize=True)
+        through = np.einsum("vcnai,vcnap->nip", rows.by_place, self.smoothed[i], optimize=True)
         through -= np.einsum("vnik,vkp->nip", posed, self.crossed[i], optimize=True)
-        by_place = self.by_place[:, axes].reshape(-1, len(inverse))
-        total -= 2.0 * float((inverse * (by_place.T @ through.reshape(by_place.shape))).sum())
-        square = by_place.T @ by_place
-        return total + float(np.trace(inverse @ square @ inverse @ self.by_rig[i]))
+        found = []
+        for axes in _AXES:
+            some, by_place = posed[:, :, axes], self.by_place[:, axes]
+            total = float((alike[..., axes] ** 2).sum())
+            total -= 2.0 * float((of_pose[:, :, axes] * some).sum())
+            square = np.einsum("vnik,vnil->vkl", some, some)
+            total += float((self.overlap[i] * square).sum())
+            total -= 2.0 * float((by_place * through[:, axes]).sum())
+            flat = by_place.reshape(-1, by_place.shape[-1])
+            found.append(total + float((self.by_rig[i] * (flat.T @ flat)).sum()))
+        return found
 
     def _of_places(self) -> Array:
         """(N, 3, N, 3) products of places' slopes, after all unknowns were fitted."""
         rows, count = self.rows, self.by_place.shape[0]
         posed = self.place_of_pose.transpose(1, 2, 0, 3).reshape(3 * count, -1)
         by_place = self.by_place.reshape(3 * count, -1)
-        left = -(posed @ posed.T) - by_place @ self.inverse @ by_place.T
+        left = -(posed @ posed.T) - by_place @ by_place.T
         blocks: Array = left.reshape(count, 3, count, 3)
         own = np.einsum("vcnai,vcnaj->nij", rows.by_place, rows.by_place)
         blocks[np.arange(count), :, np.arange(count)] += own
         return blocks
+
+
+def _inner(values: Array) -> Array:
+    """(K, K) inner products of K arrays."""
+    flat = values.reshape(len(values), -1)
+    products: Array = flat @ flat.T
+    return products
