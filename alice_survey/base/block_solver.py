@@ -35,7 +35,7 @@ _ROUNDING = 1e-15
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Step:
+class BlockStep:
     """A step of all unknowns against the gradient."""
 
     poses: Array
@@ -103,7 +103,7 @@ class Equations:
         blocks[self.own] += np.where(self.free, ridge, 1.0)[:, :, None] * np.eye(blocks.shape[1])
         return PoseFactor(self, blocks)
 
-    def step(self, damping: float = 0.0, pinned: Flags | None = None) -> Step:
+    def step(self, damping: float = 0.0, pinned: Flags | None = None) -> BlockStep:
         """The step of all unknowns but those of what is shared that are pinned."""
         shared = np.zeros(len(self.shared) - 1)
         moving = np.flatnonzero(np.ones_like(shared) if pinned is None else ~pinned)
@@ -123,7 +123,7 @@ class Equations:
             shared[moving] = scale * step
         along = -float(shared[moving] @ reduced[:-1, -1])
         gain = along - float(reduced[-1, -1])
-        return Step(
+        return BlockStep(
             poses=-solved[..., -1] - solved[..., :-1] @ shared[moving],
             shared=shared,
             gain=gain,
@@ -292,7 +292,7 @@ class Problem(Protocol[Guess, Normal]):
     def linearised(self, guess: Guess, noise: Array) -> Normal:
         """Normal equations at a guess, weights and priors included."""
 
-    def moved(self, guess: Guess, equations: Normal, step: Step) -> Guess:
+    def moved(self, guess: Guess, equations: Normal, step: BlockStep) -> Guess:
         """The guess after a step that its equations gave; an `AliceError` beyond what can be."""
 
     def at_bound(self, guess: Guess) -> Flags:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Equations, Flags, Indices, Step
+from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import pose_jacobian
@@ -89,7 +89,7 @@ class CalibrationProblem:
         """(N, 3) points of the target in the guessed shape."""
         return self.points + self.shape.found(state.bend).offsets_m
 
-    def stepped(self, state: State, step: Step) -> State:
+    def stepped(self, state: State, step: BlockStep) -> State:
         """Another guess; bounded parameters stop at their bound.
 
         Raises:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alice_survey.base.block_solver import Equations, Flags, Indices, Step, product_of
+from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices, product_of
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
@@ -69,7 +69,7 @@ class PointEquations(Equations):
     point_inverse: Array
     """(P, 3, 3) covariance of the points where all else is known."""
 
-    def point_steps(self, step: Step) -> Array:
+    def point_steps(self, step: BlockStep) -> Array:
         """How far every point moves, (P, 3), where all else takes a step."""
         return self.follow(step.poses, np.append(step.shared, 1.0))
 

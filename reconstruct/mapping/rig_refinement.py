@@ -19,7 +19,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Flags, Step, inverse_of, minimise
+from alice_survey.base.block_solver import BlockStep, Flags, inverse_of, minimise
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array, Datum
@@ -172,7 +172,7 @@ def fit_rig(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Guess:
+class _RigGuess:
     """One guess of all unknowns, with what is seen from there."""
 
     state: RigState
@@ -210,10 +210,10 @@ class _SurveyProblem:
             )
         return spare
 
-    def _seen(self, state: RigState) -> _Guess:
+    def _seen(self, state: RigState) -> _RigGuess:
         linear = exact_observations(state, self.pixels, self.fields, lever=self.fixes is not None)
         lost = int((~linear.by_point[:, 0].any(axis=1)).sum())
-        return _Guess(state=state, linear=linear, lost=lost)
+        return _RigGuess(state=state, linear=linear, lost=lost)
 
     def values(self, state: RigState) -> Array:
         """(G,) values of what is shared."""
@@ -236,13 +236,13 @@ class _SurveyProblem:
         rows = rows / self.fixes.sigmas[:, :, None]
         return np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
 
-    def noise(self, guess: _Guess) -> Array:
+    def noise(self, guess: _RigGuess) -> Array:
         """Sigma of a keypoint's coordinate for the weights, and variance that scales them."""
         miss = guess.linear.miss
         sigma = sigma_of(miss, guess.linear.seen_by, len(guess.state.centres))
         return np.array([sigma, variance_of(miss, cauchy_weights(miss, sigma), self.left)])
 
-    def cost(self, guess: _Guess, noise: Array) -> float:
+    def cost(self, guess: _RigGuess, noise: Array) -> float:
         """Half of Cauchy's loss, prior and fixes."""
         if guess.lost > self.start.lost:
             return math.inf
@@ -251,7 +251,7 @@ class _SurveyProblem:
         pixels = cauchy_cost(guess.linear.miss, sigma) / variance
         return 0.5 * float(pixels + off @ self.information @ off + (fixes**2).sum())
 
-    def linearised(self, guess: _Guess, noise: Array) -> PointEquations:
+    def linearised(self, guess: _RigGuess, noise: Array) -> PointEquations:
         """Normal equations with the points eliminated."""
         sigma, variance = noise
         weights = cauchy_weights(guess.linear.miss, sigma) / variance
@@ -270,7 +270,7 @@ class _SurveyProblem:
         found.shared[-4:, -4:] += square[:, POSE:, POSE:].sum(axis=0)
         return found.knowing(square[:, :POSE, :POSE])
 
-    def moved(self, guess: _Guess, equations: PointEquations, step: Step) -> _Guess:
+    def moved(self, guess: _RigGuess, equations: PointEquations, step: BlockStep) -> _RigGuess:
         """The guess after a step."""
         state, count = guess.state, len(self.fields)
         return self._seen(
@@ -283,7 +283,7 @@ class _SurveyProblem:
             )
         )
 
-    def at_bound(self, guess: _Guess) -> Flags:
+    def at_bound(self, guess: _RigGuess) -> Flags:
         """Parameters that have their least value."""
         return at_bound(guess.state.rig, self.names)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from alice_survey.base.block_solver import Equations, Minimum, Step, inverse_of, minimise
+from alice_survey.base.block_solver import BlockStep, Equations, Minimum, inverse_of, minimise
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 from tests.oracles_refraction import dense_of
@@ -118,7 +118,7 @@ class Curves:
             shared=shared,
         )
 
-    def moved(self, guess: Array, equations: Equations, step: Step) -> Array:
+    def moved(self, guess: Array, equations: Equations, step: BlockStep) -> Array:
         rate = max(guess[-1] + step.shared[0], self.low)
         if rate > 50.0:
             raise AliceError("too fast")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.block_solver import Step
+from alice_survey.base.block_solver import BlockStep
 from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import observed
@@ -90,7 +90,7 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
 
     rng = np.random.default_rng(1)
     steps, shared_step = rng.normal(0, 1e-3, (stations, 6)), rng.normal(0, 1e-3, count)
-    moved = reduced.point_steps(Step(poses=steps, shared=shared_step, gain=0.0, length=0.0))
+    moved = reduced.point_steps(BlockStep(poses=steps, shared=shared_step, gain=0.0, length=0.0))
     step = np.concatenate([steps.ravel(), shared_step])
     wanted = -back @ (slope[rest] + hessian[np.ix_(rest, own)] @ step)
     np.testing.assert_allclose(moved.ravel(), wanted, atol=1e-9)
