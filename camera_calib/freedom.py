@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.block_solver import Flags, Indices, inverse_of
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
+from camera_calib.camera import pose_jacobian
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
@@ -82,16 +83,31 @@ def value(rig: Rig, name: str) -> float:
 
 
 def wanted_slopes(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
-    """Which slopes of a camera's pixels are by one of the names, and which name that is.
+    """Which slopes of a camera's pixels are by one of the names, ascending, and which name that is.
 
     The slopes are those by the camera's own parameters, then by its pose on the rig.
     """
-    slopes = {
-        f"{camera}.{field}": i for i, field in enumerate((*rig.cameras[camera].parameters, *POSE))
-    }
-    pairs = [(slopes[name], i) for i, name in enumerate(names) if name in slopes]
+    fields = (*rig.cameras[camera].parameters, *POSE)
+    slopes = {f"{camera}.{field}": i for i, field in enumerate(fields)}
+    pairs = sorted((slopes[name], i) for i, name in enumerate(names) if name in slopes)
     columns, at = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     return columns, at
+
+
+def chosen_slopes(wanted: Indices, by_camera: Array, by_point: Array, turned: Array) -> Array:
+    """Slopes (..., 2, K) of a camera's pixels by what `wanted_slopes` lists.
+
+    Args:
+        wanted: (K,).
+        by_camera: (..., 2, P) slopes by the camera's own parameters.
+        by_point: (..., 2, 3) slopes by the point.
+        turned: (..., 3) the point along the camera's axes, from the rig's origin.
+    """
+    own = wanted[wanted < by_camera.shape[-1]]
+    if len(own) == len(wanted):
+        return by_camera[..., own]
+    by_pose = pose_jacobian(by_point, turned)[..., wanted[len(own) :] - by_camera.shape[-1]]
+    return np.concatenate([by_camera[..., own], by_pose], axis=-1)
 
 
 def at_bound(rig: Rig, names: Sequence[str]) -> Flags:
@@ -118,9 +134,11 @@ def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
         }
         cameras[name] = camera.with_parameters(changed) if changed else camera
         pose = rig.cam_from_rig[name]
-        poses[name] = RigidTransform.from_components(
-            pose.translation + shift, Rotation.from_rotvec(turn) * pose.rotation
-        )
+        if any(turn + shift):
+            pose = RigidTransform.from_components(
+                pose.translation + shift, Rotation.from_rotvec(turn) * pose.rotation
+            )
+        poses[name] = pose
     return replace(rig, cameras=cameras, cam_from_rig=poses)
 
 

@@ -99,7 +99,7 @@ def adjust(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Guess:
+class _TargetGuess:
     """One guess of all unknowns, with how it explains the pixels."""
 
     state: State
@@ -115,13 +115,13 @@ class _Solver(CalibrationProblem):
     blur: Array = np.ones((1, 1, 1))
     """(V, C, 1) noise of each picture over `noise_px`."""
 
-    def seen_from(self, state: State) -> _Guess:
+    def seen_from(self, state: State) -> _TargetGuess:
         """A guess with its residuals."""
         residuals = self.residuals(state)
         lengths = np.sqrt(np.einsum("vcni,vcni->vcn", residuals, residuals)) / self.blur
-        return _Guess(state=state, residuals=residuals, lengths=lengths)
+        return _TargetGuess(state=state, residuals=residuals, lengths=lengths)
 
-    def cost(self, guess: _Guess, noise: Array) -> float:
+    def cost(self, guess: _TargetGuess, noise: Array) -> float:
         """Half the robust sum of squares in sigmas; inf where a seen point is not projected."""
         length = guess.lengths[self.seen] / noise
         if not np.all(np.isfinite(length)):
@@ -130,16 +130,16 @@ class _Solver(CalibrationProblem):
         off = self.prior_residuals(guess.state)
         return float(loss.sum() + 0.5 * off @ self.prior_information @ off)
 
-    def linearised(self, guess: _Guess, noise: Array) -> Equations:
+    def linearised(self, guess: _TargetGuess, noise: Array) -> Equations:
         """Normal equations with Huber's weights."""
         weights = self.weights(guess, noise)
         return self.equations(guess.state, weights / (noise * self.blur) ** 2)
 
-    def moved(self, guess: _Guess, equations: Equations, step: BlockStep) -> _Guess:
+    def moved(self, guess: _TargetGuess, equations: Equations, step: BlockStep) -> _TargetGuess:
         """The guess after a step."""
         return self.seen_from(self.stepped(guess.state, step))
 
-    def at_bound(self, guess: _Guess) -> Flags:
+    def at_bound(self, guess: _TargetGuess) -> Flags:
         """Parameters that have their least value."""
         return at_bound(guess.state.rig, self.names)
 
@@ -149,7 +149,7 @@ class _Solver(CalibrationProblem):
         coordinates = 2 * int(self.seen.sum()) + len(self.prior_at)
         return coordinates - len(self.names) - 6 * len(self.pixels)
 
-    def noise(self, guess: _Guess) -> Array:
+    def noise(self, guess: _TargetGuess) -> Array:
         """(1,) sigma of a coordinate from the median length of the residuals."""
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
         sigma_px = float(np.median(guess.lengths[self.seen])) / RAYLEIGH_MEDIAN * share
@@ -192,13 +192,13 @@ class _Solver(CalibrationProblem):
             f"{found.length:.2g} sigmas): take views at more angles and distances"
         )
 
-    def weights(self, guess: _Guess, noise: Array) -> Array:
+    def weights(self, guess: _TargetGuess, noise: Array) -> Array:
         """(V, C, N) Huber's weights; 0 where unseen."""
         length = np.where(self.seen, guess.lengths / noise, 0.0)
         weights: Array = np.where(self.seen, HUBER / np.maximum(length, HUBER), 0.0)
         return weights
 
-    def result(self, found: Minimum[_Guess, Equations]) -> Adjustment:
+    def result(self, found: Minimum[_TargetGuess, Equations]) -> Adjustment:
         """The adjusted rig and poses, with the covariance at this guess."""
         state, weights = found.guess.state, self.weights(found.guess, found.noise)
         noise_px = self._noise(found.guess.lengths, weights)

@@ -16,7 +16,7 @@ from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.camera import pose_jacobian
-from camera_calib.freedom import POSE, Freedom, moved, wanted_slopes
+from camera_calib.freedom import POSE, Freedom, chosen_slopes, moved, wanted_slopes
 from camera_calib.rig import Covariance, Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape
 
@@ -147,12 +147,9 @@ class CalibrationProblem:
             by_rig = (turned[v] + state.places[v, None]) @ turn.T
             pixels, by_point, by_parameter = camera.project_jacobian(by_rig + pose.translation)
             columns, at = wanted_slopes(self.rig, self.rig_names, name)
-            by_camera = by_parameter
-            if columns.max(initial=0) >= by_parameter.shape[-1]:  # it is not the reference
-                by_camera = np.concatenate([by_camera, pose_jacobian(by_point, by_rig)], axis=-1)
+            rows = [chosen_slopes(columns, by_parameter, by_point, by_rig)]
             by_turned = by_point @ turn
             by_place = by_turned @ state.turns[v, None]
-            rows = [by_camera[..., columns]]
             if self.shape_at.size:
                 rows.append(by_place @ self.shape.modes.transpose(1, 2, 0))
             rows.append(pose_jacobian(by_turned, turned[v]))

@@ -11,8 +11,7 @@ import numpy as np
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from camera_calib.camera import pose_jacobian
-from camera_calib.freedom import wanted_slopes
+from camera_calib.freedom import chosen_slopes, wanted_slopes
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed, rig_poses
 from reconstruct.mapping.database import Observations
@@ -146,13 +145,11 @@ def exact_observations(
             world_from_rig = state.turns[pixels.station[rows]]
             turned = np.einsum("nij,ni->nj", world_from_rig, arm[rows]) @ turn.T
             at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
-            slopes = by_camera
-            if source.max(initial=0) >= by_camera.shape[2]:  # it may move on the rig
-                slopes = np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2)
+            slopes = chosen_slopes(source, by_camera, by_cam, turned)
             miss = (at - pixels.taken[rows])[:, :, None]
             _put(
-                rows, by_cam @ turn, world_from_rig,
-                np.concatenate([slopes[:, :, source], miss], axis=2), target, by_point, rest,
+                rows, by_cam @ turn, world_from_rig, np.concatenate([slopes, miss], axis=2),
+                target, by_point, rest,
             )  # fmt: skip
     return LinearObservations(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm, rest=rest

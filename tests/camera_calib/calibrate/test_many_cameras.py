@@ -13,7 +13,8 @@ from alice_survey.base.executor import SERIAL
 from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
-from camera_calib.camera import IN_AIR, Camera, flat_port_camera
+from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import Target, parse_target
 from tests.cameras import changed
@@ -24,10 +25,10 @@ NOISE_PX = 0.1
 
 
 def camera(width: int, height: int, focal: float, k1: float) -> Camera:
-    return flat_port_camera(
-        width_px=width, height_px=height, fx_px=focal, fy_px=1.002 * focal, cx_px=0.51 * width,
-        cy_px=0.49 * height, k1=k1, **IN_AIR,
-    )  # fmt: skip
+    lens = OpenCVLens(
+        fx_px=focal, fy_px=1.002 * focal, cx_px=0.51 * width, cy_px=0.49 * height, k1=k1
+    )
+    return Camera(width_px=width, height_px=height, lens=lens)
 
 
 def four_cameras() -> Rig:
