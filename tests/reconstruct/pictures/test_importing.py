@@ -143,8 +143,8 @@ def test_one_folder_does_not_serve_twice(tmp_path: Path, several: Several) -> No
     several(3)
     (tmp_path / "link").symlink_to(tmp_path / "in")
     pair = {"left": tmp_path / "in", "right": tmp_path / "link"}
-    with pytest.raises(ImageError, match="--right"):
-        import_images(tmp_path / "w", [], **pair)
+    with pytest.raises(ImageError, match="is given twice"):
+        import_images(tmp_path / "w", [], cameras=pair)
     with pytest.raises(ImageError):
         import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "in"])
 
