@@ -368,10 +368,10 @@ def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path, draw: Draw) -> None:
     write_rig(tmp_path / "good.json", design_rig(small, WaterConfig()))
     write_rig(tmp_path / "bad.json", design_rig(CameraConfig(), WaterConfig()))
     pair = {"left": tmp_path / "left", "right": tmp_path / "right"}
-    import_images(tmp_path / "w", [], **pair, rig=tmp_path / "good.json")
+    import_images(tmp_path / "w", [], cameras=pair, rig=tmp_path / "good.json")
     assert read_rig(tmp_path / "w" / "images" / "rig.json").cameras["left"].width_px == 846
     with pytest.raises(ImageError, match=r"846 x 677.*3384 x 2710"):
-        import_images(tmp_path / "w", [], **pair, rig=tmp_path / "bad.json")
+        import_images(tmp_path / "w", [], cameras=pair, rig=tmp_path / "bad.json")
     assert (tmp_path / "w" / "images" / "rig.json").exists()  # what was there stays
 
 
@@ -394,9 +394,9 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         ([tmp_path / "absent"], {}, "absent"),
         ([tmp_path / "nav.csv"], {}, "nav.csv"),
         ([], {}, "--left and --right"),
-        ([three], {"left": three, "right": three}, "--left and --right"),
-        ([], {"left": three}, "--left and --right"),
-        ([], {"left": three, "right": tmp_path / "one"}, "3 .* 1 "),
+        ([three], {"cameras": {"left": three, "right": three}}, "--left and --right"),
+        ([], {"cameras": {"left": three}}, "--left and --right"),
+        ([], {"cameras": {"left": three, "right": tmp_path / "one"}}, "3 in .* 1 in "),
         ([], {"video": tmp_path / "no.mp4"}, "no.mp4"),
         ([], {"video": tmp_path / "no.mp4", "every_s": 0.0}, "--every"),
         ([three], {"navigation": nav}, "DateTimeOriginal"),
