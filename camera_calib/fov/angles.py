@@ -10,7 +10,7 @@ from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.seawater import n_water as n_water_of_colour
 from camera_calib.approximation.pinhole_warp import best_warp, residual_px
 from camera_calib.camera import Camera
-from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
+from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m, axial_pixel_m
 from camera_calib.fov.table import check_range
 from camera_calib.rig import design_rig
 from camera_calib.water import WAVELENGTH_NM
@@ -95,7 +95,8 @@ def _displacement(camera: Camera, altitude_m: float) -> tuple[float, float]:
     floor_z = float(camera.front_cam[2]) + altitude_m
     radius_px = math.hypot(camera.cx_px, camera.cy_px)
     spot = camera.at_depth(np.zeros((1, 2)), floor_z)[0]
-    ideal_px = camera.fx_px * math.hypot(spot[0], spot[1]) / apparent_distance_m(camera, altitude_m)
+    at_glass_m, per_m = axial_pixel_m(camera)
+    ideal_px = math.hypot(spot[0], spot[1]) / (at_glass_m + per_m * altitude_m)
     return radius_px - ideal_px, 100.0 * (radius_px / ideal_px - 1.0)
 
 
@@ -111,9 +112,9 @@ def _angle_row(
     outer, direction = camera.unproject(corner)
     tangent = float(np.linalg.norm(direction[0, :2]) / direction[0, 2])
     meets_axis = glass_z - float(np.linalg.norm(outer[0, :2])) / tangent
-    # Near the axis every ray in water comes from a pinhole as many times as far as the port
-    # magnifies.
-    paraxial = glass_z - camera.port.magnification * apparent_distance_m(camera, 0.0)
+    # Near the axis every ray in water comes from where a pixel is of no size.
+    at_glass_m, per_m = axial_pixel_m(camera)
+    paraxial = glass_z - at_glass_m / per_m
 
     near, far = glass_z + altitude_m * (1 - RELIEF), glass_z + altitude_m * (1 + RELIEF)
     residual = residual_px(best_warp(camera, near, far), np.linspace(near, far, 11))

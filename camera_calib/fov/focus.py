@@ -116,6 +116,14 @@ def altitude_of_apparent_m(camera: Camera, apparent_m: float) -> float:
     return float(_on_axis(camera).altitudes_m(apparent_m)[0].mean())
 
 
+def axial_pixel_m(camera: Camera) -> tuple[float, float]:
+    """Size of a pixel on the sea floor at altitude 0, and its growth for a metre (paraxial)."""
+    spots = np.array([0.0, 0.0, float(camera.front_cam[2])]) + np.array([[0, 0, 1.0], [0, 0, 2.0]])
+    slopes = replace(camera, lens=_TANGENTS).project_jacobian(spots)[1]
+    first, second = (2.0 / (slopes[:, 0, 0] + slopes[:, 1, 1]) / camera.fx_px).tolist()
+    return 2.0 * first - second, second - first
+
+
 def air_rays(camera: Camera, pixels: Array) -> Array:
     """Unit directions in air, (..., 3), of pixels: before the port bends them."""
     return camera.in_air().unproject(pixels)[1]

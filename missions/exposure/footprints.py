@@ -12,7 +12,7 @@ from shapely.affinity import translate
 
 from alice_survey.base.config import PlanConfig
 from camera_calib.camera import Camera
-from camera_calib.fov.focus import altitude_of_apparent_m, apparent_distance_m
+from camera_calib.fov.focus import axial_pixel_m
 from camera_calib.rig import Rig
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import LEAST_ALTITUDE_M, Way, conflict
@@ -103,12 +103,14 @@ def footprint_at(rig: Rig, altitude_m: float, step_m: float) -> FootprintAt:
 
 def pixel_on_floor_m(camera: Camera, altitude_m: float) -> float:
     """Size of the central pixel on the sea floor (paraxial)."""
-    return apparent_distance_m(camera, altitude_m) / camera.fx_px
+    at_glass_m, per_m = axial_pixel_m(camera)
+    return at_glass_m + per_m * altitude_m
 
 
 def altitude_for_pixel_m(camera: Camera, pixel_m: float) -> float:
     """The inverse of `pixel_on_floor_m`; negative where even the glass is too far."""
-    return altitude_of_apparent_m(camera, pixel_m * camera.fx_px)
+    at_glass_m, per_m = axial_pixel_m(camera)
+    return (pixel_m - at_glass_m) / per_m
 
 
 def top_altitude_m(plan: PlanConfig) -> float:

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import CalibrationError
 from camera_calib.camera import Camera, camera_from_json
-from camera_calib.fov.focus import altitude_of_apparent_m, apparent_distance_m
+from camera_calib.fov.focus import (
+    altitude_of_apparent_m,
+    apparent_distance_m,
+    axial_pixel_m,
+)
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
@@ -33,6 +37,7 @@ FISHEYE = FisheyeLens(
 DOME = DomePort(
     dome_x_m=0.003, dome_y_m=-0.004, dome_z_m=0.012, outer_radius_m=0.08, glass_thickness_m=0.006
 )
+HALF_PIXELS = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 PORTS = (NO_PORT, FlatPort(port_distance_m=0.02, glass_thickness_m=0.01), DOME)
 
 
@@ -157,7 +162,7 @@ def changed_radius(port: DomePort) -> DomePort:
 def test_a_fisheye_is_that_of_opencv_and_colmap() -> None:
     camera = camera_of(FISHEYE, NO_PORT)
     points = np.random.default_rng(4).uniform([-3, -3, 0.3], [3, 3, 2], (500, 3))
-    k = np.array([FISHEYE.lens.k1, FISHEYE.lens.k2, FISHEYE.lens.k3, FISHEYE.lens.k4])
+    k = np.array([FISHEYE.k1, FISHEYE.k2, FISHEYE.k3, FISHEYE.k4])
     matrix = np.array([[600.0, 0.0, 804.5], [0.0, 604.0, 589.5], [0.0, 0.0, 1.0]])
     opencv = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, k)[0]
     np.testing.assert_allclose(camera.project(points), opencv[:, 0] + 0.5, atol=1e-9)
@@ -195,6 +200,21 @@ def test_a_dome_makes_a_near_image(altitude_m: float, dome_z_m: float) -> None:
     assert apparent_distance_m(camera, altitude_m) == pytest.approx(expected, rel=1e-9)
     assert expected < 0.5  # some three radii, however far the sea floor is
     assert altitude_of_apparent_m(camera, expected) == pytest.approx(altitude_m, rel=1e-7)
+
+
+@pytest.mark.parametrize("port", PORTS)
+@pytest.mark.parametrize("altitude_m", [0.4, 3.0])
+def test_a_pixel_on_the_sea_floor_is_as_large_as_traced(
+    port: PortValues, altitude_m: float
+) -> None:
+    lens = OpenCVLens(fx_px=1000.0, fy_px=1000.0, cx_px=0.0, cy_px=0.0)
+    camera = camera_of(lens, port)
+    floor_z = float(camera.front_cam[2]) + altitude_m
+    foot = camera.project(np.array([0.0, 0.0, floor_z]))
+    square = camera.at_depth(foot + HALF_PIXELS, floor_z)
+    traced_m = (square[1, 0] - square[0, 0] + square[3, 1] - square[2, 1]) / 2
+    at_glass_m, per_m = axial_pixel_m(camera)
+    assert at_glass_m + per_m * altitude_m == pytest.approx(traced_m, rel=2e-4)
 
 
 @pytest.mark.parametrize("dome_z_m", [-0.02, 0.03])

@@ -95,8 +95,8 @@ def test_the_sure_rectangle_lies_between_the_corners(lens_mm: float, altitude_m:
     halves = np.array([3384, 2710]) * 3.69e-3 / 2
     sine = math.sin(math.atan(np.hypot(*halves) / lens_mm))
     layers = (
-        (PORT.port.port_distance_m, 1.0),
-        (PORT.port.glass_thickness_m, 1.52),
+        (PORT.port_distance_m, 1.0),
+        (PORT.glass_thickness_m, 1.52),
         (altitude_m, 1.34),
     )
     reach = sum(thick * math.tan(math.asin(sine / n)) for thick, n in layers)
