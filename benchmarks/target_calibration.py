@@ -18,7 +18,6 @@ from alice_survey.base.executor import SERIAL, Executor
 from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.solve import blank_camera, calibrate
 from camera_calib.calibration import Calibration, TargetView
-from camera_calib.camera import IN_AIR
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, value
 from camera_calib.rig import Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape
@@ -143,7 +142,7 @@ def views_of(target: Board, rng: np.random.Generator, count: int = _VIEWS) -> li
 
 def true_rig() -> Rig:
     """One camera in air."""
-    camera = blank_camera(_SIZE, **IN_AIR).with_parameters(_LENS)
+    camera = blank_camera(_SIZE, "opencv5").with_parameters(_LENS)
     return Rig(
         cameras={"camera": camera},
         cam_from_rig={"camera": RigidTransform.identity()},

@@ -27,8 +27,8 @@ def test_options_reach_the_rows() -> None:
         f_number=5.6, choices=FovChoices(coc_px=2.0, focus_air_m=1.2, match_sigma_px=0.5),
     )[0]  # fmt: skip
     wanted = {
-        "lens_mm": 16.0, "altitude_m": 1.5, "n_water": 1.345, "port_distance_m": 0.035,
-        "glass_thickness_m": 0.012, "f_number": 5.6, "coc_px": 2.0, "focus_set_m": 1.2,
+        "lens_mm": 16.0, "altitude_m": 1.5, "n_water": 1.345,
+        "port": "port 35 mm + glass 12 mm", "f_number": 5.6, "coc_px": 2.0, "focus_set_m": 1.2,
         "match_sigma_px": 0.5,
     }  # fmt: skip
     assert {key: row[key] for key in wanted} == pytest.approx(wanted)
@@ -53,7 +53,7 @@ def test_a_survey_s_settings_are_taken_unless_said_otherwise(tmp_path: Path) -> 
     _, data, _ = fov_report(FovOptions(survey=survey), QUIET)
     [row] = data["rows"]
     assert (row["lens_mm"], row["altitude_m"], row["n_water"]) == (16.0, 1.7, 1.337)
-    assert row["port_distance_m"] == 0.05
+    assert row["port"] == "port 50 mm + glass 10 mm"
     [blur] = data["blur"]
     assert (blur["speed_mps"], blur["allowed_px"]) == (0.3, 0.5)
     other = rows(survey=survey, lens_mm=[8.0], n_water=1.35)[0]

@@ -16,7 +16,7 @@ from camera_calib.calibrate.corner_noise import spread_of
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibration import TargetView, stack_views
-from camera_calib.freedom import PORT, Freedom, of_cameras, pose_names
+from camera_calib.freedom import Freedom, of_ports, pose_names
 from camera_calib.judge.validation import halves_agreement
 from camera_calib.target_shape import usual_shape
 from tests.camera_calib.calibration_scenes import board, board_poses, built_rig, views_of
@@ -46,7 +46,7 @@ def test_the_parts_of_the_noise_and_the_covariance_are_those_of_dense_matrices()
     views[1].pixels["left"][2:5] = np.nan
     del views[3].pixels["right"]  # type: ignore[attr-defined]
     freedom, shape = (
-        Freedom(free=(*of_cameras(TRUTH, PORT), *pose_names(TRUTH))),
+        Freedom(free=(*of_ports(TRUTH), *pose_names(TRUTH))),
         usual_shape(points),
     )
     found = adjust(views, points, TRUTH, poses, freedom, shape=shape)

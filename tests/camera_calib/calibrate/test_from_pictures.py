@@ -384,8 +384,8 @@ def test_a_camera_of_which_most_pictures_do_not_fit_is_no_calibration(
         ]
         return replace(found, views=tuple(few))
 
-    calibrated = from_pictures._calibrated
-    monkeypatch.setattr(from_pictures, "_calibrated", with_few)
+    calibrated = from_pictures.calibrated
+    monkeypatch.setattr(from_pictures, "calibrated", with_few)
     settings = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="k2")
     with pytest.raises(CalibrationError, match="only 5 of 12 pictures of right") as caught:
         calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
