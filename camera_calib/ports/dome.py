@@ -33,7 +33,7 @@ class DomePort(PortValues):
         >>> import alice_survey as alice
         >>> dome = alice.DomePort(outer_radius_m=0.08, glass_thickness_m=0.006, dome_z_m=0.005)
         >>> dome.refracts, round(dome.magnification, 3)
-        (True, 0.982)
+        (True, 0.983)
     """
 
     shape: ClassVar[str] = "dome"
