@@ -308,7 +308,9 @@ def _pictures_summary(folder: Path) -> Summary:
 
 
 def _calibrate_inputs(workspace: Path) -> list[Path]:
-    return [workspace / "pool" / name for name in ("manifest.csv", "board.json", "left", "right")]
+    pool = workspace / "pool"
+    air = [pool / "air"] if (pool / "air").exists() else []
+    return [pool / name for name in ("manifest.csv", "board.json", "left", "right")] + air
 
 
 def _calibrate_summary(folder: Path) -> Summary:

@@ -1,5 +1,6 @@
 """The stage `calibration`: the rig from the pictures of a board in a pool."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from alice_survey.base.config import CameraConfig, WaterConfig
@@ -10,7 +11,11 @@ from alice_survey.base.records import BoardRecord
 from camera_calib.calibrate.detect_views import Size, detect_views
 from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet
-from camera_calib.calibrate.solve import calibrate_through_ports
+from camera_calib.calibrate.solve import (
+    Intrinsics,
+    calibrate_in_air,
+    calibrate_through_ports,
+)
 from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target
 
@@ -21,7 +26,7 @@ def run_calibrate(
     """Calibrate the rig from `pool/`.
 
     Intrinsics, ports (with their normals) and the pose of the right camera are found together,
-    from the design.
+    from the design, or from the pictures in air where there are some.
 
     Raises:
         CalibrationError: too few usable views.
@@ -35,7 +40,15 @@ def run_calibrate(
     warn_of_unseen(found)
     start = design_rig(camera, water, _scale(found.sizes["left"], camera))
     lens = "fisheye" if camera.lens == "fisheye" else "opencv5"
-    calibration = calibrate_through_ports(found.views, target.points, start, "free", lens)
+    known: Intrinsics = "free"
+    if (pool / "air").is_dir():
+        seen = detect_views(_pool_pictures(pool / "air"), target, executor)
+        dry = calibrate_in_air(seen.views, target.points, seen.sizes, lens).rig
+        cameras = {
+            name: replace(one, port=start.cameras[name].port) for name, one in dry.cameras.items()
+        }
+        start, known = replace(dry, cameras=cameras, body_from_rig=start.body_from_rig), "prior"
+    calibration = calibrate_through_ports(found.views, target.points, start, known, lens)
     finish(folder, calibration, found)
 
 

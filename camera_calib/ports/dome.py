@@ -45,6 +45,8 @@ class DomePort(PortValues):
 
     estimated: ClassVar[tuple[str, ...]] = ("dome_x_m", "dome_y_m", "dome_z_m")
 
+    needs_air: ClassVar[bool] = True
+
     dome_x_m: float = 0.0
     dome_y_m: float = 0.0
     dome_z_m: float = 0.0

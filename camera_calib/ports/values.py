@@ -44,6 +44,8 @@ class PortValues:
     """Names of its parameters, ordered as its slopes."""
     estimated: ClassVar[tuple[str, ...]]
     """Those that a calibration finds; glass and indices are known better."""
+    needs_air: ClassVar[bool] = False
+    """Whether views under water alone hardly tell its place from the lens's focal length."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

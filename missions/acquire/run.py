@@ -73,13 +73,26 @@ def run_pool(
     imaging: ImagingConfig,
     seed: int,
 ) -> None:
-    """Take the stereo pictures of a chessboard in a pool."""
+    """Take the stereo pictures of a chessboard in a pool, and in air where its ports need them."""
     board = PoolBoard()
     rig = true_rig(camera, water, scale=imaging.scale, seed=seed)
     rng = np.random.default_rng([seed, _POOL_STREAM])
-    poses = pool_poses(board, rig, imaging.pool_views, rng)
-    shown = board_records(rig, poses)
     shoot = _Shoot(folder=folder, camera=camera, water=water, imaging=imaging, seed=seed)
+    _take_boards(shoot, board, rig, rng, executor)
+    BoardRecord(**asdict(board)).write(folder / "board.json")
+    if any(one.port.needs_air for one in rig.cameras.values()):
+        cameras = {name: one.in_air() for name, one in rig.cameras.items()}
+        dry = replace(shoot, folder=folder / "air", seed=seed + 1)
+        _take_boards(dry, board, replace(rig, cameras=cameras), rng, executor)
+
+
+def _take_boards(
+    shoot: _Shoot, board: PoolBoard, rig: Rig, rng: np.random.Generator, executor: Executor
+) -> None:
+    """Take the pictures of one calibration, with their truth."""
+    folder = shoot.folder
+    poses = pool_poses(board, rig, shoot.imaging.pool_views, rng)
+    shown = board_records(rig, poses)
     jobs = [
         (shoot, board, view, name, rig.cameras[name], pose.as_matrix())
         for view, by_camera in enumerate(shown)
@@ -87,7 +100,6 @@ def run_pool(
     ]
     records = list(executor.map(_take_board, jobs, label="pool pictures"))
     write_manifest(folder / "manifest.csv", records)
-    BoardRecord(**asdict(board)).write(folder / "board.json")
     write_rig(folder / "truth" / "rig.json", rig)
     write_json(
         folder / "truth" / "boards.json",
