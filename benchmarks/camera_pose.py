@@ -17,7 +17,7 @@ from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.figures import Figure, Goal
-from camera_calib.camera import flat_port_camera
+from tests.cameras import flat_port_camera
 
 PUBLISHED = {
     0.0: (0.0008, 0.020),

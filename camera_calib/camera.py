@@ -16,12 +16,11 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib import optics
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.lenses.values import LensValues
+from camera_calib.lenses.values import MOST_PX, LensValues
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 
-_MOST_PX = 1e7
 _Part = TypeVar("_Part", LensValues, PortValues)
 
 
@@ -50,8 +49,8 @@ class Camera:
     def __post_init__(self) -> None:
         if min(self.width_px, self.height_px) < 1:
             raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
-        if max(self.width_px, self.height_px) > _MOST_PX:
-            raise CalibrationError(f"camera: a size or focal length exceeds {_MOST_PX:g} px")
+        if max(self.width_px, self.height_px) > MOST_PX:
+            raise CalibrationError(f"camera: a size or focal length exceeds {MOST_PX:g} px")
 
     @property
     def optics(self) -> optics.Optics:
@@ -233,18 +232,6 @@ class Camera:
             **asdict(self.port),
         }
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
-
-
-def flat_port_camera(*, width_px: int, height_px: int, **values: Any) -> Camera:
-    """A camera with OpenCV's lens behind a flat port, from the fields of both.
-
-    Raises:
-        CalibrationError: a field is unknown or a value out of range.
-    """
-    lens = {name: values.pop(name) for name in OpenCVLens.parameters if name in values}
-    return Camera(
-        width_px=width_px, height_px=height_px, lens=OpenCVLens(**lens), port=FlatPort(**values)
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

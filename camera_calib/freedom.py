@@ -19,7 +19,6 @@ from camera_calib.camera import pose_jacobian
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
-from camera_calib.ports.values import lowest
 from camera_calib.rig import Rig
 
 POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
@@ -112,9 +111,13 @@ def chosen_slopes(wanted: Indices, by_camera: Array, by_point: Array, turned: Ar
 
 def at_bound(rig: Rig, names: Sequence[str]) -> Flags:
     """Which parameters of a rig have their least value; those of something else have none."""
-    lows = {name: lowest(name.split(".")[1]) for name in names}
-    bound = [low > -np.inf and value(rig, name) <= low for name, low in lows.items()]
-    return np.array(bound, dtype=np.bool_)
+
+    def bound(name: str) -> bool:
+        camera, _, field = name.partition(".")
+        least = rig.cameras[camera].port.least(field) if camera in rig.cameras else -np.inf
+        return least > -np.inf and value(rig, name) <= least
+
+    return np.array([bound(name) for name in names], dtype=np.bool_)
 
 
 def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
@@ -129,7 +132,7 @@ def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
         mine = {field: float(change) for (owner, _, field), change in parts if owner == name}
         turn, shift = ([mine.pop(axis, 0.0) for axis in axes] for axes in (_TURN, _SHIFT))
         changed = {
-            field: max(camera.parameter(field) + change, lowest(field))
+            field: max(camera.parameter(field) + change, camera.port.least(field))
             for field, change in mine.items()
         }
         cameras[name] = camera.with_parameters(changed) if changed else camera

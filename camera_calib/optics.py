@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from alice_survey.base.compiled import BLOCK as _BLOCK
 from alice_survey.base.compiled import compiled, compiled_ieee
 from alice_survey.base.frames import Array
 from camera_calib.lenses.fisheye import FisheyeLens, fisheye_pixels, fisheye_rays, fisheye_slopes
@@ -25,8 +26,6 @@ LENSES: dict[str, type[LensValues]] = {lens.model: lens for lens in (OpenCVLens,
 PORTS: dict[str, type[PortValues]] = {port.shape: port for port in (NoPort, FlatPort, DomePort)}
 _FISHEYE = FisheyeLens.kind
 _FLAT, _DOME = FlatPort.kind, DomePort.kind
-_BLOCK = 128
-"""Points at a time: loops over a block that do not branch become vector instructions."""
 
 
 @compiled_ieee

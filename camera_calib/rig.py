@@ -15,11 +15,7 @@ from alice_survey.base.contents import one_line
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.camera import Camera, camera_from_json
-from camera_calib.optics import LENSES
-from camera_calib.ports.dome import DomePort
-from camera_calib.ports.flat import FlatPort
-from camera_calib.ports.none import NO_PORT
-from camera_calib.ports.values import PortValues
+from camera_calib.optics import LENSES, PORTS
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}
 _NORM_TOLERANCE = 1e-3
@@ -156,7 +152,7 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         width_px=camera.width_px,
         height_px=camera.height_px,
         lens=LENSES[camera.lens](fx_px=focal_px, fy_px=focal_px, **middle),
-        port=_design_port(camera, water),
+        port=PORTS[camera.port].designed(camera, water.n_water),
     ).reduced(scale)
     ahead, right, down = camera.position_body_m
     pupil = (ahead, right, down - float(one.front_cam[2]))
@@ -171,35 +167,9 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
     )
 
 
-def _design_port(camera: CameraConfig, water: WaterConfig) -> PortValues:
-    glass = {"glass_thickness_m": camera.glass_thickness_m, "n_glass": camera.n_glass}
-    if camera.port == "none":
-        return NO_PORT
-    if camera.port == "dome":
-        x, y, z = camera.dome_centre_m
-        return DomePort(
-            dome_x_m=x, dome_y_m=y, dome_z_m=z, outer_radius_m=camera.dome_radius_m,
-            n_water=water.n_water, **glass,
-        )  # fmt: skip
-    x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
-    return FlatPort(
-        port_distance_m=camera.port_distance_m,
-        n_water=water.n_water,
-        normal=(x, y, float(np.sqrt(1.0 - x * x - y * y))),
-        **glass,
-    )
-
-
 def port_settings(camera: Camera) -> dict[str, Any]:
     """The settings of `CameraConfig` that design the port of a camera."""
-    settings: dict[str, Any] = {"lens": camera.lens.model, "port": camera.port.shape}
-    for name in ("port_distance_m", "glass_thickness_m", "n_glass"):
-        if name in camera.parameters:
-            settings[name] = camera.parameter(name)
-    if "outer_radius_m" in camera.parameters:
-        settings["dome_radius_m"] = camera.parameter("outer_radius_m")
-        settings["dome_centre_m"] = tuple(camera.parameter(f"dome_{axis}_m") for axis in "xyz")
-    return settings
+    return {"lens": camera.lens.model, "port": camera.port.shape, **camera.port.settings}
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:

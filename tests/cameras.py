@@ -4,6 +4,16 @@ from dataclasses import fields, replace
 from typing import Any
 
 from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.ports.flat import FlatPort
+
+
+def flat_port_camera(*, width_px: int, height_px: int, **values: Any) -> Camera:
+    """A camera with OpenCV's lens behind a flat port, from the fields of both."""
+    lens = {name: values.pop(name) for name in OpenCVLens.parameters if name in values}
+    return Camera(
+        width_px=width_px, height_px=height_px, lens=OpenCVLens(**lens), port=FlatPort(**values)
+    )
 
 
 def changed(camera: Camera, **values: Any) -> Camera:

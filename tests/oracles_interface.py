@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from camera_calib.triangulate import Triangulation, reproject, triangulate
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 
 Array = NDArray[np.float64]
 

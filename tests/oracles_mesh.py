@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from camera_calib.rig import Rig
+from tests.cameras import flat_port_camera
 
 
 def implicit_value(points: Array, normals: Array, weights: Array, node: Array) -> float:

@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.camera_pose import PUBLISHED, run_level, simulated
-from camera_calib.camera import Camera, flat_port_camera
-from tests.cameras import changed
+from camera_calib.camera import Camera
+from tests.cameras import changed, flat_port_camera
 
 Array = np.ndarray
 

@@ -18,6 +18,8 @@ from numba import njit
 
 from alice_survey.base.errors import note
 
+BLOCK = 128
+"""Points at a time: loops over a block that do not branch become vector instructions."""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)

@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.camera import Camera
-from camera_calib.ports.values import RANGES
 from camera_calib.rig import Rig, design_rig
 
 _SEED_STREAM = 3400
@@ -23,8 +22,6 @@ PORT_TOLERANCE_M = 0.001
 TURN_TOLERANCE_RAD = np.deg2rad(0.3)
 TILT_TOLERANCE = float(np.sin(np.deg2rad(0.3)))
 """Largest error of a port's normal, about each axis."""
-_PORT_PLACES = ("port_distance_m", "dome_x_m", "dome_y_m", "dome_z_m")
-_PORT_TURNS = ("normal_x", "normal_y")
 _DISTORTION = {
     "opencv": {"k1": (-0.06, -0.04), "k2": (0.02, 0.05), "p1": (-3e-4, 3e-4), "p2": (-3e-4, 3e-4)},
     "fisheye": {"k1": (-0.03, -0.01), "k2": (0.0, 0.01), "k3": (-1e-3, 1e-3)},
@@ -66,8 +63,8 @@ def _built(camera: Camera, rng: np.random.Generator) -> Camera:
     focal = 1.0 + rng.uniform(-FOCAL_TOLERANCE, FOCAL_TOLERANCE)
     skew = 1.0 + rng.uniform(-1e-4, 1e-4)
     centre = rng.uniform(-CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_PX, 2)
-    port = _shifted(camera, _PORT_PLACES, PORT_TOLERANCE_M, rng)
-    port = {name: max(value, RANGES.get(name, (value,))[0]) for name, value in port.items()}
+    port = _shifted(camera, camera.port.places, PORT_TOLERANCE_M, rng)
+    port = {name: max(value, camera.port.least(name)) for name, value in port.items()}
     terms = {name: rng.uniform(*ends) for name, ends in _DISTORTION[camera.lens.model].items()}
     return camera.with_parameters(
         {
@@ -82,14 +79,10 @@ def _built(camera: Camera, rng: np.random.Generator) -> Camera:
 
 
 def _tilted(camera: Camera, rng: np.random.Generator) -> Camera:
-    return camera.with_parameters(_shifted(camera, _PORT_TURNS, TILT_TOLERANCE, rng))
+    return camera.with_parameters(_shifted(camera, camera.port.tilts, TILT_TOLERANCE, rng))
 
 
 def _shifted(
     camera: Camera, names: Sequence[str], tolerance: float, rng: np.random.Generator
 ) -> dict[str, float]:
-    return {
-        name: camera.parameter(name) + rng.uniform(-tolerance, tolerance)
-        for name in names
-        if name in camera.parameters
-    }
+    return {name: camera.parameter(name) + rng.uniform(-tolerance, tolerance) for name in names}

@@ -49,7 +49,6 @@ from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras
-from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT, NoPort
 from camera_calib.ports.values import PortValues
@@ -66,9 +65,6 @@ _WRITTEN = (
 _MOST_FIRST_VIEWS = 30
 _FEWEST_FITTING = 0.5
 """Share of a camera's pictures that must fit those of the others."""
-_GUESSED_PORT_M = 0.02
-_USUAL_DOME_M = 0.08
-_FRESH_WATER = 1.34
 _LEVELS = ("bad", "look", "good")
 
 
@@ -419,12 +415,7 @@ def _cameras(
 
 def _port(kind: str, old: PortValues, settings: CalibrateOptions) -> PortValues:
     """First values of a port of some kind: those of the start, or usual ones, or as named."""
-    usual: dict[str, PortValues] = {
-        NoPort.shape: NO_PORT,
-        FlatPort.shape: FlatPort(port_distance_m=_GUESSED_PORT_M, n_water=_FRESH_WATER),
-        DomePort.shape: DomePort(outer_radius_m=_USUAL_DOME_M, n_water=_FRESH_WATER),
-    }
-    port = old if old.shape == kind else usual[kind]
+    port = old if old.shape == kind else PORTS[kind].guess()
     given = {
         "glass_thickness_m": _metres(settings.glass_mm),
         "outer_radius_m": _metres(settings.dome_radius_mm),
@@ -612,14 +603,16 @@ def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
     yield f"{name}: focal lengths {stated('fx_px', ' px')}, {stated('fy_px', ' px')}"
     if not camera.port.parameters:
         return
-    tilt_deg, sigma_deg = port_tilt_deg(rig, name)
-    tilt = f"{tilt_deg:.3g} deg (held)" if sigma_deg is None else with_sigma(tilt_deg, sigma_deg)
-    yield (
-        f"{name} port: {stated('port_distance_m', ' mm', 1e3)} from the pupil, tilt "
-        f"{tilt}{'' if sigma_deg is None else ' deg'}, glass "
-        f"{stated('glass_thickness_m', ' mm', 1e3)}, index {stated('n_glass', '')}, water "
-        f"{stated('n_water', '')}"
-    )
+    parts = [
+        label.format(stated(field, " mm", 1e3) if field.endswith("_m") else stated(field, ""))
+        for field, label in camera.port.labels.items()
+    ]
+    if camera.port.tilts:
+        tilt_deg, sigma_deg = port_tilt_deg(rig, name)
+        known = f"{tilt_deg:.3g}" if sigma_deg is None else with_sigma(tilt_deg, sigma_deg)
+        held = " (held)" if sigma_deg is None else ""
+        parts.insert(len(camera.port.places), f"tilt {known} deg{held}")
+    yield f"{name} {camera.port.shape} port: {', '.join(parts)}"
 
 
 def port_tilt_deg(rig: Rig, name: str) -> tuple[float, float | None]:
@@ -629,7 +622,7 @@ def port_tilt_deg(rig: Rig, name: str) -> tuple[float, float | None]:
     """
     x, y, z = rig.cameras[name].port.axis_cam
     sine = math.hypot(x, y)
-    fields = [f"{name}.normal_x", f"{name}.normal_y"]
+    fields = [f"{name}.{tilt}" for tilt in rig.cameras[name].port.tilts]
     tilt_deg = math.degrees(math.atan2(sine, z))
     if rig.covariance is None or not set(fields) <= set(rig.covariance.parameters):
         return tilt_deg, None

@@ -4,6 +4,7 @@ https://github.com/gyroflow/lens_profiles: JSON with OpenCV's numbers for one se
 camera, measured on another copy of it, in air. They are no calibration of the camera at hand.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +17,14 @@ from camera_calib.formats.opencv_model import read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.lenses.values import LensValues
 from camera_calib.rig import Rig
 
 KEY = "fisheye_params"
-_MODELS = {"opencv_fisheye": FisheyeLens, "opencv_standard": OpenCVLens}
+_MODELS: Mapping[str, type[LensValues]] = {
+    "opencv_fisheye": FisheyeLens,
+    "opencv_standard": OpenCVLens,
+}
 
 
 def read_gyroflow(path: Path, reading: ReadOptions) -> Rig:

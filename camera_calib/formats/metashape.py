@@ -12,6 +12,7 @@ Pixels count from the outer corner of the first one; p1 and p2 are OpenCV's p2 a
 a fisheye's p1 and p2, and b2 have no place in lenses here, p3 and p4 are of older versions.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -34,7 +35,7 @@ _FRAME = {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p2", "p2": "p1"}
 """Names here by Metashape's."""
 _FISHEYE = {name: name for name in ("k1", "k2", "k3", "k4")}
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b2")
-_KINDS = {
+_KINDS: Mapping[str, tuple[type[LensValues], Mapping[str, str]]] = {
     "frame": (OpenCVLens, _FRAME),
     "fisheye": (FisheyeLens, _FISHEYE),
     "equidistant_fisheye": (FisheyeLens, _FISHEYE),
@@ -119,7 +120,6 @@ def _camera(path: Path, element: ET.Element) -> Camera:
     kind = element.get("type") or fields.text("projection")
     if kind not in _KINDS:
         raise CalibrationError(f"{path}: projection {kind!r}; {', '.join(_KINDS)} can be read")
-    lens: type[LensValues]
     lens, names = _KINDS[kind]
 
     def value(name: str) -> float:

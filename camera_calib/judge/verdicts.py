@@ -35,6 +35,10 @@ _VERY_BENT = 2.0
 _RETURNING = 0.5
 """Residuals that return in the target's frame, over the noise of a coordinate."""
 _SIGMAS = 3.0
+_MOVED_LOOK, _MOVED_BAD = 4.0, 8.0
+"""Sigmas by which views may move a parameter from its prior."""
+_LEARNT = 0.99
+"""Share of a prior's variance below which the views determine a parameter, too."""
 _TREND_LOOK, _TREND_BAD = 0.35, 1.0
 _SIGMA_LOOK, _SIGMA_BAD = 3.0, 10.0
 """Projection sigma that nine tenths of the frame keep below, over the noise."""
@@ -49,6 +53,7 @@ def _lines(judged: Judgement) -> Iterator[Verdict]:
     yield from _side_verdicts(judged.calibration.rig)
     yield from _fit_verdicts(judged)
     yield from _housing_verdicts(judged)
+    yield from _prior_verdicts(judged)
     yield from _hold_out_verdicts(judged)
     yield from _length_verdicts(judged)
     yield from _target_verdicts(judged)
@@ -139,6 +144,37 @@ def _housing_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 text=f"the flat port of {name} ended {distance_m * 1e3:.0f} mm before the pupil, "
                 "farther than in any housing: the pictures may be through a dome; try --port auto",
             )
+
+
+def _prior_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Whether the views contradict what was known before, as a wrong kind of port makes them do.
+
+    The change of a parameter by the views has the variance of its prior less that of the result.
+    """
+    calibration = judged.calibration
+    prior, result = calibration.freedom.prior, calibration.rig.covariance
+    if result is None or not prior.parameters:
+        return
+    before = np.diag(prior.covariance)
+    after = np.diag(result.marginal(prior.parameters).matrix)
+    learnt = after < _LEARNT * before
+    if not learnt.any():
+        return
+    moved = np.zeros(len(before))
+    moved[learnt] = prior.misfit(calibration.rig)[learnt] / np.sqrt((before - after)[learnt])
+    most = int(np.abs(moved).argmax())
+    level = _graded(abs(float(moved[most])), _MOVED_LOOK, _MOVED_BAD)
+    text = (
+        f"the views move {prior.parameters[most]} by {abs(moved[most]):.1f} sigmas from its prior"
+    )
+    if level == "good":
+        yield Verdict(level=level, text=f"{text}, more than any other parameter")
+    else:
+        yield Verdict(
+            level=level,
+            text=f"{text}: port, lens or water are not what was taken; try --port auto, or "
+            "--intrinsics free if the focus changed",
+        )
 
 
 def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:

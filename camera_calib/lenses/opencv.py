@@ -16,6 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from alice_survey.base.compiled import BLOCK as _BLOCK
 from alice_survey.base.compiled import compiled, compiled_ieee
 from alice_survey.base.frames import Array
 from camera_calib.lenses.values import FOCAL_AND_CENTRE, LensValues
@@ -27,7 +28,6 @@ _NEWTON_STEPS = 60
 _BISECTIONS = 60
 _SETTLED = 1e-9
 """After a step of Newton's method this short in a tangent, the remaining error is its square."""
-_BLOCK = 128
 _COUNT = 4 + len(COEFFICIENTS)
 
 

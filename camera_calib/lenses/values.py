@@ -1,6 +1,7 @@
 """What all lenses have: focal lengths and a centre."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
@@ -11,11 +12,12 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 
 FOCAL_AND_CENTRE = ("fx_px", "fy_px", "cx_px", "cy_px")
-_MOST_PX = 1e7
+MOST_PX = 1e7
+"""Largest size of a picture, and largest focal length."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensValues:
+class LensValues(ABC):
     """A lens in air: rays of any length to pixels and back, by the kernels of its file."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
@@ -43,13 +45,13 @@ class LensValues:
                 )
         if min(self.fx_px, self.fy_px) <= 0:
             raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
-        if max(self.fx_px, self.fy_px) > _MOST_PX:
-            raise CalibrationError(f"camera: a size or focal length exceeds {_MOST_PX:g} px")
+        if max(self.fx_px, self.fy_px) > MOST_PX:
+            raise CalibrationError(f"camera: a size or focal length exceeds {MOST_PX:g} px")
 
     @property
+    @abstractmethod
     def values(self) -> Array:
         """Its parameters, and what else its kernels need."""
-        raise NotImplementedError
 
     def parameter(self, name: str) -> float:
         """The value of one of `parameters`."""

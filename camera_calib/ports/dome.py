@@ -7,19 +7,22 @@ method finds it. With the pupil at the centre the dome does nothing to any ray.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from alice_survey.base.compiled import BLOCK as _BLOCK
 from alice_survey.base.compiled import compiled_ieee
+from alice_survey.base.config import CameraConfig
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.ports.values import PortValues, Vector
+from camera_calib.ports.values import GLASS_AND_WATER, N_WATER_SPREAD, PortValues, Vector
 
+_CENTRE = ("dome_x_m", "dome_y_m", "dome_z_m")
 _STEPS = 40
-_BLOCK = 128
 _FEW_STEPS = 3
 _SETTLED = 1e-8
 """After a step of Newton's method this short, in radians, its square is what is left."""
@@ -39,11 +42,24 @@ class DomePort(PortValues):
     shape: ClassVar[str] = "dome"
     kind: ClassVar[int] = 2
     parameters: ClassVar[tuple[str, ...]] = (
-        "dome_x_m", "dome_y_m", "dome_z_m", "outer_radius_m", "glass_thickness_m", "n_glass",
-        "n_water",
+        *_CENTRE, "outer_radius_m", "glass_thickness_m", "n_glass", "n_water"
     )  # fmt: skip
-
-    estimated: ClassVar[tuple[str, ...]] = ("dome_x_m", "dome_y_m", "dome_z_m")
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "outer_radius_m": (1e-3, 10.0), **GLASS_AND_WATER
+    }  # fmt: skip
+    places: ClassVar[tuple[str, ...]] = _CENTRE
+    spreads: ClassVar[Mapping[str, float]] = {
+        "dome_x_m": 0.005, "dome_y_m": 0.005, "dome_z_m": 0.02, "n_water": N_WATER_SPREAD
+    }  # fmt: skip
+    labels: ClassVar[Mapping[str, str]] = {
+        "dome_x_m": "its centre {} right of the pupil",
+        "dome_y_m": "{} down",
+        "dome_z_m": "{} before it",
+        "outer_radius_m": "radius {}",
+        "glass_thickness_m": "glass {}",
+        "n_glass": "index {}",
+        "n_water": "water {}",
+    }
 
     needs_air: ClassVar[bool] = True
 
@@ -55,6 +71,32 @@ class DomePort(PortValues):
     glass_thickness_m: float = 0.0
     n_glass: float = 1.49
     n_water: float = 1.34
+
+    @classmethod
+    def guess(cls) -> Self:
+        """Of 80 mm radius, about the pupil."""
+        return cls(outer_radius_m=0.08)
+
+    @classmethod
+    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+        """The port of a design, in water of an index."""
+        return cls(
+            **dict(zip(_CENTRE, camera.dome_centre_m, strict=True)),
+            outer_radius_m=camera.dome_radius_m,
+            glass_thickness_m=camera.glass_thickness_m,
+            n_glass=camera.n_glass,
+            n_water=n_water,
+        )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of `CameraConfig` that design it."""
+        return {
+            "dome_radius_m": self.outer_radius_m,
+            "dome_centre_m": (self.dome_x_m, self.dome_y_m, self.dome_z_m),
+            "glass_thickness_m": self.glass_thickness_m,
+            "n_glass": self.n_glass,
+        }
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,21 +9,22 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from alice_survey.base.compiled import BLOCK as _BLOCK
 from alice_survey.base.compiled import compiled_ieee
+from alice_survey.base.config import CameraConfig
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.ports.values import PortValues, Vector
+from camera_calib.ports.values import GLASS_AND_WATER, N_WATER_SPREAD, PortValues, Vector
 
 _NEWTON_STEPS = 60
 _SETTLED = 1e-8
 """A step this short, against the tangent, leaves an error below 1.5 times its square, as t f'' / f'
 of what Newton's method solves is 3 at most."""
 _LEAST_ROOT = 0.01
-_BLOCK = 128
 _NORMAL = ("normal_x", "normal_y")
 
 
@@ -47,7 +48,20 @@ class FlatPort(PortValues):
     """The unit normal has two: its first two components, sines of the port's tilt about the
     camera's y and x axes."""
 
-    estimated: ClassVar[tuple[str, ...]] = ("port_distance_m", *_NORMAL)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "port_distance_m": (0.0, 100.0), **GLASS_AND_WATER
+    }  # fmt: skip
+    places: ClassVar[tuple[str, ...]] = ("port_distance_m",)
+    tilts: ClassVar[tuple[str, ...]] = _NORMAL
+    spreads: ClassVar[Mapping[str, float]] = {
+        "port_distance_m": 0.02, **dict.fromkeys(_NORMAL, 0.05), "n_water": N_WATER_SPREAD
+    }  # fmt: skip
+    labels: ClassVar[Mapping[str, str]] = {
+        "port_distance_m": "{} from the pupil",
+        "glass_thickness_m": "glass {}",
+        "n_glass": "index {}",
+        "n_water": "water {}",
+    }
 
     port_distance_m: float = 0.0
     """Distance from the entrance pupil to the inner glass, along the port's normal."""
@@ -56,6 +70,32 @@ class FlatPort(PortValues):
     n_water: float = 1.34
     normal: Vector = (0.0, 0.0, 1.0)
     """Unit normal of the port in the camera frame, pointing into the water."""
+
+    @classmethod
+    def guess(cls) -> Self:
+        """Two centimetres before the pupil."""
+        return cls(port_distance_m=0.02)
+
+    @classmethod
+    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+        """The port of a design, in water of an index."""
+        x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
+        return cls(
+            port_distance_m=camera.port_distance_m,
+            glass_thickness_m=camera.glass_thickness_m,
+            n_glass=camera.n_glass,
+            n_water=n_water,
+            normal=(x, y, float(np.sqrt(1.0 - x * x - y * y))),
+        )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of `CameraConfig` that design it, but for its tilt."""
+        return {
+            "port_distance_m": self.port_distance_m,
+            "glass_thickness_m": self.glass_thickness_m,
+            "n_glass": self.n_glass,
+        }
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,11 +1,12 @@
 """No port: a camera in air, or one whose calibration in water absorbed its housing."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from alice_survey.base.compiled import compiled_ieee
+from alice_survey.base.config import CameraConfig
 from alice_survey.base.frames import Array
 from camera_calib.ports.values import PortValues, Vector
 
@@ -17,7 +18,21 @@ class NoPort(PortValues):
     shape: ClassVar[str] = "none"
     kind: ClassVar[int] = 0
     parameters: ClassVar[tuple[str, ...]] = ()
-    estimated: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def guess(cls) -> Self:
+        """The only one."""
+        return cls()
+
+    @classmethod
+    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+        """The only one."""
+        return cls()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """None."""
+        return {}
 
     @property
     def n_water(self) -> float:

@@ -55,10 +55,6 @@ from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
 
-_PORT_SIGMAS = {
-    "port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005,
-    "dome_x_m": 0.005, "dome_y_m": 0.005, "dome_z_m": 0.02,
-}  # fmt: skip
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 """Prior sigmas of parameters that no calibration determines: very wide."""
 _LEVER = ("lever.x_m", "lever.y_m", "lever.z_m")
@@ -314,8 +310,7 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
         for name in names:
             camera = rig.cameras[name]
             if camera.refracts:
-                found = (*camera.port.estimated, "n_water")
-                wide |= {f"{name}.{field}": _PORT_SIGMAS[field] for field in found}
+                wide |= {f"{name}.{field}": sigma for field, sigma in camera.port.spreads.items()}
     if pose:
         wide |= {
             name: _RIG_SIGMAS[name.split(".")[1]]

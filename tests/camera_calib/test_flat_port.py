@@ -11,12 +11,11 @@ from alice_survey.base.errors import CalibrationError
 from camera_calib.camera import (
     Camera,
     camera_from_json,
-    flat_port_camera,
     pose_jacobian,
 )
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 from tests.oracles_camera import (
     lens_pixel,
     numeric_slope,
@@ -86,7 +85,10 @@ def test_a_pixel_comes_back_within_a_billionth(camera: Camera, distance_m: float
 
     back = camera.project(glass + distance_m * directions)
 
-    assert np.abs(back - pixels).max() < 1e-9
+    seen = np.isfinite(glass).all(axis=1)  # some lenses fold back before the corners of the frame
+    assert seen.mean() > 0.8
+    np.testing.assert_array_equal(np.isfinite(back).all(axis=1), seen)
+    assert np.abs(back - pixels)[seen].max() < 1e-9
 
 
 @settings(deadline=None, max_examples=60)

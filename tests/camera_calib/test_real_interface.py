@@ -15,12 +15,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.calibrate.clock import Lag, estimate_lags, pixel_speeds
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import COEFFICIENTS
 from camera_calib.targets.detect import detect
 from camera_calib.targets.target import parse_target
 from camera_calib.triangulate import Triangulation
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 from tests.oracles_interface import Tank, behind_interface
 
 Array = NDArray[np.float64]

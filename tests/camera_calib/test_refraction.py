@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from camera_calib.camera import flat_port_camera
 from camera_calib.ports.flat import air_tangent
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 
 CAMERA = flat_port_camera(
     width_px=1600, height_px=1200, fx_px=1200.0, fy_px=1190.0, cx_px=790.0, cy_px=610.0,

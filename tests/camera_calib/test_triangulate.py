@@ -6,9 +6,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.camera import flat_port_camera
 from camera_calib.triangulate import nearest_to_rays, reproject, triangulate
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 from tests.oracles_interface import (
     LENS,
     nearest_slowly,

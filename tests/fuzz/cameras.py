@@ -10,8 +10,8 @@ import numpy as np
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.executor import SERIAL
-from camera_calib.camera import flat_port_camera
 from camera_calib.rig import Rig, design_rig
+from tests.cameras import flat_port_camera
 from tests.fuzz.target import Target
 
 _SIZE = (48, 32)

@@ -18,9 +18,9 @@ from alice_survey.seafloor.renderer import (
 )
 from alice_survey.seafloor.terrain import Terrain, build_terrain
 from alice_survey.seafloor.texture import Texture
-from camera_calib.camera import flat_port_camera
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
+from tests.cameras import flat_port_camera
 from tests.oracles_seafloor import fermat_pixels, world_to_cam
 
 CONFIG = SurveyConfig.model_validate({"imaging": {"scale": 16}})

@@ -19,13 +19,14 @@ from alice_survey.seafloor.light import (
     beam_solid_angle_sr,
     camera_light,
 )
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from camera_calib.water import (
     ASYMMETRY,
     WaterOptics,
     phase_per_sr,
     water_optics,
 )
+from tests.cameras import flat_port_camera
 from tests.oracles_seafloor import direct_light
 
 CLEAR_TO_TURBID: Sequence[Jerlov] = ("I", "II", "III", "1C", "3C", "5C", "7C", "9C")

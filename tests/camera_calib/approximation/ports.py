@@ -2,8 +2,8 @@
 
 import math
 
-from camera_calib.camera import Camera, flat_port_camera
-from tests.cameras import changed
+from camera_calib.camera import Camera
+from tests.cameras import changed, flat_port_camera
 
 CAMERA = flat_port_camera(
     width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,

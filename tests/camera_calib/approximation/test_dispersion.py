@@ -18,9 +18,9 @@ from camera_calib.approximation.dispersion import (
     shifts_report,
     undisperse,
 )
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from camera_calib.water import CHANNELS
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 
 ALICE = flat_port_camera(
     width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,

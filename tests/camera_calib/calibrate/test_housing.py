@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrated
+from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrated, calibration_text
 from camera_calib.calibrate.housing import housing_lines
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
@@ -17,6 +17,7 @@ from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
+from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import (
     BOARD,
     board_poses,
@@ -76,6 +77,10 @@ def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> No
         for camera in found.rig.cameras.values():
             for name, sigma_most in (("dome_x_m", 3e-4), ("dome_z_m", 3e-4)):
                 assert camera.parameter(name) == pytest.approx(getattr(port, name), abs=sigma_most)
+    lines = calibration_text(found, parse_target("chessboard 9x6 25mm"), []).splitlines()
+    ports = [line for line in lines if f" {chosen} port: " in line]
+    assert len(ports) == (0 if chosen == "none" else len(TRUTH.cameras))
+    assert all("glass 6 mm (held)" in line for line in ports)
     said = verdicts(judge(found, None))
     assert not [v for v in said if v.level == "bad" and "focal lengths" in v.text]
 

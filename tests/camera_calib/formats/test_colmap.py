@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.colmap import read_colmap, write_colmap, write_refractive
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 from tests.strategies_formats import (
     BOTH_LENSES,
     RATIONAL,

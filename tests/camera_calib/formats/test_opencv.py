@@ -12,12 +12,11 @@ from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.camera import flat_port_camera
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.rig import Rig
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 from tests.strategies_formats import BOTH_LENSES, POINTS_RIG, fault_of, opencv_pixels, rigs
 
 AIR = flat_port_camera(

@@ -13,12 +13,11 @@ from hypothesis import assume, given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.camera import flat_port_camera
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.ros import read_ros, write_ros
 from camera_calib.rig import Rig
-from tests.cameras import changed
+from tests.cameras import changed, flat_port_camera
 from tests.strategies_formats import (
     BOTH_LENSES,
     POINTS_RIG,

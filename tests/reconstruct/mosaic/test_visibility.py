@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.camera import Camera, flat_port_camera
+from camera_calib.camera import Camera
 from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
 from reconstruct.mosaic.visibility import (
     Ground,
@@ -22,6 +22,7 @@ from reconstruct.mosaic.visibility import (
 from reconstruct.raster import DemGrid
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift
+from tests.cameras import flat_port_camera
 from tests.oracles_mosaic import lanczos_at
 
 TILT = np.deg2rad(2.0)

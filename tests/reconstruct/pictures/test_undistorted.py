@@ -8,10 +8,10 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ImageError, WorkspaceError
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
-from camera_calib.camera import flat_port_camera
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
 from reconstruct.views.model_files import colmap_pinhole
+from tests.cameras import flat_port_camera
 
 WIDTH, HEIGHT = 320, 240
 
