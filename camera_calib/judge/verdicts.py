@@ -35,10 +35,10 @@ _VERY_BENT = 2.0
 _RETURNING = 0.5
 """Residuals that return in the target's frame, over the noise of a coordinate."""
 _SIGMAS = 3.0
-_MOVED_LOOK, _MOVED_BAD = 4.0, 8.0
+_MOVED_LOOK, _MOVED_BAD = 3.5, 6.0
 """Sigmas by which views may move a parameter from its prior."""
 _LEARNT = 0.99
-"""Share of a prior's variance below which the views determine a parameter, too."""
+"""Share of a prior's variance below which the views determine a parameter as well."""
 _TREND_LOOK, _TREND_BAD = 0.35, 1.0
 _SIGMA_LOOK, _SIGMA_BAD = 3.0, 10.0
 """Projection sigma that nine tenths of the frame keep below, over the noise."""
@@ -150,6 +150,8 @@ def _prior_verdicts(judged: Judgement) -> Iterator[Verdict]:
     """Whether the views contradict what was known before, as a wrong kind of port makes them do.
 
     The change of a parameter by the views has the variance of its prior less that of the result.
+    Where correlated noise of the corners makes the result the less certain of the two, it has their
+    sum at most.
     """
     calibration = judged.calibration
     prior, result = calibration.freedom.prior, calibration.rig.covariance
@@ -157,11 +159,8 @@ def _prior_verdicts(judged: Judgement) -> Iterator[Verdict]:
         return
     before = np.diag(prior.covariance)
     after = np.diag(result.marginal(prior.parameters).matrix)
-    learnt = after < _LEARNT * before
-    if not learnt.any():
-        return
-    moved = np.zeros(len(before))
-    moved[learnt] = prior.misfit(calibration.rig)[learnt] / np.sqrt((before - after)[learnt])
+    spread = np.sqrt(np.where(after < _LEARNT * before, before - after, before + after))
+    moved = prior.misfit(calibration.rig) / spread
     most = int(np.abs(moved).argmax())
     level = _graded(abs(float(moved[most])), _MOVED_LOOK, _MOVED_BAD)
     text = (

@@ -101,3 +101,14 @@ def test_a_flat_port_taken_for_a_dome_is_bad() -> None:
     found = calibrated(settings, through(FLAT), Board(), dry())
     said = [v.text for v in verdicts(judge(found, None)) if v.level == "bad"]
     assert any("--port flat" in text for text in said)
+
+
+def test_a_dome_off_its_centre_taken_for_none_contradicts_the_calibration_in_air() -> None:
+    settings = CalibrateOptions(water=True, port="none")
+    found = calibrated(settings, through(OFF), Board(), dry())
+    said = [v for v in verdicts(judge(found, None)) if "from its prior" in v.text]
+    assert [v.level for v in said] == ["bad"]
+    right = calibrated(replace(settings, port="dome", glass_mm=6.0, dome_radius_mm=80.0),
+                       through(OFF), Board(), dry())  # fmt: skip
+    said = [v for v in verdicts(judge(right, None)) if "from its prior" in v.text]
+    assert [v.level for v in said] == ["good"]
