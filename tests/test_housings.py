@@ -1,0 +1,109 @@
+"""Surveys through other housings than a flat port, from the plan to the mesh."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from alice_survey.base.artefacts import read_json
+from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+
+pytestmark = pytest.mark.slow
+
+SURVEY = """
+name = "housing"
+seed = 7
+[area]
+length_m = {length_m}
+width_m = {width_m}
+seafloor_depth_m = 15.0
+[camera]
+{camera}
+glass_thickness_m = 0.006
+n_glass = 1.49
+[plan]
+altitude_m = 2.0
+speed_mps = 0.2
+forward_overlap = 0.62
+side_overlap = 0.3
+cross_lines = 1
+[seafloor]
+relief_m = 0.35
+rocks_per_m2 = 0.8
+amphora = true
+[imaging]
+scale = 4
+[reconstruct]
+max_features = 3000
+"""
+DOME = """
+focal_mm = 16.75
+port = "dome"
+dome_radius_m = 0.08
+dome_centre_m = [0.0, 0.0, 0.005]
+"""
+FISHEYE = """
+focal_mm = 7.64
+lens = "fisheye"
+port = "dome"
+dome_radius_m = 0.08
+"""
+BOARD = "chessboard 11x8 40mm"
+
+
+def surveyed(workspace: Path, camera: str, length_m: float, width_m: float) -> dict[str, Any]:
+    workspace.mkdir()
+    settings = SURVEY.format(camera=camera, length_m=length_m, width_m=width_m)
+    (workspace / "survey.toml").write_text(settings)
+    command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace), "--quiet"]
+    subprocess.run(command, check=True, capture_output=True)
+    score: dict[str, Any] = json.loads((workspace / "evaluation" / "score.json").read_text())
+    return score
+
+
+def check(score: dict[str, Any]) -> None:
+    """0.3 mm for cameras and 0.5 mm for the surface, in ground pixels of the demonstration."""
+    assert score["cameras"]["registered"] == score["cameras"]["total"] >= 20
+    pixel_mm = score["surface"]["ground_pixel_mm"]
+    assert 0.01 < score["cameras"]["rms_mm"] / pixel_mm < 0.17
+    assert 0.05 < score["surface"]["distance_rms_mm"] / pixel_mm < 0.28
+    assert 0.8 < score["surface"]["error_over_sigma"]["robust"] < 1.4
+    assert abs(score["cameras"]["scale_error_ppm"]) < 400
+    assert score["surface"]["completeness"] > 0.99
+    assert 0.02 < score["mosaic"]["position_rms_px"] < 0.3
+    assert 0.05 < score["mesh"]["distance_rms_mm"] / pixel_mm < 0.4
+
+
+def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> list[str]:
+    """What is bad in a calibration from the pool's pictures."""
+    pool = workspace / "pool" if port else workspace / "pool" / "air"
+    glass = {"glass_mm": 6.0, "n_glass": 1.49} if port in ("flat", "dome", "auto") else {}
+    calibrate_pictures(
+        CalibrateOptions(
+            left=str(pool / "left"), right=str(pool / "right"), target=BOARD, output=output,
+            water=port is not None, port=port, **glass, **more,
+        )
+    )  # fmt: skip
+    verdicts = read_json(output / "report.json")["verdicts"]
+    return [verdict["text"] for verdict in verdicts if verdict["level"] == "bad"]
+
+
+def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_path: Path) -> None:
+    workspace = tmp_path / "dome"
+    check(surveyed(workspace, DOME, 2.6, 2.2))
+    assert not pool_as(workspace, tmp_path / "air", None)
+    start = {"start": tmp_path / "air" / "rig.json"}
+    dome = {"dome_radius_mm": 80.0, **start}
+    assert not pool_as(workspace, tmp_path / "dome_rig", "dome", **dome)
+    assert any("flat port of" in text for text in pool_as(workspace, tmp_path / "flat", "flat"))
+    bare = pool_as(workspace, tmp_path / "bare", "none", **start)
+    assert any("from its prior" in text for text in bare)
+    pool_as(workspace, tmp_path / "auto", "auto", **dome)
+    assert read_json(tmp_path / "auto" / "calibration.json")["housing"]["chosen"] == "dome"
+
+
+def test_a_fisheye_of_120_degrees_is_surveyed(tmp_path: Path) -> None:
+    check(surveyed(tmp_path / "fisheye", FISHEYE, 4.5, 3.7))
