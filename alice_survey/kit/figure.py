@@ -98,7 +98,7 @@ _NO_DATES: dict[str, dict[str, None]] = {
 _MOST_PX = 1600
 
 
-class _Shown(Sheet):  # type: ignore[misc]
+class _Shown(Sheet):  # type: ignore[misc]  # matplotlib has no types
     """A figure that a notebook shows without set-up."""
 
     def _repr_png_(self) -> bytes:
