@@ -13,11 +13,11 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
 from alice_survey.base.frames import Array, Datum
 from missions.lines.hops import comparable
-from missions.lines.lay import laid
+from missions.lines.lay import laid, lay_lines
 from missions.lines.rows import Site
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
-from missions.values.costs import Costs, power_at
+from missions.values.costs import Costs, power_at, time_costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 
@@ -37,6 +37,31 @@ def area_of(survey: shapely.Geometry, margin_m: float = 3.0) -> Area:
     holes = MultiPolygon([Polygon(ring) for part in parts.geoms for ring in part.interiors])
     around = parts.buffer(margin_m, join_style="mitre").difference(holes)
     return Area(datum=DATUM, survey=parts, allowed=multipolygon(around), no_go=multipolygon(holes))
+
+
+def lay(
+    survey: shapely.Geometry,
+    heading: float = 0.0,
+    pattern: Pattern = STEREO,
+    *,
+    margin_m: float = 3.0,
+    cross_lines: int = 1,
+    closing_line: bool = True,
+    costs: Costs | None = None,
+) -> list[Line]:
+    """The lines of an area with a margin, from somewhere inside it and home again."""
+    area = area_of(survey, margin_m)
+    home = area.allowed.representative_point()
+    return lay_lines(
+        area,
+        heading,
+        pattern,
+        Ways(area.allowed),
+        time_costs(0.2) if costs is None else costs,
+        (home.x, home.y),
+        cross_lines=cross_lines,
+        closing_line=closing_line,
+    )
 
 
 def random_area(rng: np.random.Generator) -> MultiPolygon:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from types import TracebackType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, ParamSpec, Protocol, TypeVar
 
 from alice_survey.base.errors import AliceError, Level, collected_by, note, say, warn
 from alice_survey.base.run.progress import current, step
@@ -24,6 +24,7 @@ _QUEUED = 3
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+P = ParamSpec("P")
 
 
 class Pool(Protocol):
@@ -161,10 +162,12 @@ class _Processes(ProcessPoolExecutor):
                 initializer=_start_worker,
             )
 
-    def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":  # type: ignore[override]
+    def submit(
+        self, function: Callable[P, Result], /, *args: P.args, **kwargs: P.kwargs
+    ) -> "Future[Result]":
         """Queue a task; a process starts when there is something for it to do."""
         with _as_workers_start():
-            return super().submit(function, *args)
+            return super().submit(function, *args, **kwargs)
 
     def __exit__(
         self,
@@ -211,7 +214,7 @@ class _Task(Generic[Item, Result]):
         with collected_by(collect):
             try:
                 return _TaskResult(self.function(item), messages)
-            except Exception as error:
+            except Exception as error:  # whatever it raises takes its messages along
                 vars(error)[_MESSAGES] = messages
                 raise
 
@@ -246,7 +249,7 @@ def _result(future: "Future[_TaskResult[Result]]", *, shown: bool = False) -> Re
     """The result of a task, once its notes and warnings are reported here."""
     try:
         answer = future.result()
-    except Exception as error:
+    except Exception as error:  # any that the task raised, as above
         _report(vars(error).pop(_MESSAGES, []), shown=shown)
         raise
     _report(answer.messages, shown=shown)

@@ -406,7 +406,7 @@ def main() -> None:
     gc.set_threshold(100_000)
     try:
         app()
-    except Exception as error:
+    except Exception as error:  # libraries raise known faults as all kinds; bugs are raised again
         fault = known_fault(error)
         if fault is None:
             raise

@@ -98,7 +98,7 @@ _NO_DATES: dict[str, dict[str, None]] = {
 _MOST_PX = 1600
 
 
-class _Shown(Sheet):  # type: ignore[misc]
+class _Shown(Sheet):  # type: ignore[misc]  # matplotlib has no types
     """A figure that a notebook shows without set-up."""
 
     def _repr_png_(self) -> bytes:
@@ -232,17 +232,16 @@ def map_axes(axes: Any, unit: str = "m", *, placed: bool = True) -> None:
         north_arrow(axes)
 
 
-def scale_bar(axes: Any, unit: str = "m", share: float = 0.25) -> None:
-    """A bar of a round length at the lower left.
+def scale_bar(axes: Any, unit: str = "m") -> None:
+    """A bar of a round length, at most a quarter of the axes' width, at the lower left.
 
     Args:
         axes: with one unit on both axes, and their limits set.
         unit: unit of the axes.
-        share: most of the axes' width that it may take.
     """
     low, high = sorted(axes.get_xlim())
     bottom, top = sorted(axes.get_ylim())
-    length = round_length(share * (high - low))
+    length = round_length(0.25 * (high - low))
     x, y = low + 0.04 * (high - low), bottom + 0.05 * (top - bottom)
     rim = [withStroke(linewidth=5, foreground="white")]
     axes.plot([x, x + length], [y, y], color=INK, lw=2.4, solid_capstyle="butt", zorder=20,
@@ -254,11 +253,11 @@ def scale_bar(axes: Any, unit: str = "m", share: float = 0.25) -> None:
     )  # fmt: skip
 
 
-def north_arrow(axes: Any, at: tuple[float, float] = (0.955, 0.95)) -> None:
-    """An arrow up with an N; `at` is its tip as a share of the axes."""
+def north_arrow(axes: Any) -> None:
+    """An arrow up with an N, at the upper right."""
     rim = [withStroke(linewidth=2.5, foreground="white")]
     axes.annotate(
-        "N", at, xytext=(0, -24), xycoords="axes fraction", textcoords="offset points",
+        "N", (0.955, 0.95), xytext=(0, -24), xycoords="axes fraction", textcoords="offset points",
         ha="center", va="top", fontsize=9, fontweight="bold", color=INK, zorder=20,
         path_effects=rim,
         arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.6, "shrinkA": 0, "shrinkB": 0,
@@ -285,15 +284,10 @@ def palette_steps(name: str, count: int) -> list[str]:
     return [to_hex(mpl.colormaps[name](i / (count - 1))) for i in range(count)]
 
 
-def even_limit(values: Array, percent: float = 97.0) -> float:
-    """Limit of a colour scale about zero that includes most values; NaNs do not count.
-
-    Args:
-        values: any shape.
-        percent: percent of the known values that are within it.
-    """
+def even_limit(values: Array) -> float:
+    """Limit of a colour scale about zero that includes 97 % of the values; NaNs do not count."""
     known = np.abs(values[np.isfinite(values)])
-    return max(float(np.percentile(known, percent)), 1e-9) if len(known) else 1.0
+    return max(float(np.percentile(known, 97.0)), 1e-9) if len(known) else 1.0
 
 
 def plain_name(name: str) -> str:

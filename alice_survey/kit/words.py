@@ -15,9 +15,9 @@ def length(metres: float | None, unit: str = "m") -> str:
     return f"{digits(factor * metres)} {name}"
 
 
-def length_with_sigma(metres: float, sigma_m: float, unit: str = "m") -> str:
+def length_with_sigma(metres: float, sigma_m: float) -> str:
     """`4.6 ± 49 mm`: a length and its sigma in one unit."""
-    factor, name = _length_unit(max(abs(metres), sigma_m)) if unit == "m" else (1.0, unit)
+    factor, name = _length_unit(max(abs(metres), sigma_m))
     return f"{with_sigma(factor * metres, factor * sigma_m)} {name}"
 
 

@@ -221,7 +221,7 @@ class Handler(BaseHTTPRequestHandler):
             self._send_line(HTTPStatus.NOT_FOUND, "nothing is here")
         except (ConnectionError, TimeoutError):
             raise
-        except Exception as fault:
+        except Exception as fault:  # a visitor gets an answer to any; bugs are raised again
             self.close_connection = True
             known = known_fault(fault)
             if not self._begun:

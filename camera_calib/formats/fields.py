@@ -236,7 +236,7 @@ def camera_name(path: Path, name: str) -> str:
     return plain
 
 
-class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
+class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """Safe YAML without aliases (which can grow without bound) and without repeated keys."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:

@@ -64,8 +64,6 @@ class Planned:
     imaging: ImagingSettings
     costs: Costs
     certificate: Certificate
-    sweep: Sweep | None
-    """How the direction of the lines was found; None where it was given."""
     bathymetry: Bathymetry | None
     terrain: str
     """How lines follow the bathymetry; empty without one."""
@@ -191,7 +189,6 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             imaging=imaging,
             costs=costs,
             certificate=seen,
-            sweep=sweep,
             bathymetry=bathymetry,
             warnings=(),
             terrain=terrain,

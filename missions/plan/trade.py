@@ -22,8 +22,6 @@ from missions.route.energy import (
     usable_wh,
 )
 
-_J_PER_WH = 3600.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class LinePower:

@@ -8,32 +8,12 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from missions.lines.cross import LEAST_STEPS, stabs
-from missions.lines.lay import lay_lines
-from missions.route.ways import Ways
-from missions.values.costs import time_costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
-from tests.oracles_lines import PATTERNS, STEREO, area_of, areas, as_string
+from tests.oracles_lines import PATTERNS, STEREO, area_of, areas, as_string, lay
 
 ARMS = Polygon([(0, 0), (30, 0), (30, 12), (14, 12), (14, 26), (0, 26)])
 HOLES = Polygon([(6, 6), (10, 5), (11, 9), (7, 10)]), box(20, 3, 23, 7)
-
-
-def lay(
-    survey: Polygon | MultiPolygon, heading: float, pattern: Pattern, cross_lines: int
-) -> list[Line]:
-    area = area_of(survey)
-    home = area.allowed.representative_point()
-    return lay_lines(
-        area,
-        heading,
-        pattern,
-        Ways(area.allowed),
-        time_costs(0.2),
-        (home.x, home.y),
-        cross_lines=cross_lines,
-        closing_line=False,
-    )
 
 
 def of_kind(lines: list[Line], kind: str) -> list[Line]:
@@ -63,7 +43,7 @@ def test_every_survey_line_with_a_neighbour_is_crossed(
     survey: MultiPolygon, heading: float, pattern: Pattern, cross_lines: int
 ) -> None:
     assume(survey.area > 0.3 and len(area_of(survey).allowed.geoms) == 1)
-    lines = lay(survey, heading, pattern, cross_lines)
+    lines = lay(survey, heading, pattern, cross_lines=cross_lines, closing_line=False)
     crossing, grid = of_kind(lines, "cross"), of_kind(lines, "survey")
     if cross_lines == 0:
         assert not crossing
@@ -83,7 +63,7 @@ def test_every_survey_line_with_a_neighbour_is_crossed(
 def test_all_arms_of_an_area_are_tied_together(heading: float) -> None:
     """Lines that cross one another are one net; one cross line left an arm of this area out."""
     survey = ARMS.difference(HOLES[0]).difference(HOLES[1])
-    lines = lay(survey, heading, STEREO, 1)
+    lines = lay(survey, heading, closing_line=False)
     grid, crossing = of_kind(lines, "survey"), of_kind(lines, "cross")
     net, left = [as_string(crossing[0])], [as_string(x) for x in (*grid, *crossing[1:])]
     while True:
@@ -98,7 +78,7 @@ def test_all_arms_of_an_area_are_tied_together(heading: float) -> None:
 
 def test_a_rectangle_has_the_requested_cross_lines_evenly() -> None:
     for count in (1, 2, 4):
-        crossing = of_kind(lay(box(0, 0, 20, 9), 0.0, STEREO, count), "cross")
+        crossing = of_kind(lay(box(0, 0, 20, 9), cross_lines=count, closing_line=False), "cross")
         norths = sorted(line.start_ne_m[0] for line in crossing)
         assert len(norths) == count
         np.testing.assert_allclose(norths, np.linspace(norths[0], norths[-1], count))
@@ -111,10 +91,10 @@ def test_a_rectangle_has_the_requested_cross_lines_evenly() -> None:
 def test_cross_lines_are_moved_rather_than_added() -> None:
     """A notch, where the one cross line would lie, cuts the rows of one side: its place moves."""
     notched = box(0, 0, 20, 10).difference(box(8, 6, 12, 10))
-    two = of_kind(lay(notched, 0.0, STEREO, 2), "cross")
+    two = of_kind(lay(notched, cross_lines=2, closing_line=False), "cross")
     assert len(two) == 2
     moved = box(0, 0, 20, 10).union(box(0, 10, 3, 14))
-    one = of_kind(lay(moved, 0.0, STEREO, 1), "cross")
+    one = of_kind(lay(moved, closing_line=False), "cross")
     assert len(one) == 1
     assert one[0].start_ne_m[0] < 3.6
     assert one[0].length_m > 12

@@ -25,6 +25,7 @@ from tests.oracles_lines import (
     as_string,
     flight_by_hand,
     full_cost_j,
+    lay,
     points_in,
     random_area,
     seen_enough,
@@ -38,30 +39,6 @@ CURRENT = time_costs(0.2)._replace(
     spot_w=60.0,
     sway_w=90 + 30 * np.cos(COURSES - 2),
 )
-
-
-def lay(
-    survey: Polygon | MultiPolygon,
-    heading: float = 0.0,
-    pattern: Pattern = STEREO,
-    *,
-    margin_m: float = 3.0,
-    cross_lines: int = 1,
-    closing_line: bool = True,
-    costs: Costs | None = None,
-) -> list[Line]:
-    area = area_of(survey, margin_m)
-    home = area.allowed.representative_point()
-    return lay_lines(
-        area,
-        heading,
-        pattern,
-        Ways(area.allowed),
-        time_costs(0.2) if costs is None else costs,
-        (home.x, home.y),
-        cross_lines=cross_lines,
-        closing_line=closing_line,
-    )
 
 
 def across(line: Line, heading: float) -> float:
