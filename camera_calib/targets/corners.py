@@ -48,6 +48,8 @@ does."""
 _NOISES = 2.0
 """What a fit leaves is noise up to this many standard deviations of the picture's."""
 _LEAST_CONTRAST = 0.001
+_LARGEST_SIGMA_PX = 0.5
+"""Largest standard deviation: two edges that cross outside of the window fit whatever is in it."""
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
 
 
@@ -180,9 +182,12 @@ def _fit_corners(
             states[i] = UNLIKE_A_CORNER
             continue
         inverse = np.linalg.inv(normal + 1e-12 * np.eye(9))
+        sigma = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
+        if sigma > _LARGEST_SIGMA_PX:
+            states[i] = UNLIKE_A_CORNER
+            continue
         out[i, 0], out[i, 1] = column + best[0], row + best[1]
-        out[i, 2] = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
-        out[i, 3] = best[5]
+        out[i, 2], out[i, 3] = sigma, best[5]
     return out, states
 
 
