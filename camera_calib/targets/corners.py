@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from camera_calib.targets.pattern import CROSSING, Surroundings
 
 Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
 
@@ -50,6 +51,8 @@ _NOISES = 2.0
 _LEAST_CONTRAST = 0.001
 _LARGEST_SIGMA_PX = 0.5
 """Largest standard deviation: two edges that cross outside of the window fit whatever is in it."""
+_SHARP = 4.0
+"""Distance from an edge over its blur beyond which it is black or white."""
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
 
 
@@ -113,6 +116,9 @@ def fit_corners(
     pixels_per_square: Array,
     reach: float = 1.0,
     arm: float = 1.0,
+    *,
+    bends: Array | None = None,
+    around: Surroundings = CROSSING,
 ) -> Corners:
     """Fit the crossing of two soft edges around each corner.
 
@@ -124,6 +130,9 @@ def fit_corners(
         reach: distance to the next edges that cross these two, in squares.
         arm: distance to the next edges next to these two, in squares; in between, farther than that
             from both edges, there may be anything.
+        bends: (N, 2, 3) how edges are curved by the lens: pixels by u^2, u v and v^2, with u and v
+            the squares along both edges from the corner.
+        around: other edges, whose blur reaches into the window, of each corner or of all.
     """
     fits = np.full((len(near), 4), np.nan)
     states = np.full(len(near), UNSEEN, dtype=np.intp)
@@ -139,9 +148,13 @@ def fit_corners(
         light = _light(part)
         noise = _NOISES**2 * _noise_variance(light) / _WHITE_NOISE
         light = cv2.GaussianBlur(light, (0, 0), _BLUR_PX)
+        which = np.flatnonzero(inside)
+        bent = np.zeros((len(which), 2, 3)) if bends is None else bends[inside]
         fits[inside], states[inside] = _fit_corners(
-            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]), reach, arm, noise
-        )
+            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]),
+            np.ascontiguousarray(bent), around.lines, around.shades,
+            which if len(around.lines) > 1 else 0 * which, reach, arm, noise,
+        )  # fmt: skip
         fits[inside, :2] += low
     return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
 
@@ -155,19 +168,34 @@ def _noise_variance(light: Array) -> float:
 
 @compiled
 def _fit_corners(
-    picture: Array, near: Array, steps: Array, reach: float, arm: float, noise: float
+    picture: Array,
+    near: Array,
+    steps: Array,
+    bends: Array,
+    lines: Array,
+    shades: Array,
+    which: NDArray[np.intp],
+    reach: float,
+    arm: float,
+    noise: float,
 ) -> tuple[Array, NDArray[np.intp]]:
     out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
     side = 2 * _HALF_PX + 1
     window, used = np.empty((side, side)), np.empty((side, side), np.bool_)
+    places, edges = np.empty((side, side, 2)), np.empty((2, lines.shape[2]))
     for i in range(near.shape[0]):
         column, row = int(near[i, 0]), int(near[i, 1])
-        states[i] = _cut(picture, column, row, near[i], steps[i], reach, arm, window, used)
+        states[i] = _cut(
+            picture, column, row, near[i], steps[i], bends[i], reach, arm, window, used, places
+        )
         if states[i] != FITTED:
             continue
-        best = _start(window, used, near[i, 0] - column, near[i, 1] - row, steps[i])
+        _scale(steps[i], lines[which[i]], edges)
+        shade = shades[which[i]]
+        start = near[i] - np.array([column, row])
+        best = _start(window, used, places, edges, shade, start, steps[i])
         x, y = best[0], best[1]
-        best, cost, normal = _descend(window, used, best)
+        best, cost, normal = _descend(window, used, places, edges, shade, best)
         count = used.sum()
         area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
         farthest = max(_FARTHEST_PX, _FARTHEST * math.sqrt(area))
@@ -198,12 +226,17 @@ def _cut(
     row: int,
     centre: Array,
     steps: Array,
+    bends: Array,
     reach: float,
     arm: float,
     window: Array,
     used: NDArray[np.bool_],
+    places: Array,
 ) -> int:
-    """Fill the window with the pixels around a corner; report which of them show its edges only."""
+    """Fill the window with the pixels around a corner; report which of them show its edges only.
+
+    `places` are those of the pixels in a picture in which the lens curves no edge near the corner.
+    """
     rows, columns = picture.shape
     used[:] = False
     area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
@@ -221,7 +254,13 @@ def _cut(
     for j in range(-_HALF_PX, _HALF_PX + 1):
         for i in range(-_HALF_PX, _HALF_PX + 1):
             x, y = column + i + 0.5 - centre[0], row + j + 0.5 - centre[1]
-            u, v = abs(ux * x + uy * y), abs(vx * x + vy * y)
+            u, v = ux * x + uy * y, vx * x + vy * y
+            for axis in range(2):
+                b = bends[axis]
+                straight = (x, y)[axis] - b[0] * u * u - b[1] * u * v - b[2] * v * v
+                origin = (column, row)[axis]
+                places[j + _HALF_PX, i + _HALF_PX, axis] = centre[axis] - origin + straight
+            u, v = abs(u), abs(v)
             if u > u_reach or v > v_reach or (u > u_arm and v > v_arm):
                 continue
             if not (0 <= row + j < rows and 0 <= column + i < columns):
@@ -233,7 +272,27 @@ def _cut(
 
 
 @compiled
-def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Array) -> Array:
+def _scale(steps: Array, lines: Array, edges: Array) -> None:
+    """Distances of lines in pixels, (2, L): of those along the first edge, then the second."""
+    area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
+    across = (
+        area / math.hypot(steps[0, 0], steps[1, 0]),
+        area / math.hypot(steps[0, 1], steps[1, 1]),
+    )
+    for k in range(lines.shape[1]):
+        edges[0, k], edges[1, k] = lines[1, k] * across[0], lines[0, k] * across[1]
+
+
+@compiled
+def _start(
+    window: Array,
+    used: NDArray[np.bool_],
+    places: Array,
+    edges: Array,
+    shades: Array,
+    centre: Array,
+    steps: Array,
+) -> Array:
     """Centre, normals of both edges, blur, contrast, level and its slopes, to begin with."""
     low, high, total, count = np.inf, -np.inf, 0.0, 0
     for j in range(window.shape[0]):
@@ -243,27 +302,35 @@ def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Ar
                 total += window[j, i]
                 count += 1
     one = math.atan2(steps[0, 0], -steps[1, 0])
-    two = math.atan2(steps[0, 1], -steps[1, 1])
-    start = np.array([x, y, one, two, 1.5, 0.5 * (high - low), total / count, 0.0, 0.0])
-    cost = _equations(window, used, start)[0]
+    two = math.atan2(-steps[0, 1], steps[1, 1])
+    contrast = 0.5 * (high - low)
+    start = np.array([centre[0], centre[1], one, two, 1.5, contrast, total / count, 0.0, 0.0])
+    cost = _equations(window, used, places, edges, shades, start)[0]
     start[5] = -start[5]
-    if _equations(window, used, start)[0] > cost:
+    if _equations(window, used, places, edges, shades, start)[0] > cost:
         start[5] = -start[5]
     return start
 
 
 @compiled
-def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Array, float, Array]:
+def _descend(
+    window: Array,
+    used: NDArray[np.bool_],
+    places: Array,
+    edges: Array,
+    shades: Array,
+    start: Array,
+) -> tuple[Array, float, Array]:
     """Levenberg-Marquardt on what `_start` lists; returns the cost and the normal matrix too."""
     q, damping = start.copy(), 1e-3
-    cost, normal, right = _equations(window, used, q)
+    cost, normal, right = _equations(window, used, places, edges, shades, q)
     for _ in range(_STEPS):
         damped = normal.copy()
         for k in range(9):
             damped[k, k] += damping * normal[k, k] + 1e-12
         step = np.linalg.solve(damped, right)
         tried = q - step
-        new_cost, new_normal, new_right = _equations(window, used, tried)
+        new_cost, new_normal, new_right = _equations(window, used, places, edges, shades, tried)
         if new_cost < cost:
             small = abs(step[0]) + abs(step[1]) < 1e-6
             q, cost, normal, right = tried, new_cost, new_normal, new_right
@@ -278,31 +345,84 @@ def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Arra
 
 
 @compiled
-def _equations(window: Array, used: NDArray[np.bool_], q: Array) -> tuple[float, Array, Array]:
+def _between(distance: float, blur: float, edges: Array, shares: Array, slopes: Array) -> None:
+    """Shares of the areas between soft edges at a distance, and the slopes of the edges' steps.
+
+    Args:
+        distance: of a pixel from the first edge, px.
+        blur: of the edges, px.
+        edges: (L,) their distances.
+        shares: (L + 1,) to fill in; they sum to 1.
+        slopes: (L, 2) to fill in: half the slope of a step by the distance and by the blur, times
+            the blur.
+    """
+    last = 1.0
+    for k in range(edges.shape[0]):
+        at = (distance - edges[k]) / blur
+        step, slope = 1.0 if at > 0.0 else -1.0, 0.0
+        if -_SHARP < at < _SHARP:
+            step, slope = math.erf(at), 0.5 * _TWO_OVER_ROOT_PI * math.exp(-at * at)
+            slopes[k, 1] = -slope * at
+        else:
+            slopes[k, 1] = 0.0
+        slopes[k, 0] = slope
+        shares[k] = 0.5 * (last - step)
+        last = step
+    shares[edges.shape[0]] = 0.5 * (last + 1.0)
+
+
+@compiled
+def _equations(
+    window: Array,
+    used: NDArray[np.bool_],
+    places: Array,
+    edges: Array,
+    shades: Array,
+    q: Array,
+) -> tuple[float, Array, Array]:
     """Sum of squared residuals, and the normal equations."""
     cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
     slope = np.empty(9)
+    count = edges.shape[1]
+    rows, columns = np.empty(count + 1), np.empty(count + 1)
+    by_rows, by_columns = np.empty((count, 2)), np.empty((count, 2))
+    of_row, of_column = np.empty(count + 1), np.empty(count + 1)
     c1, s1, c2, s2 = math.cos(q[2]), math.sin(q[2]), math.cos(q[3]), math.sin(q[3])
     blur = q[4] if abs(q[4]) > 1e-3 else 1e-3
+    scale = q[5] / blur
     for j in range(window.shape[0]):
         for i in range(window.shape[1]):
             if not used[j, i]:
                 continue
             # The window's first pixel is _HALF_PX before the pixel that holds the start.
             across, down = float(i - _HALF_PX), float(j - _HALF_PX)
-            x, y = across + 0.5 - q[0], down + 0.5 - q[1]
-            u, v = (x * c1 + y * s1) / blur, (x * c2 + y * s2) / blur
-            one, two = math.erf(u), math.erf(v)
-            du = _TWO_OVER_ROOT_PI * math.exp(-u * u) * two * q[5]
-            dv = _TWO_OVER_ROOT_PI * math.exp(-v * v) * one * q[5]
-            slope[0] = -(du * c1 + dv * c2) / blur
-            slope[1] = -(du * s1 + dv * s2) / blur
-            slope[2] = du * (y * c1 - x * s1) / blur
-            slope[3] = dv * (y * c2 - x * s2) / blur
-            slope[4] = -(du * u + dv * v) / blur
-            slope[5] = one * two
+            x, y = places[j, i, 0] - q[0], places[j, i, 1] - q[1]
+            _between(x * c1 + y * s1, blur, edges[0], rows, by_rows)
+            _between(x * c2 + y * s2, blur, edges[1], columns, by_columns)
+            value = 0.0
+            of_column[:] = 0.0
+            for a in range(count + 1):
+                of_row[a] = 0.0
+                for b in range(count + 1):
+                    of_row[a] += shades[a, b] * columns[b]
+                    of_column[b] += shades[a, b] * rows[a]
+                value += rows[a] * of_row[a]
+            one, two, by_blur = 0.0, 0.0, 0.0
+            for k in range(count):
+                step = of_row[k + 1] - of_row[k]
+                one += step * by_rows[k, 0]
+                by_blur += step * by_rows[k, 1]
+                step = of_column[k + 1] - of_column[k]
+                two += step * by_columns[k, 0]
+                by_blur += step * by_columns[k, 1]
+            slope[0] = -(one * c1 + two * c2) * scale
+            slope[1] = -(one * s1 + two * s2) * scale
+            slope[2] = one * (y * c1 - x * s1) * scale
+            slope[3] = two * (y * c2 - x * s2) * scale
+            slope[4] = by_blur * scale
+            slope[5] = value
             slope[6], slope[7], slope[8] = 1.0, across, down
-            miss = q[6] + q[7] * across + q[8] * down + q[5] * one * two - window[j, i]
+            miss = q[6] + q[7] * across + q[8] * down + q[5] * value - window[j, i]
             cost += miss * miss
             for a in range(9):
                 right[a] += slope[a] * miss

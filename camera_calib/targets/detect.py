@@ -27,11 +27,13 @@ from camera_calib.targets.corners import (
     fit_corners,
 )
 from camera_calib.targets.grow import (
+    board_map,
     from_neighbours,
     grown_chessboard,
     largest_chessboard,
     spans_board,
 )
+from camera_calib.targets.pattern import surroundings
 from camera_calib.targets.target import (
     TAG_BITS,
     TAG_BORDER_BITS,
@@ -42,10 +44,12 @@ from camera_calib.targets.target import (
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
-_FEWEST_POINTS = 6
-_FARTHEST_OFF, _ALWAYS_NEAR = 0.2, 0.02
-"""Largest distance of a point from its prediction by its neighbours, in squares; one that is always
-allowed."""
+_FEWEST_POINTS, _FEWEST_AROUND = 6, 16
+_FARTHEST_OFF, _ALWAYS_NEAR, _NEAR_AT_RIM = 0.2, 0.02, 0.1
+"""Largest distance of a point from its prediction by its neighbours, in squares; those that are
+always allowed, amidst the neighbours and where they are on one side."""
+_RIM = 0.3
+"""Distance of a point from the mean of its neighbours beyond which these are on one side."""
 _FARTHEST_OVER_MIDDLE = 10.0
 """The same over the middle one of the picture: a lens bends all of a board."""
 _WEAKEST = 0.1
@@ -196,6 +200,7 @@ def _refined(target: Target, grey: Grey, near: Array) -> Detection:
     while int((corners.states == FITTED).sum()) > fitted:
         fitted = int((corners.states == FITTED).sum())
         corners = _second_look(target, grey, corners)
+    corners = _without_astray(target, _last_look(target, grey, corners))
     used = corners.states == FITTED
     seen = np.isfinite(near).all(axis=1)
     counts = {
@@ -222,13 +227,21 @@ def _fit(target: Target, grey: Grey, near: Array, shrink: float = 1.0) -> Corner
     return _fit_with(target, grey, near, steps, shrink)
 
 
-def _fit_with(target: Target, grey: Grey, near: Array, steps: Array, shrink: float) -> Corners:
+def _fit_with(
+    target: Target,
+    grey: Grey,
+    near: Array,
+    steps: Array,
+    shrink: float = 1.0,
+    bends: Array | None = None,
+) -> Corners:
     reach, arm = 1.0, 1.0
     if target.marker_m is not None:
         arm = 0.5 * (1.0 - target.marker_m / target.size_m)
     if target.spacing is not None:
         reach, arm = target.spacing, min(target.spacing, TAG_BORDER_BITS / TAG_BITS)
-    return fit_corners(grey, near, steps, shrink * reach, arm)
+    around = surroundings(target)
+    return fit_corners(grey, near, steps, shrink * reach, arm, bends=bends, around=around)
 
 
 def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
@@ -253,6 +266,21 @@ def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
     return corners
 
 
+def _last_look(target: Target, grey: Grey, corners: Corners) -> Corners:
+    """Fit again, with edges as curved as the lens has them around each corner."""
+    used = corners.states == FITTED
+    if used.sum() < _FEWEST_AROUND:
+        return corners
+    steps, bends = (np.full((len(used), 2, count), np.nan) for count in (2, 3))
+    board = target.points[:, :2] / target.size_m
+    steps[used], bends[used] = board_map(board[used], corners.pixels[used])
+    near = np.where(used[:, None], corners.pixels, np.nan)
+    again = _fit_with(target, grey, near, steps, bends=bends)
+    found = again.states == FITTED
+    order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
+    return corners.joined(again).take(order)
+
+
 def _without_astray(target: Target, corners: Corners) -> Corners:
     """Leave out corners far from their prediction, of the wrong colours or too faint."""
     fitted = corners.states == FITTED
@@ -267,8 +295,10 @@ def _without_astray(target: Target, corners: Corners) -> Corners:
     astray = np.zeros(len(fitted), dtype=np.bool_)
     nearest = cKDTree(board).query(board, k=min(_ALIKE_NEAR, len(board)))[1]
     faint = contrast < _WEAKEST * np.maximum(np.median(contrast[nearest], axis=1), 0.0)
-    usual = max(_ALWAYS_NEAR, _FARTHEST_OVER_MIDDLE * float(np.median(off)))
-    astray[fitted] = (off > min(_FARTHEST_OFF, usual)) | faint
+    at_rim = np.linalg.norm(board[nearest].mean(axis=1) - board, axis=1) > _RIM
+    always = np.where(at_rim, _NEAR_AT_RIM, _ALWAYS_NEAR)
+    usual = np.maximum(always, _FARTHEST_OVER_MIDDLE * float(np.median(off)))
+    astray[fitted] = (off > np.minimum(_FARTHEST_OFF, usual)) | faint
     return corners.without(astray, ASTRAY)
 
 
