@@ -39,8 +39,11 @@ _NARROWEST_PX, _WIDEST_PX = 0.2, 8.0
 _HALF_PX = 12
 _REACH = 0.45
 """Half the window in squares; it must not reach the neighbouring edges."""
-_CLEAR_PX = 2.0
-"""Distance kept from other edges, which are blurred too."""
+_CLEAR_PX, _CLEAR = 2.0, 0.25
+"""Distance kept from other edges, whose places are less well known: the lesser of this and of this
+share of the distance to them."""
+_MOST_BENT_PX = 0.1
+"""Largest bend of an edge in the window; bends are known to a tenth or so."""
 _LEAST_PX = 1.0
 _FEWEST_PIXELS = 25
 _WORST_MISFIT, _WORST_NOISY_MISFIT = 0.2, 0.35
@@ -51,6 +54,8 @@ _NOISES = 2.0
 _LEAST_CONTRAST = 0.001
 _LARGEST_SIGMA_PX = 0.5
 """Largest standard deviation: two edges that cross outside of the window fit whatever is in it."""
+_FARTHEST_LINE_PX = _HALF_PX + 2.0
+"""Distance from a corner at which a line still shows in its window."""
 _SHARP = 4.0
 """Distance from an edge over its blur beyond which it is black or white."""
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
@@ -182,7 +187,7 @@ def _fit_corners(
     out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
     side = 2 * _HALF_PX + 1
     window, used = np.empty((side, side)), np.empty((side, side), np.bool_)
-    places, edges = np.empty((side, side, 2)), np.empty((2, lines.shape[2]))
+    places = np.empty((side, side, 2))
     for i in range(near.shape[0]):
         column, row = int(near[i, 0]), int(near[i, 1])
         states[i] = _cut(
@@ -190,8 +195,13 @@ def _fit_corners(
         )
         if states[i] != FITTED:
             continue
-        _scale(steps[i], lines[which[i]], edges)
-        shade = shades[which[i]]
+        area = steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0]
+        along_px = area / math.hypot(steps[i, 0, 1], steps[i, 1, 1])
+        down_px = area / math.hypot(steps[i, 0, 0], steps[i, 1, 0])
+        left, right = _in_window(lines[which[i], 0], along_px)
+        top, bottom = _in_window(lines[which[i], 1], down_px)
+        edges = lines[which[i], 1, top:bottom] * down_px, lines[which[i], 0, left:right] * along_px
+        shade = shades[which[i], top : bottom + 1, left : right + 1]
         start = near[i] - np.array([column, row])
         best = _start(window, used, places, edges, shade, start, steps[i])
         x, y = best[0], best[1]
@@ -217,6 +227,13 @@ def _fit_corners(
         out[i, 0], out[i, 1] = column + best[0], row + best[1]
         out[i, 2], out[i, 3] = sigma, best[5]
     return out, states
+
+
+@compiled
+def _clear(distance: float, per_px: float) -> float:
+    """Length of a window up to an edge at a distance, in squares."""
+    kept = min(_CLEAR_PX * per_px, _CLEAR * distance)
+    return max(distance - kept, _LEAST_PX * per_px)
 
 
 @compiled
@@ -246,10 +263,11 @@ def _cut(
     ux, uy = steps[1, 1] / area, -steps[0, 1] / area
     vx, vy = -steps[1, 0] / area, steps[0, 0] / area
     u_px, v_px = math.hypot(ux, uy), math.hypot(vx, vy)
-    u_reach = max(min(_REACH, reach - _CLEAR_PX * u_px), _LEAST_PX * u_px)
-    v_reach = max(min(_REACH, reach - _CLEAR_PX * v_px), _LEAST_PX * v_px)
-    u_arm = max(arm - _CLEAR_PX * u_px, _LEAST_PX * u_px)
-    v_arm = max(arm - _CLEAR_PX * v_px, _LEAST_PX * v_px)
+    u_reach, v_reach = min(_REACH, _clear(reach, u_px)), min(_REACH, _clear(reach, v_px))
+    u_arm, v_arm = _clear(arm, u_px), _clear(arm, v_px)
+    bend_px = max(np.abs(bends).max(), 1e-9)
+    straight = max(math.sqrt(_MOST_BENT_PX / bend_px), 4.0 * math.sqrt(u_px * v_px))
+    u_reach, v_reach = min(u_reach, straight), min(v_reach, straight)
     count = 0
     for j in range(-_HALF_PX, _HALF_PX + 1):
         for i in range(-_HALF_PX, _HALF_PX + 1):
@@ -272,15 +290,14 @@ def _cut(
 
 
 @compiled
-def _scale(steps: Array, lines: Array, edges: Array) -> None:
-    """Distances of lines in pixels, (2, L): of those along the first edge, then the second."""
-    area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
-    across = (
-        area / math.hypot(steps[0, 0], steps[1, 0]),
-        area / math.hypot(steps[0, 1], steps[1, 1]),
-    )
-    for k in range(lines.shape[1]):
-        edges[0, k], edges[1, k] = lines[1, k] * across[0], lines[0, k] * across[1]
+def _in_window(lines: Array, pixels_per_square: float) -> tuple[int, int]:
+    """First and last but one of the lines that can be seen in a window."""
+    low, high = 0, 0
+    for k in range(lines.shape[0]):
+        at = lines[k] * pixels_per_square
+        low += at < -_FARTHEST_LINE_PX
+        high += at < _FARTHEST_LINE_PX
+    return low, high
 
 
 @compiled
@@ -288,7 +305,7 @@ def _start(
     window: Array,
     used: NDArray[np.bool_],
     places: Array,
-    edges: Array,
+    edges: tuple[Array, Array],
     shades: Array,
     centre: Array,
     steps: Array,
@@ -317,7 +334,7 @@ def _descend(
     window: Array,
     used: NDArray[np.bool_],
     places: Array,
-    edges: Array,
+    edges: tuple[Array, Array],
     shades: Array,
     start: Array,
 ) -> tuple[Array, float, Array]:
@@ -376,17 +393,18 @@ def _equations(
     window: Array,
     used: NDArray[np.bool_],
     places: Array,
-    edges: Array,
+    edges: tuple[Array, Array],
     shades: Array,
     q: Array,
 ) -> tuple[float, Array, Array]:
     """Sum of squared residuals, and the normal equations."""
     cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
     slope = np.empty(9)
-    count = edges.shape[1]
-    rows, columns = np.empty(count + 1), np.empty(count + 1)
-    by_rows, by_columns = np.empty((count, 2)), np.empty((count, 2))
-    of_row, of_column = np.empty(count + 1), np.empty(count + 1)
+    down_edges, along_edges = edges
+    high, wide = len(down_edges), len(along_edges)
+    rows, columns = np.empty(high + 1), np.empty(wide + 1)
+    by_rows, by_columns = np.empty((high, 2)), np.empty((wide, 2))
+    of_row, of_column = np.empty(high + 1), np.empty(wide + 1)
     c1, s1, c2, s2 = math.cos(q[2]), math.sin(q[2]), math.cos(q[3]), math.sin(q[3])
     blur = q[4] if abs(q[4]) > 1e-3 else 1e-3
     scale = q[5] / blur
@@ -397,21 +415,22 @@ def _equations(
             # The window's first pixel is _HALF_PX before the pixel that holds the start.
             across, down = float(i - _HALF_PX), float(j - _HALF_PX)
             x, y = places[j, i, 0] - q[0], places[j, i, 1] - q[1]
-            _between(x * c1 + y * s1, blur, edges[0], rows, by_rows)
-            _between(x * c2 + y * s2, blur, edges[1], columns, by_columns)
+            _between(x * c1 + y * s1, blur, down_edges, rows, by_rows)
+            _between(x * c2 + y * s2, blur, along_edges, columns, by_columns)
             value = 0.0
             of_column[:] = 0.0
-            for a in range(count + 1):
+            for a in range(high + 1):
                 of_row[a] = 0.0
-                for b in range(count + 1):
+                for b in range(wide + 1):
                     of_row[a] += shades[a, b] * columns[b]
                     of_column[b] += shades[a, b] * rows[a]
                 value += rows[a] * of_row[a]
             one, two, by_blur = 0.0, 0.0, 0.0
-            for k in range(count):
+            for k in range(high):
                 step = of_row[k + 1] - of_row[k]
                 one += step * by_rows[k, 0]
                 by_blur += step * by_rows[k, 1]
+            for k in range(wide):
                 step = of_column[k + 1] - of_column[k]
                 two += step * by_columns[k, 0]
                 by_blur += step * by_columns[k, 1]

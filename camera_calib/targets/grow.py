@@ -323,7 +323,7 @@ def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
     places, slopes, bends = through(homography, board)
     middle, half = (board.max(axis=0) + board.min(axis=0)) / 2.0, np.ptp(board, axis=0) / 2.0
     x, y = ((board - middle) / half).T
-    degree = max(d for d in range(_MOST_DEGREE + 1) if 3 * (d + 1) * (d + 2) // 2 <= len(board))
+    degree = max(d for d in range(_MOST_DEGREE + 1) if (d + 1) * (d + 2) <= len(board))
 
     def by(along_x: int, along_y: int) -> Array:
         """(M, T) derivatives of the polynomial's terms."""
