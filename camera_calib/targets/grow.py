@@ -306,8 +306,8 @@ def from_neighbours(
 def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
     """Steps and bends of a board's picture at each of its points, from all of them.
 
-    A homography and a polynomial of its misses, of a degree such that three points or more serve
-    each of its terms.
+    A homography and a polynomial of its misses, of a degree such that two points or more serve each
+    of its terms, and two lines of points each power of x or y.
 
     Args:
         board: (M, 2) points, in squares; 4 or more that are not on a line.
@@ -324,6 +324,10 @@ def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
     middle, half = (board.max(axis=0) + board.min(axis=0)) / 2.0, np.ptp(board, axis=0) / 2.0
     x, y = ((board - middle) / half).T
     degree = max(d for d in range(_MOST_DEGREE + 1) if (d + 1) * (d + 2) <= len(board))
+    most_x, most_y = (len(np.unique(np.round(line, 6))) // 2 for line in (x, y))
+    powers = [
+        (i, j) for i in range(min(degree, most_x) + 1) for j in range(min(degree - i, most_y) + 1)
+    ]
 
     def by(along_x: int, along_y: int) -> Array:
         """(M, T) derivatives of the polynomial's terms."""
@@ -331,10 +335,7 @@ def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
         for z, times, one in ((x, along_x, half[0]), (y, along_y, half[1])):
             series = legendre.legder(np.eye(degree + 1), times) / one**times
             sides.append(legendre.legval(z, series).reshape(degree + 1, -1))
-        return np.stack(
-            [sides[0][i] * sides[1][j] for i in range(degree + 1) for j in range(degree + 1 - i)],
-            axis=1,
-        )
+        return np.stack([sides[0][i] * sides[1][j] for i, j in powers], axis=1)
 
     terms = np.linalg.lstsq(by(0, 0), pixels - places, rcond=1e-9)[0]
     changes = {of: by(*of) @ terms for of in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}

@@ -52,7 +52,7 @@ def test_what_a_lens_bends_is_followed() -> None:
 
 @pytest.mark.parametrize("board", [GRID, GRID[:21], GRID[GRID.sum(axis=1) < 4]])
 def test_steps_and_bends_are_those_of_the_lens(board: np.ndarray) -> None:
-    """A polynomial of low degree from few points, so that noise does not rule it."""
+    """Less so from few points, of which only polynomials of low degree are taken."""
 
     def seen(x: float, y: float) -> np.ndarray:
         return bent(through(VIEW, board + 1e-2 * np.array([x, y]))[0])
@@ -63,10 +63,11 @@ def test_steps_and_bends_are_those_of_the_lens(board: np.ndarray) -> None:
     square = [seen(*way) + seen(*(-np.array(way))) - 2 * seen(0, 0) for way in [(1, 0), (0, 1)]]
     mixed = seen(1, 1) + seen(-1, -1) - seen(1, -1) - seen(-1, 1)
     second = np.stack([square[0] / 2, mixed / 4, square[1] / 2], axis=-1) / 1e-4
-    lens = np.abs(second - through(VIEW, board)[2]).max()
-    assert lens > 0.5
-    assert np.abs(bends - second).max() < (0.05 if len(board) > 40 else 1.0) * lens
-    np.testing.assert_allclose(steps, slopes, atol=0.2 if len(board) > 40 else 1.0)
+    lens = np.sqrt(np.mean((second - through(VIEW, board)[2]) ** 2))
+    assert lens > 0.2
+    whole = len(board) == len(GRID)
+    assert np.sqrt(np.mean((bends - second) ** 2)) < (0.1 if whole else 0.6) * lens
+    np.testing.assert_allclose(steps, slopes, atol=0.2 if whole else 1.0)
 
 
 @pytest.mark.parametrize("known", [GRID[:0], GRID[:3], GRID[:8]])
