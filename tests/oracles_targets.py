@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from camera_calib.targets.sheet import black_rectangles
+from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target
 
 WHITE, BLACK, WALL = 0.7, 0.05, 0.3

@@ -268,6 +268,10 @@ def calibrate(
         ),
     ] = False,
     target: Annotated[str | None, typer.Option(help="A target in words, or target.json.")] = None,
+    target_shape: Annotated[
+        Literal["sheet", "markers", "flat"],
+        typer.Option(help="Found with the cameras: bends and stretch; markers' places too; none."),
+    ] = "sheet",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     lens: Annotated[
         str,
@@ -326,8 +330,8 @@ def calibrate(
 
     options = CalibrateOptions(
         left=left, right=right, pictures=pictures, cameras=tuple(camera or ()),
-        own_clocks=own_clocks, target=target, output=output, lens=lens, water=water, start=start,
-        known=intrinsics, port=port, dome_radius_mm=dome_radius,
+        own_clocks=own_clocks, target=target, target_shape=target_shape, output=output, lens=lens,
+        water=water, start=start, known=intrinsics, port=port, dome_radius_mm=dome_radius,
         port_distance_mm=port_distance, glass_mm=glass, glass_sigma_mm=glass_sigma, n_glass=n_glass,
         n_glass_sigma=n_glass_sigma, n_water=n_water, n_water_sigma=n_water_sigma,
         carry_to_n=carry_to_n,

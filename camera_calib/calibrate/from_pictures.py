@@ -53,7 +53,16 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT, NoPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, read_rig, write_rig
-from camera_calib.target_shape import BOW_X, BOW_Y, SHEAR, STRETCH, TWIST
+from camera_calib.target_shape import (
+    BOW_X,
+    BOW_Y,
+    SHEAR,
+    STRETCH,
+    TWIST,
+    ShapeKind,
+    marker_lines,
+    shape_of,
+)
 from camera_calib.targets.target import Target, parse_target
 
 ONE_CAMERA = "camera"
@@ -83,6 +92,8 @@ class CalibrateOptions:
     """Whether the cameras took their pictures by clocks of their own, without a common trigger."""
     target: str | None = None
     """Target, as `parse_target` reads it."""
+    target_shape: ShapeKind = "sheet"
+    """How it may differ from its drawing."""
     output: Path | None = None
     """Folder to write."""
     lens: str = "opencv5"
@@ -318,7 +329,8 @@ def calibrated(
         bare = _cameras(settings, found.sizes, start, NoPort.shape)
         start = None if start is None else replace(start, cameras=bare)
         views = _numbered(found, target, bare, lens, known=start is not None)
-        return calibrate_in_air(views, points, found.sizes, lens, start)
+        shape = shape_of(target, settings.target_shape)
+        return calibrate_in_air(views, points, found.sizes, lens, start, shape)
     ratios: dict[str, float] = {}
     if start is not None:
         views = _numbered(found, target, start.cameras, lens, known=True)
@@ -368,6 +380,7 @@ def _through(
 ) -> Calibration:
     """The calibration under water through ports of one kind."""
     points, lens = target.points, settings.lens
+    shape = shape_of(target, settings.target_shape)
     cameras = _cameras(settings, found.sizes, start, kind)
     views = _numbered(found, target, cameras, lens, known=start is not None)
     known_to = {
@@ -382,10 +395,10 @@ def _through(
         if sigma is not None and parameter in camera.parameters
     }
     if start is None:
-        return calibrate_in_water_alone(views, points, cameras, lens, sigmas)
+        return calibrate_in_water_alone(views, points, cameras, lens, sigmas, shape)
     known = settings.known or ("held" if start.covariance is None else "prior")
     start = replace(start, cameras=cameras)
-    return calibrate_through_ports(views, points, start, known, lens, sigmas)
+    return calibrate_through_ports(views, points, start, known, lens, sigmas, shape)
 
 
 def _metres(length_mm: float | None) -> float | None:
@@ -570,6 +583,7 @@ def _shape_lines(calibration: Calibration) -> Iterator[str]:
             f"{stated(BOW_Y, 1e3)} mm, twist {stated(TWIST, 1e3)} mm; x over y longer by "
             f"{stated(STRETCH, 1e2)} %, shear {stated(SHEAR, 1e2)} %"
         )
+    yield from marker_lines(shape)
     if calibration.spread is not None:
         noise = calibration.spread.noise
         yield (

@@ -169,6 +169,7 @@ def calibrate_in_air(
     sizes: Mapping[str, tuple[int, int]],
     lens: str = "opencv5",
     start: Rig | None = None,
+    shape: TargetShape | None = None,
 ) -> Calibration:
     """Intrinsics of each camera alone, then of all with the rig, in air, without a start.
 
@@ -178,6 +179,7 @@ def calibrate_in_air(
         sizes: width and height of each camera's pictures; the first is the reference.
         lens: name of a lens model (`freedom.LENSES`).
         start: a rig near the truth, where one is known.
+        shape: as of `calibrate`.
 
     Raises:
         CalibrationError: too few views, or they do not determine the cameras.
@@ -187,7 +189,8 @@ def calibrate_in_air(
         blank = {name: blank_camera(size, lens) for name, size in sizes.items()}
         start = first_rig(views, points, blank, lens)
     free = (*of_cameras(start, names), *pose_names(start))
-    return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
+    freedom = Freedom(free=free)
+    return calibrate(views, points, start, freedom, source="calibration in air", shape=shape)
 
 
 @progress.step("find cameras and ports")
@@ -198,6 +201,7 @@ def calibrate_through_ports(
     known: Intrinsics,
     lens: str = "opencv5",
     sigmas: Mapping[str, float] | None = None,
+    shape: TargetShape | None = None,
 ) -> Calibration:
     """Rig and housings in one adjustment: distance and normal of each port, pose of each camera.
 
@@ -210,6 +214,7 @@ def calibrate_through_ports(
         lens: name of the lens model that is found again.
         sigmas: more parameters that are known about as the start has them, such as
             `left.glass_thickness_m`, with their standard deviations.
+        shape: as of `calibrate`.
 
     Raises:
         CalibrationError: too few views, they do not determine what is free, or the start has no
@@ -225,7 +230,7 @@ def calibrate_through_ports(
         free=tuple(name for name in free if name not in extra.parameters), prior=extra
     )
     source = f"calibration through the ports, intrinsics {known},"
-    return calibrate(views, points, start, freedom, source=source)
+    return calibrate(views, points, start, freedom, source=source, shape=shape)
 
 
 def calibrate_in_water_alone(
@@ -234,6 +239,7 @@ def calibrate_in_water_alone(
     cameras: Mapping[str, Camera],
     lens: str = "opencv5",
     sigmas: Mapping[str, float] | None = None,
+    shape: TargetShape | None = None,
 ) -> Calibration:
     """Rig, housings and intrinsics from views under water, where nothing else exists.
 
@@ -243,12 +249,13 @@ def calibrate_in_water_alone(
         cameras: blank ones (`blank_camera`) with glass, water and a guess of the port distance.
         lens: name of a lens model.
         sigmas: as of `calibrate_through_ports`.
+        shape: as of `calibrate`.
 
     Raises:
         CalibrationError: too few views, or they do not determine what is free.
     """
     start = first_rig(views, points, cameras, lens)
-    found = calibrate_through_ports(views, points, start, "free", lens, sigmas)
+    found = calibrate_through_ports(views, points, start, "free", lens, sigmas, shape)
     return replace(found, warnings=(*found.warnings, *unobservable(found)))
 
 

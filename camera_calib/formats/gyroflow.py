@@ -1,7 +1,8 @@
 """Gyroflow's lens profiles, of GoPros and other action cameras: starts of a calibration.
 
 https://github.com/gyroflow/lens_profiles: JSON with OpenCV's numbers for one setting of a model of
-camera, measured on another copy of it, in air. They are no calibration of the camera at hand.
+camera, measured on another copy of it, in air. They are no calibration of the camera at hand: they
+have a wide covariance, and a calibration that starts from one takes it as a weak prior.
 """
 
 from collections.abc import Mapping
@@ -15,12 +16,17 @@ from alice_survey.base.errors import CalibrationError
 from camera_calib.formats.fields import Fields, read_json_fields
 from camera_calib.formats.opencv_model import read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble
+from camera_calib.freedom import intrinsics
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
-from camera_calib.rig import Rig
+from camera_calib.rig import Covariance, Rig
 
 KEY = "fisheye_params"
+_FOCAL_SHARE, _CENTRE_SHARE, _DISTORTION = 0.03, 0.02, 0.05
+"""Standard deviations between copies of a camera: of focal lengths over themselves, of the centre
+over the width, of distortion terms. Far wider than any calibration."""
+_KNOWN = {FisheyeLens.model: intrinsics("fisheye"), OpenCVLens.model: intrinsics("opencv5")}
 _MODELS: Mapping[str, type[LensValues]] = {
     "opencv_fisheye": FisheyeLens,
     "opencv_standard": OpenCVLens,
@@ -58,7 +64,23 @@ def read_gyroflow(path: Path, reading: ReadOptions) -> Rig:
     rig = assemble(path, reading, "Gyroflow", ["cam0"], [camera], [RigidTransform.identity()])
     words = [_words(fields, key) for key in ("camera_brand", "camera_model", "lens_model")]
     named = " ".join(filter(None, words)) or path.name
-    return replace(rig, source=f"start of a calibration: lens profile of {named}, another camera")
+    return replace(
+        rig,
+        source=f"start of a calibration: lens profile of {named}, another camera",
+        covariance=_spread(rig),
+    )
+
+
+def _spread(rig: Rig) -> Covariance:
+    """Covariance of the lenses between copies of a camera."""
+    (name,) = rig.cameras
+    camera = rig.cameras[name]
+    pinhole = [_FOCAL_SHARE * camera.fx_px] * 2 + [_CENTRE_SHARE * camera.width_px] * 2
+    fields = _KNOWN[camera.lens.model]
+    sigmas = pinhole + [_DISTORTION] * (len(fields) - len(pinhole))
+    return Covariance(
+        parameters=tuple(f"{name}.{field}" for field in fields), matrix=np.diag(np.square(sigmas))
+    )
 
 
 def _words(fields: Fields, key: str) -> str:

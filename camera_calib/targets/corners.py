@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from camera_calib.targets.pattern import CROSSING, Surroundings
 
 Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
 
@@ -38,8 +39,11 @@ _NARROWEST_PX, _WIDEST_PX = 0.2, 8.0
 _HALF_PX = 12
 _REACH = 0.45
 """Half the window in squares; it must not reach the neighbouring edges."""
-_CLEAR_PX = 2.0
-"""Distance kept from other edges, which are blurred too."""
+_CLEAR_PX, _CLEAR = 2.0, 0.25
+"""Distance kept from other edges, whose places are less well known: the lesser of this and of this
+share of the distance to them."""
+_MOST_BENT_PX = 0.1
+"""Largest bend of an edge in the window; bends are known to a tenth or so."""
 _LEAST_PX = 1.0
 _FEWEST_PIXELS = 25
 _WORST_MISFIT, _WORST_NOISY_MISFIT = 0.2, 0.35
@@ -48,6 +52,12 @@ does."""
 _NOISES = 2.0
 """What a fit leaves is noise up to this many standard deviations of the picture's."""
 _LEAST_CONTRAST = 0.001
+_LARGEST_SIGMA_PX = 0.5
+"""Largest standard deviation: two edges that cross outside of the window fit whatever is in it."""
+_FARTHEST_LINE_PX = _HALF_PX + 2.0
+"""Distance from a corner at which a line still shows in its window."""
+_SHARP = 4.0
+"""Distance from an edge over its blur beyond which it is black or white."""
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
 
 
@@ -111,6 +121,9 @@ def fit_corners(
     pixels_per_square: Array,
     reach: float = 1.0,
     arm: float = 1.0,
+    *,
+    bends: Array | None = None,
+    around: Surroundings = CROSSING,
 ) -> Corners:
     """Fit the crossing of two soft edges around each corner.
 
@@ -122,6 +135,9 @@ def fit_corners(
         reach: distance to the next edges that cross these two, in squares.
         arm: distance to the next edges next to these two, in squares; in between, farther than that
             from both edges, there may be anything.
+        bends: (N, 2, 3) how edges are curved by the lens: pixels by u^2, u v and v^2, with u and v
+            the squares along both edges from the corner.
+        around: other edges, whose blur reaches into the window, of each corner or of all.
     """
     fits = np.full((len(near), 4), np.nan)
     states = np.full(len(near), UNSEEN, dtype=np.intp)
@@ -137,9 +153,13 @@ def fit_corners(
         light = _light(part)
         noise = _NOISES**2 * _noise_variance(light) / _WHITE_NOISE
         light = cv2.GaussianBlur(light, (0, 0), _BLUR_PX)
+        which = np.flatnonzero(inside)
+        bent = np.zeros((len(which), 2, 3)) if bends is None else bends[inside]
         fits[inside], states[inside] = _fit_corners(
-            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]), reach, arm, noise
-        )
+            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]),
+            np.ascontiguousarray(bent), around.lines, around.shades,
+            which if len(around.lines) > 1 else 0 * which, reach, arm, noise,
+        )  # fmt: skip
         fits[inside, :2] += low
     return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
 
@@ -153,19 +173,39 @@ def _noise_variance(light: Array) -> float:
 
 @compiled
 def _fit_corners(
-    picture: Array, near: Array, steps: Array, reach: float, arm: float, noise: float
+    picture: Array,
+    near: Array,
+    steps: Array,
+    bends: Array,
+    lines: Array,
+    shades: Array,
+    which: NDArray[np.intp],
+    reach: float,
+    arm: float,
+    noise: float,
 ) -> tuple[Array, NDArray[np.intp]]:
     out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
     side = 2 * _HALF_PX + 1
     window, used = np.empty((side, side)), np.empty((side, side), np.bool_)
+    places = np.empty((side, side, 2))
     for i in range(near.shape[0]):
         column, row = int(near[i, 0]), int(near[i, 1])
-        states[i] = _cut(picture, column, row, near[i], steps[i], reach, arm, window, used)
+        states[i] = _cut(
+            picture, column, row, near[i], steps[i], bends[i], reach, arm, window, used, places
+        )
         if states[i] != FITTED:
             continue
-        best = _start(window, used, near[i, 0] - column, near[i, 1] - row, steps[i])
+        area = steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0]
+        along_px = area / math.hypot(steps[i, 0, 1], steps[i, 1, 1])
+        down_px = area / math.hypot(steps[i, 0, 0], steps[i, 1, 0])
+        left, right = _in_window(lines[which[i], 0], along_px)
+        top, bottom = _in_window(lines[which[i], 1], down_px)
+        edges = lines[which[i], 1, top:bottom] * down_px, lines[which[i], 0, left:right] * along_px
+        shade = shades[which[i], top : bottom + 1, left : right + 1]
+        start = near[i] - np.array([column, row])
+        best = _start(window, used, places, edges, shade, start, steps[i])
         x, y = best[0], best[1]
-        best, cost, normal = _descend(window, used, best)
+        best, cost, normal = _descend(window, used, places, edges, shade, best)
         count = used.sum()
         area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
         farthest = max(_FARTHEST_PX, _FARTHEST * math.sqrt(area))
@@ -180,10 +220,20 @@ def _fit_corners(
             states[i] = UNLIKE_A_CORNER
             continue
         inverse = np.linalg.inv(normal + 1e-12 * np.eye(9))
+        sigma = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
+        if sigma > _LARGEST_SIGMA_PX:
+            states[i] = UNLIKE_A_CORNER
+            continue
         out[i, 0], out[i, 1] = column + best[0], row + best[1]
-        out[i, 2] = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
-        out[i, 3] = best[5]
+        out[i, 2], out[i, 3] = sigma, best[5]
     return out, states
+
+
+@compiled
+def _clear(distance: float, per_px: float) -> float:
+    """Length of a window up to an edge at a distance, in squares."""
+    kept = min(_CLEAR_PX * per_px, _CLEAR * distance)
+    return max(distance - kept, _LEAST_PX * per_px)
 
 
 @compiled
@@ -193,12 +243,17 @@ def _cut(
     row: int,
     centre: Array,
     steps: Array,
+    bends: Array,
     reach: float,
     arm: float,
     window: Array,
     used: NDArray[np.bool_],
+    places: Array,
 ) -> int:
-    """Fill the window with the pixels around a corner; report which of them show its edges only."""
+    """Fill the window with the pixels around a corner; report which of them show its edges only.
+
+    `places` are those of the pixels in a picture in which the lens curves no edge near the corner.
+    """
     rows, columns = picture.shape
     used[:] = False
     area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
@@ -208,15 +263,22 @@ def _cut(
     ux, uy = steps[1, 1] / area, -steps[0, 1] / area
     vx, vy = -steps[1, 0] / area, steps[0, 0] / area
     u_px, v_px = math.hypot(ux, uy), math.hypot(vx, vy)
-    u_reach = max(min(_REACH, reach - _CLEAR_PX * u_px), _LEAST_PX * u_px)
-    v_reach = max(min(_REACH, reach - _CLEAR_PX * v_px), _LEAST_PX * v_px)
-    u_arm = max(arm - _CLEAR_PX * u_px, _LEAST_PX * u_px)
-    v_arm = max(arm - _CLEAR_PX * v_px, _LEAST_PX * v_px)
+    u_reach, v_reach = min(_REACH, _clear(reach, u_px)), min(_REACH, _clear(reach, v_px))
+    u_arm, v_arm = _clear(arm, u_px), _clear(arm, v_px)
+    bend_px = max(np.abs(bends).max(), 1e-9)
+    straight = max(math.sqrt(_MOST_BENT_PX / bend_px), 4.0 * math.sqrt(u_px * v_px))
+    u_reach, v_reach = min(u_reach, straight), min(v_reach, straight)
     count = 0
     for j in range(-_HALF_PX, _HALF_PX + 1):
         for i in range(-_HALF_PX, _HALF_PX + 1):
             x, y = column + i + 0.5 - centre[0], row + j + 0.5 - centre[1]
-            u, v = abs(ux * x + uy * y), abs(vx * x + vy * y)
+            u, v = ux * x + uy * y, vx * x + vy * y
+            for axis in range(2):
+                b = bends[axis]
+                straight = (x, y)[axis] - b[0] * u * u - b[1] * u * v - b[2] * v * v
+                origin = (column, row)[axis]
+                places[j + _HALF_PX, i + _HALF_PX, axis] = centre[axis] - origin + straight
+            u, v = abs(u), abs(v)
             if u > u_reach or v > v_reach or (u > u_arm and v > v_arm):
                 continue
             if not (0 <= row + j < rows and 0 <= column + i < columns):
@@ -228,7 +290,26 @@ def _cut(
 
 
 @compiled
-def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Array) -> Array:
+def _in_window(lines: Array, pixels_per_square: float) -> tuple[int, int]:
+    """First and last but one of the lines that can be seen in a window."""
+    low, high = 0, 0
+    for k in range(lines.shape[0]):
+        at = lines[k] * pixels_per_square
+        low += at < -_FARTHEST_LINE_PX
+        high += at < _FARTHEST_LINE_PX
+    return low, high
+
+
+@compiled
+def _start(
+    window: Array,
+    used: NDArray[np.bool_],
+    places: Array,
+    edges: tuple[Array, Array],
+    shades: Array,
+    centre: Array,
+    steps: Array,
+) -> Array:
     """Centre, normals of both edges, blur, contrast, level and its slopes, to begin with."""
     low, high, total, count = np.inf, -np.inf, 0.0, 0
     for j in range(window.shape[0]):
@@ -238,27 +319,35 @@ def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Ar
                 total += window[j, i]
                 count += 1
     one = math.atan2(steps[0, 0], -steps[1, 0])
-    two = math.atan2(steps[0, 1], -steps[1, 1])
-    start = np.array([x, y, one, two, 1.5, 0.5 * (high - low), total / count, 0.0, 0.0])
-    cost = _equations(window, used, start)[0]
+    two = math.atan2(-steps[0, 1], steps[1, 1])
+    contrast = 0.5 * (high - low)
+    start = np.array([centre[0], centre[1], one, two, 1.5, contrast, total / count, 0.0, 0.0])
+    cost = _equations(window, used, places, edges, shades, start)[0]
     start[5] = -start[5]
-    if _equations(window, used, start)[0] > cost:
+    if _equations(window, used, places, edges, shades, start)[0] > cost:
         start[5] = -start[5]
     return start
 
 
 @compiled
-def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Array, float, Array]:
+def _descend(
+    window: Array,
+    used: NDArray[np.bool_],
+    places: Array,
+    edges: tuple[Array, Array],
+    shades: Array,
+    start: Array,
+) -> tuple[Array, float, Array]:
     """Levenberg-Marquardt on what `_start` lists; returns the cost and the normal matrix too."""
     q, damping = start.copy(), 1e-3
-    cost, normal, right = _equations(window, used, q)
+    cost, normal, right = _equations(window, used, places, edges, shades, q)
     for _ in range(_STEPS):
         damped = normal.copy()
         for k in range(9):
             damped[k, k] += damping * normal[k, k] + 1e-12
         step = np.linalg.solve(damped, right)
         tried = q - step
-        new_cost, new_normal, new_right = _equations(window, used, tried)
+        new_cost, new_normal, new_right = _equations(window, used, places, edges, shades, tried)
         if new_cost < cost:
             small = abs(step[0]) + abs(step[1]) < 1e-6
             q, cost, normal, right = tried, new_cost, new_normal, new_right
@@ -273,31 +362,86 @@ def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Arra
 
 
 @compiled
-def _equations(window: Array, used: NDArray[np.bool_], q: Array) -> tuple[float, Array, Array]:
+def _between(distance: float, blur: float, edges: Array, shares: Array, slopes: Array) -> None:
+    """Shares of the areas between soft edges at a distance, and the slopes of the edges' steps.
+
+    Args:
+        distance: of a pixel from the first edge, px.
+        blur: of the edges, px.
+        edges: (L,) their distances.
+        shares: (L + 1,) to fill in; they sum to 1.
+        slopes: (L, 2) to fill in: half the slope of a step by the distance and by the blur, times
+            the blur.
+    """
+    last = 1.0
+    for k in range(edges.shape[0]):
+        at = (distance - edges[k]) / blur
+        step, slope = 1.0 if at > 0.0 else -1.0, 0.0
+        if -_SHARP < at < _SHARP:
+            step, slope = math.erf(at), 0.5 * _TWO_OVER_ROOT_PI * math.exp(-at * at)
+            slopes[k, 1] = -slope * at
+        else:
+            slopes[k, 1] = 0.0
+        slopes[k, 0] = slope
+        shares[k] = 0.5 * (last - step)
+        last = step
+    shares[edges.shape[0]] = 0.5 * (last + 1.0)
+
+
+@compiled
+def _equations(
+    window: Array,
+    used: NDArray[np.bool_],
+    places: Array,
+    edges: tuple[Array, Array],
+    shades: Array,
+    q: Array,
+) -> tuple[float, Array, Array]:
     """Sum of squared residuals, and the normal equations."""
     cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
     slope = np.empty(9)
+    down_edges, along_edges = edges
+    high, wide = len(down_edges), len(along_edges)
+    rows, columns = np.empty(high + 1), np.empty(wide + 1)
+    by_rows, by_columns = np.empty((high, 2)), np.empty((wide, 2))
+    of_row, of_column = np.empty(high + 1), np.empty(wide + 1)
     c1, s1, c2, s2 = math.cos(q[2]), math.sin(q[2]), math.cos(q[3]), math.sin(q[3])
     blur = q[4] if abs(q[4]) > 1e-3 else 1e-3
+    scale = q[5] / blur
     for j in range(window.shape[0]):
         for i in range(window.shape[1]):
             if not used[j, i]:
                 continue
             # The window's first pixel is _HALF_PX before the pixel that holds the start.
             across, down = float(i - _HALF_PX), float(j - _HALF_PX)
-            x, y = across + 0.5 - q[0], down + 0.5 - q[1]
-            u, v = (x * c1 + y * s1) / blur, (x * c2 + y * s2) / blur
-            one, two = math.erf(u), math.erf(v)
-            du = _TWO_OVER_ROOT_PI * math.exp(-u * u) * two * q[5]
-            dv = _TWO_OVER_ROOT_PI * math.exp(-v * v) * one * q[5]
-            slope[0] = -(du * c1 + dv * c2) / blur
-            slope[1] = -(du * s1 + dv * s2) / blur
-            slope[2] = du * (y * c1 - x * s1) / blur
-            slope[3] = dv * (y * c2 - x * s2) / blur
-            slope[4] = -(du * u + dv * v) / blur
-            slope[5] = one * two
+            x, y = places[j, i, 0] - q[0], places[j, i, 1] - q[1]
+            _between(x * c1 + y * s1, blur, down_edges, rows, by_rows)
+            _between(x * c2 + y * s2, blur, along_edges, columns, by_columns)
+            value = 0.0
+            of_column[:] = 0.0
+            for a in range(high + 1):
+                of_row[a] = 0.0
+                for b in range(wide + 1):
+                    of_row[a] += shades[a, b] * columns[b]
+                    of_column[b] += shades[a, b] * rows[a]
+                value += rows[a] * of_row[a]
+            one, two, by_blur = 0.0, 0.0, 0.0
+            for k in range(high):
+                step = of_row[k + 1] - of_row[k]
+                one += step * by_rows[k, 0]
+                by_blur += step * by_rows[k, 1]
+            for k in range(wide):
+                step = of_column[k + 1] - of_column[k]
+                two += step * by_columns[k, 0]
+                by_blur += step * by_columns[k, 1]
+            slope[0] = -(one * c1 + two * c2) * scale
+            slope[1] = -(one * s1 + two * s2) * scale
+            slope[2] = one * (y * c1 - x * s1) * scale
+            slope[3] = two * (y * c2 - x * s2) * scale
+            slope[4] = by_blur * scale
+            slope[5] = value
             slope[6], slope[7], slope[8] = 1.0, across, down
-            miss = q[6] + q[7] * across + q[8] * down + q[5] * one * two - window[j, i]
+            miss = q[6] + q[7] * across + q[8] * down + q[5] * value - window[j, i]
             cost += miss * miss
             for a in range(9):
                 right[a] += slope[a] * miss

@@ -27,11 +27,13 @@ from camera_calib.targets.corners import (
     fit_corners,
 )
 from camera_calib.targets.grow import (
+    board_map,
     from_neighbours,
     grown_chessboard,
     largest_chessboard,
     spans_board,
 )
+from camera_calib.targets.pattern import surroundings
 from camera_calib.targets.target import (
     TAG_BITS,
     TAG_BORDER_BITS,
@@ -42,20 +44,27 @@ from camera_calib.targets.target import (
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
-_FEWEST_POINTS = 6
-_FARTHEST_OFF, _ALWAYS_NEAR = 0.2, 0.02
-"""Largest distance of a point from its prediction by its neighbours, in squares; one that is always
-allowed."""
+_FEWEST_POINTS, _FEWEST_AROUND = 6, 16
+_FARTHEST_OFF, _ALWAYS_NEAR, _NEAR_AT_RIM = 0.2, 0.02, 0.1
+"""Largest distance of a point from its prediction by its neighbours, in squares; those that are
+always allowed, amidst the neighbours and where they are on one side."""
+_RIM = 0.3
+"""Distance of a point from the mean of its neighbours beyond which these are on one side."""
 _FARTHEST_OVER_MIDDLE = 10.0
 """The same over the middle one of the picture: a lens bends all of a board."""
 _WEAKEST = 0.1
 """Contrast of a corner over the middle one of those near it: part of a target may be in shade."""
 _ALIKE_NEAR = 9
 """Corners whose contrast is compared with, the corner itself among them."""
-_SECOND_LOOK = 0.5
-"""Factor of the smaller window for points that did not fit."""
+_WINDOWS = (1.0, 0.5)
+"""Factors of the window, in turn, for points that only their neighbours predict."""
 SMALL_PX, LARGE_PX = 1000, 2000
 """Longest sides of the reduced pictures given to the detectors."""
+_ENLARGED = 2
+"""Factor of pictures not larger than `SMALL_PX` before markers are read."""
+_CELL_PX, _CELL_MARGIN = 8, 0.3
+"""Resolution at which bits of markers are read, and the share of a bit's sides that is ignored: the
+bits of small markers are blurred into each other."""
 _DARK, _FLAT = 8, 4
 """Grey levels of 255 that the brightest pixels and the range of a usable picture exceed."""
 _AGREED = 0.7
@@ -191,6 +200,7 @@ def _refined(target: Target, grey: Grey, near: Array) -> Detection:
     while int((corners.states == FITTED).sum()) > fitted:
         fitted = int((corners.states == FITTED).sum())
         corners = _second_look(target, grey, corners)
+    corners = _without_astray(target, _last_look(target, grey, corners))
     used = corners.states == FITTED
     seen = np.isfinite(near).all(axis=1)
     counts = {
@@ -217,29 +227,58 @@ def _fit(target: Target, grey: Grey, near: Array, shrink: float = 1.0) -> Corner
     return _fit_with(target, grey, near, steps, shrink)
 
 
-def _fit_with(target: Target, grey: Grey, near: Array, steps: Array, shrink: float) -> Corners:
+def _fit_with(
+    target: Target,
+    grey: Grey,
+    near: Array,
+    steps: Array,
+    shrink: float = 1.0,
+    bends: Array | None = None,
+) -> Corners:
     reach, arm = 1.0, 1.0
     if target.marker_m is not None:
         arm = 0.5 * (1.0 - target.marker_m / target.size_m)
     if target.spacing is not None:
         reach, arm = target.spacing, min(target.spacing, TAG_BORDER_BITS / TAG_BITS)
-    return fit_corners(grey, near, steps, shrink * reach, arm)
+    around = surroundings(target)
+    return fit_corners(grey, near, steps, shrink * reach, arm, bends=bends, around=around)
 
 
 def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
-    """Fit again, in smaller windows, where neighbours predict the unfitted points."""
-    used = corners.states == FITTED
-    if used.all() or used.sum() < 4:
-        return corners
+    """Fit points that were not fitted where their neighbours predict them.
+
+    So the target is found beyond the markers that were read; in smaller windows next to what hides
+    a part of it.
+    """
     board = target.points[:, :2] / target.size_m
-    near, steps = from_neighbours(board[used], corners.pixels[used], board)
     pitch = max(1.0, float(target.spacing or 0.0))
-    adjacent = cKDTree(board[used]).query(board)[0] < 1.1 * pitch
-    near[used | ~adjacent] = np.nan
-    again = _fit_with(target, grey, near, steps, _SECOND_LOOK)
+    for shrink in _WINDOWS:
+        used = corners.states == FITTED
+        if used.all() or used.sum() < 4:
+            break
+        near, steps = from_neighbours(board[used], corners.pixels[used], board)
+        adjacent = cKDTree(board[used]).query(board)[0] < 1.1 * pitch
+        near[used | ~adjacent] = np.nan
+        again = _fit_with(target, grey, near, steps, shrink)
+        found = again.states == FITTED
+        order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
+        corners = _without_astray(target, corners.joined(again).take(order))
+    return corners
+
+
+def _last_look(target: Target, grey: Grey, corners: Corners) -> Corners:
+    """Fit again, with edges as curved as the lens has them around each corner."""
+    used = corners.states == FITTED
+    if used.sum() < _FEWEST_AROUND:
+        return corners
+    steps, bends = (np.full((len(used), 2, count), np.nan) for count in (2, 3))
+    board = target.points[:, :2] / target.size_m
+    steps[used], bends[used] = board_map(board[used], corners.pixels[used])
+    near = np.where(used[:, None], corners.pixels, np.nan)
+    again = _fit_with(target, grey, near, steps, bends=bends)
     found = again.states == FITTED
     order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
-    return _without_astray(target, corners.joined(again).take(order))
+    return corners.joined(again).take(order)
 
 
 def _without_astray(target: Target, corners: Corners) -> Corners:
@@ -256,8 +295,10 @@ def _without_astray(target: Target, corners: Corners) -> Corners:
     astray = np.zeros(len(fitted), dtype=np.bool_)
     nearest = cKDTree(board).query(board, k=min(_ALIKE_NEAR, len(board)))[1]
     faint = contrast < _WEAKEST * np.maximum(np.median(contrast[nearest], axis=1), 0.0)
-    usual = max(_ALWAYS_NEAR, _FARTHEST_OVER_MIDDLE * float(np.median(off)))
-    astray[fitted] = (off > min(_FARTHEST_OFF, usual)) | faint
+    at_rim = np.linalg.norm(board[nearest].mean(axis=1) - board, axis=1) > _RIM
+    always = np.where(at_rim, _NEAR_AT_RIM, _ALWAYS_NEAR)
+    usual = np.maximum(always, _FARTHEST_OVER_MIDDLE * float(np.median(off)))
+    astray[fitted] = (off > np.minimum(_FARTHEST_OFF, usual)) | faint
     return corners.without(astray, ASTRAY)
 
 
@@ -302,15 +343,21 @@ class Reduced:
 
 def reduced(grey: Grey, longest_px: int) -> Reduced:
     """The picture, made so small that its longer side is at most this."""
+    return resized(grey, min(longest_px, max(grey.shape)))
+
+
+def resized(grey: Grey, longest_px: int) -> Reduced:
+    """The picture, made so small or large that its longer side is this."""
     height, width = grey.shape
-    scale = min(longest_px / max(height, width), 1.0)
+    scale = longest_px / max(height, width)
     size = (max(round(width * scale), 1), max(round(height * scale), 1))
     small: NDArray[Any] = grey
-    if scale < 1.0:
-        small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    if scale != 1.0:
+        way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+        small = cv2.resize(grey, size, interpolation=way)
     if small.dtype != np.uint8:
         # Detectors need the middle tones that the eye needs.
-        small = np.rint(255.0 * np.sqrt(small)).astype(np.uint8)
+        small = np.rint(255.0 * np.sqrt(np.clip(small, 0.0, 1.0))).astype(np.uint8)
     return Reduced(picture=small, scale=np.array([width / size[0], height / size[1]]))
 
 
@@ -370,8 +417,9 @@ def find_markers_near(target: Target, grey: Grey) -> tuple[Array | None, str]:
     """
     side = max(grey.shape)
     board, pixels, why = np.empty((0, 2)), np.empty((0, 2)), ""
-    for longest in sorted({min(LARGE_PX, side), side}):
-        found = _read_markers(target, reduced(grey, longest))
+    sizes = {min(LARGE_PX, side), side} if side > SMALL_PX else {_ENLARGED * side}
+    for longest in sorted(sizes):
+        found = _read_markers(target, resized(grey, longest))
         if len(found[0]) >= len(board):
             board, pixels, why = found
         if len(board) == 4 * len(target.marker_places):
@@ -396,6 +444,8 @@ def _read_markers(target: Target, part: Reduced) -> tuple[Array, Array, str]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = 0.01
     parameters.markerBorderBits = TAG_BORDER_BITS if tags else 1
+    parameters.perspectiveRemovePixelPerCell = _CELL_PX
+    parameters.perspectiveRemoveIgnoredMarginPerCell = _CELL_MARGIN
     dictionary = aruco_dictionary(TAG_FAMILY if tags else str(target.dictionary))
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
     quads, numbers, _ = detector.detectMarkers(part.picture)

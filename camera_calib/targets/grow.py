@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -51,8 +52,10 @@ _LEAST_OUTER_SHARE = 0.25
 _MOST_NEIGHBOURS = 24
 _NEIGHBOUR_WIDTH = 1.5
 """Standard deviation of a neighbour's weight, in squares."""
+_MOST_DEGREE = 6
+"""Of the polynomial that describes what a lens makes of a board."""
 _STIFFNESS = 0.1
-"""Weight of 'no change of slope' against that of a neighbour one square away."""
+"""Weight of 'no change of slope', nor of bends, against that of a neighbour one square away."""
 
 
 def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Array | None:
@@ -270,8 +273,8 @@ def from_neighbours(
 ) -> tuple[Array, Array]:
     """Predict positions of the board's points in the picture, and the size of a square there.
 
-    A homography through all known points, plus an affine change of its misses near each point: so
-    a lens may bend the board.
+    A homography through all known points, plus a quadratic of its misses near each point: so a lens
+    may bend the board.
 
     Args:
         board: (M, 2) known points, in squares.
@@ -283,28 +286,80 @@ def from_neighbours(
         (K, 2) pixels, and (K, 2, 2) pixels per square along x (first column) and y (second); NaN
         where fewer than 4 points are known, or all on a line.
     """
-    homography = None
-    if len(board) >= 4 and np.linalg.matrix_rank(board - board.mean(axis=0), tol=0.1) == 2:
-        homography, _ = cv2.findHomography(board, pixels, 0)
+    homography = _homography(board, pixels)
     if homography is None:
         return np.full((len(wanted), 2), np.nan), np.full((len(wanted), 2, 2), np.nan)
-    predicted, slopes = through(homography, wanted)
+    predicted, slopes, _ = through(homography, wanted)
     misses = pixels - through(homography, board)[0]
     distance, index = cKDTree(board).query(wanted, k=min(_MOST_NEIGHBOURS, len(board)))
     weight = np.exp(-0.5 * (distance / _NEIGHBOUR_WIDTH) ** 2)
     if others:
         weight = np.where(distance < 1e-6, 0.0, weight)
-    terms = np.concatenate([np.ones((*index.shape, 1)), board[index] - wanted[:, None]], axis=2)
+    x, y = (board[index] - wanted[:, None]).transpose(2, 0, 1)
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
     weighted = (terms * weight[..., None]).transpose(0, 2, 1)
-    normal = weighted @ terms + np.diag([1e-3, _STIFFNESS, _STIFFNESS])
+    normal = weighted @ terms + np.diag([1e-3, *[_STIFFNESS] * 5])
     change = np.linalg.solve(normal, weighted @ misses[index])
-    return predicted + change[:, 0], slopes + change[:, 1:].transpose(0, 2, 1)
+    return predicted + change[:, 0], slopes + change[:, 1:3].transpose(0, 2, 1)
 
 
-def through(homography: Array, points: Array) -> tuple[Array, Array]:
-    """(K, 2) points mapped by a homography, and (K, 2, 2) the slopes of the map."""
+def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
+    """Steps and bends of a board's picture at each of its points, from all of them.
+
+    A homography and a polynomial of its misses, of a degree such that two points or more serve each
+    of its terms, and two lines of points each power of x or y.
+
+    Args:
+        board: (M, 2) points, in squares; 4 or more that are not on a line.
+        pixels: (M, 2) their pixels.
+
+    Returns:
+        (M, 2, 2) pixels per square along x (first column) and y (second), and (M, 2, 3) pixels by
+        x^2, x y and y^2 from the point.
+    """
+    homography = _homography(board, pixels)
+    if homography is None:
+        return np.full((len(board), 2, 2), np.nan), np.full((len(board), 2, 3), np.nan)
+    places, slopes, bends = through(homography, board)
+    middle, half = (board.max(axis=0) + board.min(axis=0)) / 2.0, np.ptp(board, axis=0) / 2.0
+    x, y = ((board - middle) / half).T
+    degree = max(d for d in range(_MOST_DEGREE + 1) if (d + 1) * (d + 2) <= len(board))
+    most_x, most_y = (len(np.unique(np.round(line, 6))) // 2 for line in (x, y))
+    powers = [
+        (i, j) for i in range(min(degree, most_x) + 1) for j in range(min(degree - i, most_y) + 1)
+    ]
+
+    def by(along_x: int, along_y: int) -> Array:
+        """(M, T) derivatives of the polynomial's terms."""
+        sides = []
+        for z, times, one in ((x, along_x, half[0]), (y, along_y, half[1])):
+            series = legendre.legder(np.eye(degree + 1), times) / one**times
+            sides.append(legendre.legval(z, series).reshape(degree + 1, -1))
+        return np.stack([sides[0][i] * sides[1][j] for i, j in powers], axis=1)
+
+    terms = np.linalg.lstsq(by(0, 0), pixels - places, rcond=1e-9)[0]
+    changes = {of: by(*of) @ terms for of in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}
+    slopes = slopes + np.stack([changes[1, 0], changes[0, 1]], axis=-1)
+    bends = bends + np.stack([changes[2, 0] / 2, changes[1, 1], changes[0, 2] / 2], axis=-1)
+    return slopes, bends
+
+
+def _homography(board: Array, pixels: Array) -> Array | None:
+    """The best one, or None with fewer than 4 points, or all on a line."""
+    if len(board) < 4 or np.linalg.matrix_rank(board - board.mean(axis=0), tol=0.1) < 2:
+        return None
+    found: Array | None = cv2.findHomography(board, pixels, 0)[0]
+    return found
+
+
+def through(homography: Array, points: Array) -> tuple[Array, Array, Array]:
+    """(K, 2) points mapped by a homography, and the map's slopes and bends as of `board_map`."""
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     scale = mapped[:, 2:]
     pixels = mapped[:, :2] / scale
     slopes = homography[None, :2, :2] - pixels[:, :, None] * homography[None, 2:, :2]
-    return pixels, slopes / scale[:, :, None]
+    slopes = slopes / scale[:, :, None]
+    x, y = homography[2, :2]
+    by_x, by_y = slopes.transpose(2, 0, 1)
+    bends = np.stack([by_x * x, by_x * y + by_y * x, by_y * y], axis=-1) / -scale[:, :, None]
+    return pixels, slopes, bends

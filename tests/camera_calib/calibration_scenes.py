@@ -128,3 +128,21 @@ def scene(
     """Noisy views of the board in random poses (see `board_poses`)."""
     rng = np.random.default_rng(seed)
     return views_of(rig, board_poses(rig, count, rng, **poses), noise_px, rng)  # type: ignore[arg-type]
+
+
+def differences(found: Rig, truth: Rig) -> dict[str, float]:
+    """Found minus true values of all parameters that have a sigma."""
+    errors = {}
+    for key in found.sigmas:
+        name, field = key.split(".")
+        if field in ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m"):
+            off = found.cam_from_rig[name] * truth.cam_from_rig[name].inv()
+            turn = off.rotation.as_rotvec()
+            shift = found.cam_from_rig[name].translation - truth.cam_from_rig[name].translation
+            values = dict(zip(("rx_rad", "ry_rad", "rz_rad"), turn, strict=True))
+            values |= dict(zip(("x_m", "y_m", "z_m"), shift, strict=True))
+            errors[key] = float(values[field])
+        else:
+            true = truth.cameras[name].parameter(field)
+            errors[key] = found.cameras[name].parameter(field) - true
+    return errors

@@ -23,7 +23,7 @@ from alice_survey.vehicle.files import vehicle_from_file
 from alice_survey.vehicle.log import write_vehicle_log
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig, design_rig, write_rig
-from camera_calib.targets.sheet import black_rectangles
+from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target
 from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air

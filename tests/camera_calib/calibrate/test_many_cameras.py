@@ -17,6 +17,7 @@ from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import Target, parse_target
+from tests.camera_calib.calibration_scenes import differences
 from tests.cameras import changed
 from tests.oracles_targets import picture_light, to_srgb
 
@@ -88,24 +89,6 @@ def matrix_of(rig: Rig, name: str, pose: RigidTransform) -> np.ndarray:
     one, cam_from_target = rig.cameras[name], (rig.cam_from_rig[name] * pose).as_matrix()
     inner = np.array([[one.fx_px, 0, one.cx_px], [0, one.fy_px, one.cy_px], [0, 0, 1.0]])
     return inner @ cam_from_target[:3, [0, 1, 3]]
-
-
-def differences(found: Rig, truth: Rig) -> dict[str, float]:
-    """Found minus true values of all parameters that have a sigma."""
-    errors = {}
-    for key in found.sigmas:
-        name, field = key.split(".")
-        if field in ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m"):
-            off = found.cam_from_rig[name] * truth.cam_from_rig[name].inv()
-            turn = off.rotation.as_rotvec()
-            shift = found.cam_from_rig[name].translation - truth.cam_from_rig[name].translation
-            values = dict(zip(("rx_rad", "ry_rad", "rz_rad"), turn, strict=True))
-            values |= dict(zip(("x_m", "y_m", "z_m"), shift, strict=True))
-            errors[key] = float(values[field])
-        else:
-            true = truth.cameras[name].parameter(field)
-            errors[key] = found.cameras[name].parameter(field) - true
-    return errors
 
 
 def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:

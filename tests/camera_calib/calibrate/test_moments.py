@@ -18,12 +18,12 @@ from camera_calib.calibration import TargetView
 from camera_calib.rig import Rig, read_rig
 from tests.camera_calib.calibrate.test_many_cameras import (
     TARGET,
-    differences,
     four_cameras,
     is_whole,
     matrix_of,
     pixels_of,
 )
+from tests.camera_calib.calibration_scenes import differences
 from tests.cameras import changed
 from tests.oracles_targets import picture_light, to_srgb
 

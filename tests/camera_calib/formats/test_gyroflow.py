@@ -11,6 +11,7 @@ import numpy as np
 from camera_calib.formats.gyroflow import read_gyroflow
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
+from camera_calib.freedom import Prior, intrinsics, of_cameras
 from tests.strategies_formats import POINTS_RIG, fault_of
 
 MATRIX = np.array([[2357.0, 0.0, 2676.5], [0.0, 2356.0, 2319.5], [0.0, 0.0, 1.0]])
@@ -47,6 +48,19 @@ def test_a_profile_projects_as_opencvs_fisheye_at_any_size(tmp_path: Path) -> No
         assert (camera.width_px * scale, camera.height_px * scale) == (5312, 4648)
     assert rig.source.startswith("start of a calibration")
     assert "GoPro HERO11 Black Wide" in rig.source
+
+
+def test_a_profile_is_a_weak_prior(tmp_path: Path) -> None:
+    """Another copy of the camera has its own numbers: those of the profile are not held."""
+    path = tmp_path / "gopro.json"
+    path.write_text(json.dumps(PROFILE))
+    rig = read_gyroflow(path, ReadOptions(image_size=(2656, 2324)))
+    (name,) = rig.cameras
+    prior = Prior.of_rig(rig, of_cameras(rig, intrinsics("fisheye")))
+    assert prior.parameters == tuple(f"{name}.{p}" for p in intrinsics("fisheye"))
+    assert 0.01 < rig.sigmas[f"{name}.fx_px"] / rig.cameras[name].fx_px < 0.1
+    assert 0.005 < rig.sigmas[f"{name}.cx_px"] / 2656 < 0.05
+    assert rig.sigmas[f"{name}.k1"] >= 0.02
 
 
 def test_a_standard_model_is_a_pinhole(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.targets.sheet import black_rectangles
+from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, aruco_dictionary, parse_target, write_target
 
 KINDS = [
