@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from alice_survey.base.artefacts import read_json
-from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+from camera_calib.calibrate.from_pictures import calibrate_pictures
+from camera_calib.calibrate.options import CalibrateOptions
 
 pytestmark = pytest.mark.slow
 

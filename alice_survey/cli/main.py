@@ -326,7 +326,8 @@ def calibrate(
     From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
     Writes the rig with its covariance, the residuals and a report.
     """
-    from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+    from camera_calib.calibrate.from_pictures import calibrate_pictures
+    from camera_calib.calibrate.options import CalibrateOptions
 
     options = CalibrateOptions(
         left=left, right=right, pictures=pictures, cameras=tuple(camera or ()),

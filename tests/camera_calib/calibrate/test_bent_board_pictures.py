@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL
-from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+from camera_calib.calibrate.from_pictures import calibrate_pictures
+from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import read_rig

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrated, calibration_text
+from camera_calib.calibrate.by_options import calibrated
 from camera_calib.calibrate.housing import housing_lines
+from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.solve import calibrate_in_air
+from camera_calib.calibrate.text import calibration_text
 from camera_calib.calibration import TargetView
 from camera_calib.judge.judgement import judge
 from camera_calib.judge.verdicts import verdicts

@@ -11,8 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import SERIAL
-from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.moments import clock_offset, track_of, views_at_moments
+from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
 from camera_calib.rig import Rig, read_rig

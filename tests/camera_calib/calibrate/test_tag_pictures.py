@@ -18,7 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL
 from benchmarks.camera_calibration import cramer_rao
-from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
+from camera_calib.calibrate.from_pictures import calibrate_pictures
+from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.camera import Camera
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.lenses.fisheye import FisheyeLens

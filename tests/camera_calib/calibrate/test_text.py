@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from camera_calib.calibrate.from_pictures import calibration_text, port_tilt_deg
 from camera_calib.calibrate.solve import calibrate_through_ports
+from camera_calib.calibrate.text import calibration_text, port_tilt_deg
 from camera_calib.rig import Covariance, Rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import (
@@ -62,8 +62,8 @@ def test_ports_and_baseline_are_reported_in_millimetres_with_their_sigmas() -> N
     lines = calibration_text(found, TARGET, VERDICTS).splitlines()
 
     sigma_mm = 1e3 * found.rig.sigmas["left.port_distance_m"]
-    port = next(line for line in lines if line.startswith("left port: "))
-    number, _, sigma = port.removeprefix("left port: ").split()[:3]
+    port = next(line for line in lines if line.startswith("left flat port: "))
+    number, _, sigma = port.removeprefix("left flat port: ").split()[:3]
     assert float(number) == pytest.approx(21.2, abs=5 * sigma_mm)
     assert float(sigma) == pytest.approx(sigma_mm, rel=0.06)
     baseline = next(line for line in lines if line.startswith("baseline "))

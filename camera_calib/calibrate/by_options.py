@@ -1,0 +1,188 @@
+"""The calibration that options ask for: in air, under water, through which ports."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+from alice_survey.base.errors import CalibrationError
+from camera_calib.calibrate.detect_views import Detections, Size
+from camera_calib.calibrate.housing import (
+    compare_housings,
+    focal_ratios,
+    likely_port,
+)
+from camera_calib.calibrate.options import CalibrateOptions
+from camera_calib.calibrate.solve import (
+    blank_camera,
+    calibrate_in_air,
+    calibrate_in_water_alone,
+    calibrate_through_ports,
+    first_cameras,
+)
+from camera_calib.calibrate.start import same_numbering
+from camera_calib.calibration import Calibration, TargetView
+from camera_calib.camera import Camera
+from camera_calib.optics import PORTS
+from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.none import NO_PORT, NoPort
+from camera_calib.ports.values import PortValues
+from camera_calib.rig import Rig
+from camera_calib.target_shape import (
+    shape_of,
+)
+from camera_calib.targets.target import Target
+
+
+def calibrated(
+    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None
+) -> Calibration:
+    """The calibration that the settings ask for.
+
+    Args:
+        settings: of the command.
+        found: views of the target.
+        target: what they show.
+        start: a rig calibrated in air, or an earlier one.
+
+    Raises:
+        CalibrationError: the views do not determine it.
+    """
+    points, lens = target.points, settings.lens
+    start = None if start is None else matching(start, found.sizes)
+    if not settings.water:
+        bare = start_cameras(settings, found.sizes, start, NoPort.shape)
+        start = None if start is None else replace(start, cameras=bare)
+        views = _numbered(found, target, bare, lens, known=start is not None)
+        shape = shape_of(target, settings.target_shape)
+        return calibrate_in_air(views, points, found.sizes, lens, start, shape)
+    ratios: dict[str, float] = {}
+    if start is not None:
+        views = _numbered(found, target, start.cameras, lens, known=True)
+        ratios = focal_ratios(views, points, start, lens)
+    if settings.port == "auto":
+        found_by = {kind: partial(_through, settings, found, target, start, kind) for kind in PORTS}
+        calibration = compare_housings(found_by)
+    else:
+        kind = port_kind(settings, start)
+        try:
+            calibration = _through(settings, found, target, start, kind)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}{_other_housing(ratios, kind)}") from None
+    return replace(calibration, housing=replace(calibration.housing, focal_ratios=ratios))
+
+
+def _other_housing(ratios: Mapping[str, float], kind: str) -> str:
+    """What focal lengths say against a kind of port, for the end of a message."""
+    likely = {name: likely_port(ratio) for name, ratio in ratios.items()}
+    against = [
+        name
+        for name, port in likely.items()
+        if (port == FlatPort.shape) != (kind == FlatPort.shape)
+    ]
+    if not against:
+        return ""
+    name = against[0]
+    return (
+        f"; focal lengths of {name} under water are {ratios[name]:.3f} times those in air, which "
+        f"says --port {likely[name]}"
+    )
+
+
+def _numbered(
+    found: Detections, target: Target, cameras: Mapping[str, Camera], lens: str, *, known: bool
+) -> tuple[TargetView, ...]:
+    """Views whose points all cameras number alike."""
+    if not target.is_ambiguous or len(cameras) < 2:
+        return found.views
+    views, points = found.views, target.points
+    near = cameras if known else first_cameras(views, points, cameras, lens)
+    return tuple(same_numbering(near, views, points, target.symmetries))
+
+
+def _through(
+    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None, kind: str
+) -> Calibration:
+    """The calibration under water through ports of one kind."""
+    points, lens = target.points, settings.lens
+    shape = shape_of(target, settings.target_shape)
+    cameras = start_cameras(settings, found.sizes, start, kind)
+    views = _numbered(found, target, cameras, lens, known=start is not None)
+    known_to = {
+        "glass_thickness_m": _metres(settings.glass_sigma_mm),
+        "n_glass": settings.n_glass_sigma,
+        "n_water": settings.n_water_sigma,
+    }
+    sigmas = {
+        f"{name}.{parameter}": sigma
+        for name, camera in cameras.items()
+        for parameter, sigma in known_to.items()
+        if sigma is not None and parameter in camera.parameters
+    }
+    if start is None:
+        return calibrate_in_water_alone(views, points, cameras, lens, sigmas, shape)
+    known = settings.known or ("held" if start.covariance is None else "prior")
+    start = replace(start, cameras=cameras)
+    return calibrate_through_ports(views, points, start, known, lens, sigmas, shape)
+
+
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1e3
+
+
+def port_kind(settings: CalibrateOptions, start: Rig | None) -> str:
+    """The kind of port that is named, or that of the start, or a flat one."""
+    if settings.port in PORTS:
+        return str(settings.port)
+    old = NO_PORT if start is None else next(iter(start.cameras.values())).port
+    return old.shape if old.parameters else FlatPort.shape
+
+
+def start_cameras(
+    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None, kind: str
+) -> dict[str, Camera]:
+    """Cameras of the start, or blank ones, behind ports of one kind."""
+    if start is None:
+        port = _port(kind, NO_PORT, settings)
+        return {name: blank_camera(size, settings.lens, port) for name, size in sizes.items()}
+    return {
+        name: replace(camera, port=_port(kind, camera.port, settings))
+        for name, camera in start.cameras.items()
+    }
+
+
+def _port(kind: str, old: PortValues, settings: CalibrateOptions) -> PortValues:
+    """First values of a port of some kind: those of the start, or usual ones, or as named."""
+    port = old if old.shape == kind else PORTS[kind].guess()
+    given = {
+        "glass_thickness_m": _metres(settings.glass_mm),
+        "outer_radius_m": _metres(settings.dome_radius_mm),
+        "n_glass": settings.n_glass,
+        "n_water": settings.n_water,
+        "port_distance_m": _metres(settings.port_distance_mm),
+    }
+    return port.with_parameters(
+        {k: v for k, v in given.items() if v is not None and k in port.parameters}
+    )
+
+
+def matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
+    """The cameras of a start that are calibrated, if its pictures have the same size."""
+    if not set(sizes) <= set(start.cameras):
+        raise CalibrationError(
+            f"the start has cameras {', '.join(start.cameras)}; pictures are of {', '.join(sizes)}"
+        )
+    for name, size in sizes.items():
+        camera = start.cameras[name]
+        if (camera.width_px, camera.height_px) != size:
+            raise CalibrationError(
+                f"pictures of {name} have {size[0]} x {size[1]} px, the start's camera "
+                f"{camera.width_px} x {camera.height_px}"
+            )
+    names = list(sizes)
+    to_first = start.cam_from_rig[names[0]].inv()
+    return replace(
+        start,
+        cameras={name: start.cameras[name] for name in names},
+        cam_from_rig={name: start.cam_from_rig[name] * to_first for name in names},
+        body_from_rig=start.body_from_cam(names[0]),
+    )
