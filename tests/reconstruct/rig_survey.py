@@ -114,9 +114,7 @@ def bodies() -> RigidTransform:
 
 def area() -> MultiPolygon:
     """What is scored: where several moments look."""
-    return MultiPolygon(
-        [box(0.0, -0.2, STEP_M * (MOMENTS - 1), SPACING_M * (LINES - 1) + 0.2)]
-    )
+    return MultiPolygon([box(0.0, -0.2, STEP_M * (MOMENTS - 1), SPACING_M * (LINES - 1) + 0.2)])
 
 
 @lru_cache(maxsize=1)
@@ -145,9 +143,7 @@ def _take(task: tuple[Path, str, int]) -> None:
     seen = RigidTransform.from_matrix(pose.as_matrix()[None])
     radiance = render(scene(), camera, light, seen, samples=2)
     per_e = _MIDDLE_E / float(np.median(radiance.mean(axis=-1)))
-    sensor = Sensor(
-        electrons_per_radiance=(per_e, per_e, per_e), full_well_e=1e5, read_noise_e=5.0
-    )
+    sensor = Sensor(electrons_per_radiance=(per_e, per_e, per_e), full_well_e=1e5, read_noise_e=5.0)
     rng = np.random.default_rng([_SEED, moment, list(four_cameras().cameras).index(name)])
     picture = develop(expose(radiance, sensor, rng), MIDDLE_GREY / _MIDDLE_E)
     exif = Image.Exif()
@@ -160,7 +156,9 @@ def _take(task: tuple[Path, str, int]) -> None:
 def render_survey(folder: Path, executor: Executor) -> None:
     """Write `NAME/0000.png` and so on, `navigation.csv` and `rig.json` of the truth."""
     poses = bodies()
-    tasks = [(folder, name, moment) for name in four_cameras().cameras for moment in range(len(poses))]
+    tasks = [
+        (folder, name, moment) for name in four_cameras().cameras for moment in range(len(poses))
+    ]
     list(executor.map(_take, tasks, label="pictures"))
     write_rig(folder / "rig.json", four_cameras())
     rng = np.random.default_rng(_SEED + 1)
