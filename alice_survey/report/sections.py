@@ -278,9 +278,8 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
     scale = doming.scale
     if scale is not None:
-        rows.append(
-            ("scale by what each station sees alone", parts_with_sigma(scale.mean - 1.0, scale.mean_sigma))
-        )  # fmt: skip
+        own = parts_with_sigma(scale.mean - 1.0, scale.mean_sigma)
+        rows.append(("scale by what each station sees alone", own))
     place = found.georeference
     if place is not None:
         residuals = (place.rms_north_m, place.rms_east_m, place.rms_depth_m)

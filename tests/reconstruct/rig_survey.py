@@ -58,7 +58,7 @@ def four_cameras() -> Rig:
         "wide": Camera(
             width_px=640, height_px=480,
             lens=OpenCVLens(fx_px=500.0, fy_px=501.0, cx_px=324.0, cy_px=236.0, k1=-0.06, k2=0.03),
-            port=FlatPort(port_distance_m=0.02, glass_thickness_m=0.01, normal=(0.01, 0.0, 0.99995)),
+            port=FlatPort(port_distance_m=0.02, glass_thickness_m=0.01, normal=(1e-2, 0, 0.99995)),
         ),
         "tele": Camera(
             width_px=480, height_px=600,
@@ -103,7 +103,7 @@ def bodies() -> RigidTransform:
         for step in range(MOMENTS):
             north = STEP_M * (step if line % 2 == 0 else MOMENTS - 1 - step)
             place = np.array([north, SPACING_M * line, DEPTH_M - ALTITUDE_M])
-            turn = np.deg2rad(rng.normal(0, 1.5, 3)) + [0, 0, np.pi * (line % 2)]
+            turn = np.deg2rad(rng.normal(0, 1.5, 3)) + np.array([0, 0, np.pi * (line % 2)])
             poses.append(
                 RigidTransform.from_components(
                     place + rng.normal(0, 0.03, 3), rotation_from_attitude(*turn)
@@ -244,5 +244,5 @@ if __name__ == "__main__":
     work, chosen = Path(sys.argv[1]), sys.argv[2:] or list(four_cameras().cameras)
     render_survey(work / "pictures", local_executor())
     made = work / "-".join(chosen)
-    print(reconstruct(work / "pictures", made, chosen))
-    print(score(made))
+    sys.stdout.write(reconstruct(work / "pictures", made, chosen))
+    sys.stdout.write(f"{score(made)}\n")

@@ -57,8 +57,8 @@ def make_scene(
     Relief reaches `relief_m` above and below the mean; pixels are `scale` times those of the
     camera, which noise in pixels refers to.
 
-    `port` stands in for the flat one of the design, `rig` for all of it. Navigation is the truth plus a constant bias
-    and 0.1 degrees of attitude noise.
+    `port` stands in for the flat one of the design, `rig` for all of it. Navigation is the truth
+    plus a constant bias and 0.1 degrees of attitude noise.
     """
     rng = np.random.default_rng(seed)
     camera = CameraConfig(port_distance_m=port_distance_m, port_tilt_deg=port_tilt_deg)
