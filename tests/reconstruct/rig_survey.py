@@ -95,11 +95,11 @@ def four_cameras() -> Rig:
     )
 
 
-def bodies() -> RigidTransform:
+def bodies(lines: int = LINES) -> RigidTransform:
     """`ned_from_body` of all moments: lines to and fro, with a swaying vehicle."""
     rng = np.random.default_rng(_SEED)
     poses = []
-    for line in range(LINES):
+    for line in range(lines):
         for step in range(MOMENTS):
             north = STEP_M * (step if line % 2 == 0 else MOMENTS - 1 - step)
             place = np.array([north, SPACING_M * line, DEPTH_M - ALTITUDE_M])
@@ -112,9 +112,9 @@ def bodies() -> RigidTransform:
     return RigidTransform.concatenate(poses)
 
 
-def area() -> MultiPolygon:
+def area(lines: int = LINES) -> MultiPolygon:
     """What is scored: where several moments look."""
-    return MultiPolygon([box(0.0, -0.2, STEP_M * (MOMENTS - 1), SPACING_M * (LINES - 1) + 0.2)])
+    return MultiPolygon([box(0.0, -0.2, STEP_M * (MOMENTS - 1), SPACING_M * (lines - 1) + 0.2)])
 
 
 @lru_cache(maxsize=1)
@@ -153,9 +153,9 @@ def _take(task: tuple[Path, str, int]) -> None:
     Image.fromarray(picture[..., ::-1]).save(path, exif=exif)
 
 
-def render_survey(folder: Path, executor: Executor) -> None:
+def render_survey(folder: Path, executor: Executor, lines: int = LINES) -> None:
     """Write `NAME/0000.png` and so on, `navigation.csv` and `rig.json` of the truth."""
-    poses = bodies()
+    poses = bodies(lines)
     tasks = [
         (folder, name, moment) for name in four_cameras().cameras for moment in range(len(poses))
     ]
@@ -192,17 +192,22 @@ class RigScore:
     """Side of a pixel on the sea floor."""
 
     def __str__(self) -> str:
-        surface, mosaic = self.surface.to_json(), self.mosaic.to_json()
+        cameras, surface, mosaic = self.cameras, self.surface.to_json(), self.mosaic.to_json()
+        doming, sigmas = surface["doming"], surface["error_over_sigma"]
         return (
-            f"{self.cameras.registered} of {self.cameras.total} pictures; pixel "
-            f"{1e3 * self.pixel_m:.2f} mm; cameras {self.cameras.rms_m / self.pixel_m:.3f} px rms, "
-            f"scale {1e6 * self.cameras.scale_error:+.0f} ppm; surface {surface}; mosaic {mosaic}"
+            f"{cameras.registered} of {cameras.total} pictures, {1e3 * self.pixel_m:.2f} mm a pixel"
+            f"; cameras {1e3 * cameras.rms_m:.3f} mm rms ({cameras.rms_m / self.pixel_m:.3f} px), "
+            f"scale {1e6 * cameras.scale_error:+.0f} ppm; surface "
+            f"{surface['distance_rms_mm']:.2f} mm rms "
+            f"({1e-3 * surface['distance_rms_mm'] / self.pixel_m:.2f} px), complete to "
+            f"{surface['completeness']:.1%}, domed by {doming['dome_mm']} mm, error over sigma "
+            f"{sigmas['rms']}; mosaic {mosaic['position_rms_mm']:.2f} mm rms"
         )
 
 
-def score(workspace: Path) -> RigScore:
+def score(workspace: Path, lines: int = LINES) -> RigScore:
     """Score a workspace whose pictures are of this survey."""
-    rig, poses = four_cameras(), bodies()
+    rig, poses = four_cameras(), bodies(lines)
     records = read_manifest(workspace / "images" / "manifest.csv")
     truth = {r.image: poses[r.station] * rig.body_from_cam(r.camera) for r in records}
     total = RegistrationRecord.read(workspace / "sparse" / "registration.json").total
@@ -215,10 +220,10 @@ def score(workspace: Path) -> RigScore:
     )  # fmt: skip
     moved = cameras.truth_from_world
     dense = workspace / "dense"
-    surface = score_surface(elevation_in(dense), area(), terrain, moved, pixel_m, counter)
+    surface = score_surface(elevation_in(dense), area(lines), terrain, moved, pixel_m, counter)
     mosaic = score_mosaic(
-        workspace / "mosaic" / "mosaic.tif", dense / "dem.tif", area(), terrain, scene().texture,
-        moved,
+        workspace / "mosaic" / "mosaic.tif", dense / "dem.tif", area(lines), terrain,
+        scene().texture, moved,
     )  # fmt: skip
     return RigScore(cameras=cameras, surface=surface, mosaic=mosaic, pixel_m=pixel_m)
 
@@ -232,17 +237,17 @@ def command(*arguments: str | Path) -> str:
     return done.stdout + done.stderr
 
 
-def reconstruct(pictures: Path, workspace: Path, names: Sequence[str]) -> str:
-    """Import the pictures of some cameras and reconstruct them; what the commands printed."""
+def import_survey(pictures: Path, workspace: Path, names: Sequence[str]) -> str:
+    """Import the pictures of some cameras; what the command printed."""
     given = [part for name in names for part in ("--camera", f"{name}={pictures / name}")]
     files = ("--rig", pictures / "rig.json", "--navigation", pictures / "navigation.csv")
-    said = command("import-images", *given, *files, "-w", workspace)
-    return said + command("reconstruct", "-w", workspace)
+    return command("import-images", *given, *files, "-w", workspace)
 
 
 if __name__ == "__main__":
     work, chosen = Path(sys.argv[1]), sys.argv[2:] or list(four_cameras().cameras)
     render_survey(work / "pictures", local_executor())
     made = work / "-".join(chosen)
-    sys.stdout.write(reconstruct(work / "pictures", made, chosen))
+    sys.stdout.write(import_survey(work / "pictures", made, chosen))
+    sys.stdout.write(command("reconstruct", "-w", made))
     sys.stdout.write(f"{score(made)}\n")
