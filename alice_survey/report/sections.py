@@ -363,34 +363,33 @@ def _camera(figures: Figures) -> Section:
             text.append("The cameras calibrated themselves from the survey's pictures.")
         elif calibrated is None and refined is None:
             text.append(f"The rig is as imported with the pictures: {rig.source}.")
-        tables.append(_cameras(cameras, rig))
+        tables += _cameras(cameras, rig)
     return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
 
 
-def _cameras(cameras: CamerasRecord, rig: Rig | None) -> Table:
-    """Every camera with its lens and housing and, where the rig is known, its place on it."""
-    rows = []
+def _cameras(cameras: CamerasRecord, rig: Rig | None) -> list[Table]:
+    """Lens and housing of every camera and, where the rig is known, its place on it."""
+    lenses, housings = [], []
     for name, warp in cameras.cameras.items():
         one = camera_from_json(warp["camera"])
-        lens = {key: one.parameter(key) for key in one.lens.parameters}
-        row = [
-            name,
-            f"{one.width_px} x {one.height_px}",
-            f"{one.lens.model}: "
-            + ", ".join(f"{key} {value:.6g}" for key, value in lens.items() if value),
-            one.port.words,
-        ]
+        values = {key: one.parameter(key) for key in one.lens.parameters}
+        terms = ", ".join(f"{key} {value:.6g}" for key, value in values.items() if value)
+        lenses.append((name, f"{one.width_px} x {one.height_px}", one.lens.model, terms))
+        place: list[str] = []
         if rig is not None:
             first = rig.cam_from_rig[next(iter(cameras.cameras))]
             pose = first * rig.cam_from_rig[name].inv()
             tilt = np.rad2deg(np.arccos(np.clip(pose.rotation.as_matrix()[2, 2], -1.0, 1.0)))
-            place = ", ".join(f"{1e3 * value:.1f}" for value in pose.translation)
-            row.append(f"{place} mm; {tilt:.1f} deg")
-        rows.append(row)
-    header = ["camera", "pixels", "lens", "housing"]
+            shift = ", ".join(f"{1e3 * value:z.1f}" for value in pose.translation)
+            place = [f"{shift} mm", f"{tilt:.1f} deg"]
+        housings.append((name, one.port.words, *place))
+    tables = [
+        Table(title="Cameras", header=("camera", "pixels", "lens", "parameters"), rows=lenses)
+    ]
     if rig is not None:
-        header.append("right, down, forward of the first; between their axes")
-    return Table(title="Cameras", header=header, rows=rows)
+        header = ("camera", "housing", "right, down, forward", "off the first's axis")
+        tables.append(Table(title="Housings and places", header=header, rows=housings))
+    return tables
 
 
 def _sigma(value: float | None) -> str:

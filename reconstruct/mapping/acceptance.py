@@ -325,13 +325,14 @@ def _station_scale(
     """
     numbers = sorted(d.id for d in model.frames[frame].image_ids if model.images[d.id].has_pose)
     of = {n: seen.of(seen.row(n)) for n in numbers}
-    pairs = [
-        (pair, np.intersect1d(*(seen.point[of[n]] for n in pair), return_indices=True))
-        for pair in combinations(numbers, 2)
-    ]
-    pair, (both, *at) = max(pairs, key=lambda found: len(found[1][0]), default=((), ([],)))
-    if len(both) < _LEAST_STEREO_POINTS:
+    shared = {
+        (a, b): np.intersect1d(seen.point[of[a]], seen.point[of[b]], return_indices=True)
+        for a, b in combinations(numbers, 2)
+    }
+    pair = max(shared, key=lambda found: len(shared[found][0]), default=None)
+    if pair is None or len(shared[pair][0]) < _LEAST_STEREO_POINTS:
         return None
+    both, *at = shared[pair]
     first, second = (model.images[n] for n in pair)
     theirs = [of[n] for n in pair]
     poses = [as_transform(i.cam_from_world()) for i in (first, second)]
