@@ -44,7 +44,7 @@ from reconstruct.placing.track import read_track_poses
 
 DATUM = Datum(32.8236, 34.9553)
 DEPTH_M, ALTITUDE_M = 6.0, 1.6
-LINES, MOMENTS, SPACING_M, STEP_M = 3, 5, 0.7, 0.45
+LINES, MOMENTS, SPACING_M, STEP_M = 4, 4, 0.7, 0.45
 _START = datetime(2024, 7, 1, 12)
 _SEED = 21
 _MIDDLE_E = 8000.0
