@@ -572,7 +572,7 @@ STAGES: tuple[StageSpec, ...] = (
         simulated=True,
         products={"manifest.csv": "the pictures, with time and navigation"},
         picture="left/000000.png",
-        reported=("manifest.csv", "rig.json"),
+        reported=("manifest.csv",),
     ),
     StageSpec(
         name="calibrate",
@@ -591,7 +591,7 @@ STAGES: tuple[StageSpec, ...] = (
             "rig.json": "cameras, ports and baseline with their covariance",
             "report.html": "how good the calibration is",
         },
-        reported=("report.json", "rig.json"),
+        reported=("report.json",),
     ),
     StageSpec(
         name="mapping",
@@ -615,7 +615,7 @@ STAGES: tuple[StageSpec, ...] = (
         inputs=_mapping_inputs,
         summary=_mapping_summary,
         resumes=True,
-        reported=("mapping.json", "port.json", "rig.json"),
+        reported=("mapping.json", "port.json"),
     ),
     StageSpec(
         name="placing",

@@ -21,7 +21,7 @@ NAMES = ("wide", "tele", "bow", "side")
 
 
 def check(found: RigScore, pictures: int) -> None:
-    """Errors in ground pixels; a camera that is mounted 0.1 deg off puts them off by a whole one."""
+    """Errors in ground pixels; a camera mounted 0.1 deg off puts them off by a whole one."""
     assert found.cameras.registered == found.cameras.total == pictures
     assert 0.005 < found.cameras.rms_m / found.pixel_m < 0.1
     assert abs(found.cameras.scale_error) < 5e-4
