@@ -5,7 +5,15 @@ from typing import Annotated
 
 import typer
 
-from alice_survey.cli.options import CONTEXT, AsJson, Threads, examples, executor_of, print_result
+from alice_survey.cli.options import (
+    CONTEXT,
+    AsJson,
+    RigCamera,
+    Threads,
+    examples,
+    executor_of,
+    print_result,
+)
 
 app = typer.Typer(
     help="Look at, convert and judge camera models behind flat ports.",
@@ -17,7 +25,6 @@ app = typer.Typer(
 Temperature = Annotated[float, typer.Option(help="Temperature of the water, C.")]
 Salinity = Annotated[float, typer.Option(help="Salinity of the water, psu; 0 is fresh.")]
 Depth = Annotated[float, typer.Option(help="Depth below the surface, m.")]
-RigCamera = Annotated[str | None, typer.Option(help="Camera of the rig; its first if not given.")]
 
 
 @app.command(

@@ -8,6 +8,7 @@ from typing import Any
 from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import CameraConfig, SurveyConfig, load_config, parse_config
 from alice_survey.base.errors import ConfigError, warn
+from camera_calib.formats.rigs import led_by
 from camera_calib.fov.angles import angle_table
 from camera_calib.fov.paper import paper_settings, validate_paper
 from camera_calib.fov.table import FovChoices, FovRow, blur_table, fov_table, rig_fov_table
@@ -47,6 +48,7 @@ class FovOptions:
     exposure_ms: Sequence[float] = ()
     survey: Path | None = None
     rig: Path | None = None
+    rig_camera: str | None = None
     n_water: float | None = None
     temperature_c: float | None = None
     salinity_psu: float | None = None
@@ -160,6 +162,8 @@ def _settings(options: FovOptions) -> SurveyConfig:
 
 def _rig(options: FovOptions, n_water: float) -> Rig | None:
     if options.rig is None:
+        if options.rig_camera is not None:
+            raise ConfigError("--camera names a camera of a rig: give --rig too")
         return None
     designed = {
         "--lens": options.lens_mm or None,
@@ -171,6 +175,11 @@ def _rig(options: FovOptions, n_water: float) -> Rig | None:
     if wrong:
         raise ConfigError(f"{options.rig} has lenses and ports of its own: leave out {wrong[0]}")
     rig = read_rig(options.rig)
+    if options.rig_camera is not None:
+        rig = led_by(rig, options.rig_camera)
+    elif len(rig.cameras) > 2:
+        first, *others = rig.cameras
+        warn(f"of the rig's cameras, this is {first}; --camera shows {', '.join(others)}")
     other_water = options.n_water is not None or options.temperature_c is not None
     return rig.in_water(n_water) if other_water else rig
 

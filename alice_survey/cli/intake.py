@@ -23,6 +23,7 @@ app = typer.Typer()
     epilog=examples(
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
+        "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
         "import-images photos --navigation dive.csv --vertical-datum NN2000 -w reef",
         "import-images --video GX010001.MP4 --every 0.5 -w reef",
@@ -55,9 +56,14 @@ def import_images(
     Pictures of one camera or of a rig of up to eight, or a video, with a navigation log, GPS from
     EXIF, or nothing at all.
     """
+    from alice_survey.base.errors import ImageError
     from camera_calib.picture_files import places_of_cameras
     from reconstruct.pictures.importing import import_images as work
 
+    if (left is None) != (right is None):
+        raise ImageError(
+            "--left and --right go together; of one camera give the folder, or --camera NAME=FOLDER"
+        )
     pair = {name: side for name, side in (("left", left), ("right", right)) if side is not None}
     named = {name: Path(place) for name, place in places_of_cameras(camera or ()).items()}
     found = work(

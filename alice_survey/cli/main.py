@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     CONTEXT,
     WORK,
     AsJson,
+    RigCamera,
     Scale,
     SurveyFile,
     Threads,
@@ -107,6 +108,7 @@ def fov(
     ] = None,
     n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="Index of the port.")] = None,
     rig: Annotated[Path | None, typer.Option(help="A calibrated rig.json instead.")] = None,
+    camera: RigCamera = None,
     f_number: Annotated[float | None, typer.Option(help="Aperture, 4 for F/4.")] = None,
     coc: Annotated[float, typer.Option(help="Blur circle that is sharp, px.")] = 1.0,
     focus_air: Annotated[float | None, typer.Option(help="Focus set in air, m.")] = None,
@@ -140,7 +142,7 @@ def fov(
     output = Output(markdown=markdown, csv=csv, plot=plot)
     options = FovOptions(
         lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
-        exposure_ms=exposure or (), survey=survey, rig=rig, n_water=n_water,
+        exposure_ms=exposure or (), survey=survey, rig=rig, rig_camera=camera, n_water=n_water,
         temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
         glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, blur_px=blur,
         choices=FovChoices(coc_px=coc, focus_air_m=focus_air, match_sigma_px=match_sigma),

@@ -32,6 +32,7 @@ Scale = Annotated[
     int | None,
     typer.Option(min=1, max=16, help="Divide the resolution of rendered pictures by this."),
 ]
+RigCamera = Annotated[str | None, typer.Option(help="Camera of the rig; its first if not given.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 Quiet = Annotated[
     bool, typer.Option("-q", "--quiet", help="Show warnings, errors and the result alone.")

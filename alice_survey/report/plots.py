@@ -63,10 +63,23 @@ def pictures_used(figures: Figures) -> Figure | None:
     points = np.array([number(row, "points") for row in rows])
     error = np.array([number(row, "reprojection_px") for row in rows])
 
+    station = np.array([number(row, "station") for row in rows])
+    camera = np.array([row["camera"] for row in rows])
+    names = list(dict.fromkeys(camera.tolist()))
+    inks = [INKS[i % len(INKS)] for i in range(len(names))]
+
     def paint(axes: Sequence[Any]) -> None:
-        axes[0].plot(points, ".", ms=4, color=INKS[0])
-        axes[0].set(xlabel="picture", ylabel="points of the model", ylim=(0, None))
-        axes[1].hist(error, bins=30, color=INKS[0], edgecolor="white", linewidth=0.4)
+        for i, (name, ink) in enumerate(zip(names, inks, strict=True)):
+            own = camera == name
+            mark = MARKS[i % len(MARKS)]
+            axes[0].plot(station[own], points[own], mark, ms=3, color=ink, label=name)
+        axes[0].set(xlabel="station", ylabel="points of the model", ylim=(0, None))
+        if len(names) > 1:
+            axes[0].legend()
+        axes[1].hist(
+            [error[camera == name] for name in names], bins=30, color=inks, stacked=True,
+            edgecolor="white", linewidth=0.4,
+        )  # fmt: skip
         axes[1].set(xlabel="mean reprojection error, px", ylabel="pictures")
 
     return drawn(

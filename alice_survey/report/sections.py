@@ -38,7 +38,8 @@ from alice_survey.kit.words import (
 from alice_survey.report import plots
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, known_column
-from camera_calib.freedom import intrinsics
+from camera_calib.camera import camera_from_json
+from camera_calib.rig import Rig, read_rig
 from missions.values.plan_file import Plan
 
 
@@ -277,9 +278,8 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
     scale = doming.scale
     if scale is not None:
-        rows.append(
-            ("scale of the stereo pairs", parts_with_sigma(scale.mean - 1.0, scale.mean_sigma))
-        )  # fmt: skip
+        own = parts_with_sigma(scale.mean - 1.0, scale.mean_sigma)
+        rows.append(("scale by what each station sees alone", own))
     place = found.georeference
     if place is not None:
         residuals = (place.rms_north_m, place.rms_east_m, place.rms_depth_m)
@@ -356,18 +356,40 @@ def _camera(figures: Figures) -> Section:
         drawn.append(plots.correlations(refined.parameters, np.array(refined.correlation)))
     elif own is not None:
         drawn.append(plots.correlations(own.parameters, np.array(own.correlation)))
-    if cameras is not None and calibrated is None and refined is None:
-        text.append("The cameras calibrated themselves from the survey's pictures.")
-        rows = [
-            (name, ", ".join(
-                f"{key} {warp['camera'][key]:.6g}"
-                for key in intrinsics("full")
-                if warp["camera"].get(key)
-            ))
-            for name, warp in cameras.cameras.items()
-        ]  # fmt: skip
-        tables.append(Table(title="Cameras", header=("camera", "parameters"), rows=rows))
+    if cameras is not None:
+        rig_file = held.file("mapping/rig.json") or stages.rig_file(held.workspace)
+        rig = None if rig_file is None else read_rig(rig_file)
+        if rig is None:
+            text.append("The cameras calibrated themselves from the survey's pictures.")
+        elif calibrated is None and refined is None:
+            text.append(f"The rig is as imported with the pictures: {rig.source}.")
+        tables += _cameras(cameras, rig)
     return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
+
+
+def _cameras(cameras: CamerasRecord, rig: Rig | None) -> list[Table]:
+    """Lens and housing of every camera and, where the rig is known, its place on it."""
+    lenses, housings = [], []
+    for name, warp in cameras.cameras.items():
+        one = camera_from_json(warp["camera"])
+        values = {key: one.parameter(key) for key in one.lens.parameters}
+        terms = ", ".join(f"{key} {value:.6g}" for key, value in values.items() if value)
+        lenses.append((name, f"{one.width_px} x {one.height_px}", one.lens.model, terms))
+        place: list[str] = []
+        if rig is not None:
+            first = rig.cam_from_rig[next(iter(cameras.cameras))]
+            pose = first * rig.cam_from_rig[name].inv()
+            tilt = np.rad2deg(np.arccos(np.clip(pose.rotation.as_matrix()[2, 2], -1.0, 1.0)))
+            shift = ", ".join(f"{1e3 * value:z.1f}" for value in pose.translation)
+            place = [f"{shift} mm", f"{tilt:.1f} deg"]
+        housings.append((name, one.port.words, *place))
+    tables = [
+        Table(title="Cameras", header=("camera", "pixels", "lens", "parameters"), rows=lenses)
+    ]
+    if rig is not None:
+        header = ("camera", "housing", "right, down, forward", "off the first's axis")
+        tables.append(Table(title="Housings and places", header=header, rows=housings))
+    return tables
 
 
 def _sigma(value: float | None) -> str:

@@ -143,6 +143,19 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
     )
 
 
+def led_by(rig: Rig, camera: str) -> Rig:
+    """The same rig with another first camera, which is its reference; without covariance.
+
+    Raises:
+        CalibrationError: there is no such camera.
+    """
+    if camera not in rig.cameras:
+        raise CalibrationError(f"no camera {camera!r}; there are {', '.join(rig.cameras)}")
+    names = [camera, *(name for name in rig.cameras if name != camera)]
+    cameras = {name: rig.cameras[name] for name in names}
+    return referenced(replace(rig, cameras=cameras, covariance=None))
+
+
 def referenced(rig: Rig) -> Rig:
     """The same rig relative to its first camera, whose pose becomes the identity."""
     rig_from_first = rig.cam_from_rig[rig.reference].inv()

@@ -96,8 +96,9 @@ def _footprints(rows: Sequence[FovRow]) -> TextTable:
     notes = [f"n_water {first.n_water:g}, {first.port}; altitude of the port's outer glass"]
     if math.isfinite(first.baseline_m):
         notes.append(
-            f"stereo: baseline {first.baseline_m * 1e3:.1f} mm, share of the left footprint that "
-            f"both see; depth sigma for {first.match_sigma_px:g} px of disparity noise"
+            f"stereo: with the rig's next camera, {first.baseline_m * 1e3:.1f} mm away; share of "
+            f"the footprint that both see; depth sigma for {first.match_sigma_px:g} px of "
+            "disparity noise"
         )
     notes.append(
         "footprint: across the middle of the frame; surely: the rectangle between its corners, "

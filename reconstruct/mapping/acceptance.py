@@ -13,6 +13,7 @@ every station.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import pycolmap
@@ -219,7 +220,7 @@ def scale_trend(
         down: (3,) unit vector in the model's frame.
 
     Returns:
-        None where too few stations have points that both their cameras show.
+        None where too few stations have points that two of their cameras show.
     """
     local = [
         (model.images[reference[frame]].projection_center(), *given)
@@ -318,15 +319,22 @@ def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Arr
 def _station_scale(
     model: pycolmap.Reconstruction, seen: Observed, frame: int
 ) -> tuple[float, float] | None:
-    """Depths of a frame's points over their depths by its first two cameras alone, and sigma."""
-    numbers = sorted(d.id for d in model.frames[frame].image_ids if model.images[d.id].has_pose)[:2]
-    if len(numbers) < 2:
+    """Depths of a frame's points over their depths by two of its cameras alone, and sigma.
+
+    The two are those that share most points.
+    """
+    numbers = sorted(d.id for d in model.frames[frame].image_ids if model.images[d.id].has_pose)
+    of = {n: seen.of(seen.row(n)) for n in numbers}
+    shared = {
+        (a, b): np.intersect1d(seen.point[of[a]], seen.point[of[b]], return_indices=True)
+        for a, b in combinations(numbers, 2)
+    }
+    pair = max(shared, key=lambda found: len(shared[found][0]), default=None)
+    if pair is None or len(shared[pair][0]) < _LEAST_STEREO_POINTS:
         return None
-    first, second = (model.images[n] for n in numbers)
-    theirs = [seen.of(seen.row(n)) for n in numbers]
-    both, *at = np.intersect1d(seen.point[theirs[0]], seen.point[theirs[1]], return_indices=True)
-    if len(both) < _LEAST_STEREO_POINTS:
-        return None
+    both, *at = shared[pair]
+    first, second = (model.images[n] for n in pair)
+    theirs = [of[n] for n in pair]
     poses = [as_transform(i.cam_from_world()) for i in (first, second)]
     first_from_second = poses[0] * poses[1].inv()
     starts, rays = [], []

@@ -137,7 +137,7 @@ def _map_rig(
     if not faults or method == "global":
         for fault in faults:
             warn(f"global mapping {fault}")
-        return found, ["global mapping of stereo stations", *(f"it {f}" for f in faults)]
+        return found, ["global mapping of stations", *(f"it {f}" for f in faults)]
     again = run_mapper(seen, cam_from_rig, folder, seed, free="nothing")
     ranks = [
         (not (models and unsound(models[0])), models[0].num_reg_images() if models else 0)

@@ -1,4 +1,4 @@
-"""Mapping without a calibration: cameras, and the rig of two, are found from the pictures.
+"""Mapping without a calibration: cameras and their rig are found from the pictures.
 
 Pictures that look straight down on a flat floor hardly separate focal length from distance, so
 nothing is freed that they do not determine: the mapper gets a simple lens, a focal length that EXIF
@@ -35,7 +35,7 @@ from reconstruct.views.model_files import as_transform, colmap_pinhole
 SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""
 _LEAST_STATIONS = 3
-"""Stations with both cameras from which a rig is taken."""
+"""Stations with a camera and the first one from which its place on the rig is taken."""
 _CONTRADICTION = 1.05
 """EXIF's focal length goes when freeing it lowers the mean reprojection error by this factor."""
 _LARGEST_ASPECT, _LARGEST_TANGENTIAL = 0.03, 0.03
@@ -47,11 +47,11 @@ _LEAST_FULL = 8
 def map_self_calibrated(
     seen: Observations, exif_focal: Collection[str], folder: Path, seed: int
 ) -> Mapped:
-    """Map with cameras calibrated from the pictures; two cameras become one rigid rig.
+    """Map with cameras calibrated from the pictures; several cameras become one rigid rig.
 
-    Two cameras are first mapped freely. The mean of their relative poses is the rig of a second
-    mapping that holds it constant, after which one adjustment refines that one rig with all else.
-    The baseline is then the model's unit of length.
+    They are first mapped freely. The means of their poses relative to the first are the rig of a
+    second mapping that holds it constant, after which one adjustment refines that one rig with all
+    else. The distance of the first two is then the model's unit of length.
 
     Args:
         seen: cameras to start from (`SIMPLE`), keypoints as found, matches.
@@ -68,10 +68,14 @@ def map_self_calibrated(
     model = largest(found, seen.images)
     notes: list[str] = []
     cam_from_rig = None
-    if len(seen.cameras) == 2:
+    if len(seen.cameras) > 1:
         cam_from_rig = rig_from_model(model, seen.images, list(seen.cameras))
         if cam_from_rig is None:
-            notes.append("fewer than 3 stations have both cameras: mapped without a rig")
+            first, *others = seen.cameras
+            notes.append(
+                f"fewer than {_LEAST_STATIONS} stations have both {first} and one of "
+                f"{', '.join(others)}: mapped without a rig"
+            )
             warn(notes[0])
     if cam_from_rig is not None:
         cameras = {
@@ -93,9 +97,7 @@ def map_self_calibrated(
     if cam_from_rig is not None:
         factor, baseline = 1.0 / model_baseline(model), 1.0
         scale_model(model, factor)
-        notes.append(
-            "the stereo rig calibrated itself; unless scaled, its baseline is the unit of length"
-        )
+        notes.append("the rig calibrated itself; unless scaled, its baseline is the unit of length")
     warps = {
         name: self_calibrated_warp(model.cameras[number])
         for number, name in enumerate(seen.cameras, 1)
@@ -135,28 +137,35 @@ def self_calibrated_warp(camera: pycolmap.Camera) -> PinholeWarp:
 def rig_from_model(
     model: pycolmap.Reconstruction, images: Sequence[ImageRecord], cameras: Sequence[str]
 ) -> dict[str, RigidTransform] | None:
-    """The mean pose of the second camera in the first's frame, over the stations that have both.
+    """The mean pose of every camera in the first's frame, over the stations that have both.
 
     Returns:
-        `cam_from_rig` of both, or None where fewer than 3 stations have both.
+        `cam_from_rig` of all, or None where fewer than 3 stations have one of them and the first.
     """
     poses: dict[int, dict[str, RigidTransform]] = {}
     for number, record in enumerate(images, 1):
         if number in model.images and model.images[number].has_pose:
             pose = as_transform(model.images[number].cam_from_world())
             poses.setdefault(record.station, {})[record.camera] = pose
-    first, second = cameras
-    relative = [p[second] * p[first].inv() for _, p in sorted(poses.items()) if len(p) == 2]
-    if len(relative) < _LEAST_STATIONS:
-        return None
-    turns = Rotation.concatenate([r.rotation for r in relative])
-    shifts = np.stack([r.translation for r in relative])
-    for _ in range(2):  # a station that went astray must not turn the rig
+    first, *others = cameras
+    rig = {first: RigidTransform.identity()}
+    for name in others:
+        stations = [p for _, p in sorted(poses.items()) if first in p and name in p]
+        if len(stations) < _LEAST_STATIONS:
+            return None
+        rig[name] = _mean_pose([p[name] * p[first].inv() for p in stations])
+    return rig
+
+
+def _mean_pose(poses: Sequence[RigidTransform]) -> RigidTransform:
+    """The middle of poses of which some may be astray."""
+    turns = Rotation.concatenate([pose.rotation for pose in poses])
+    shifts = np.stack([pose.translation for pose in poses])
+    for _ in range(2):
         away = (turns * turns.mean().inv()).magnitude()
         keep = np.flatnonzero(away <= 3.0 * np.median(away) + 1e-9)
         turns, shifts = turns[keep], shifts[keep]
-    mean = RigidTransform.from_components(np.median(shifts, axis=0), turns.mean())
-    return {first: RigidTransform.identity(), second: mean}
+    return RigidTransform.from_components(np.median(shifts, axis=0), turns.mean())
 
 
 @progress.step("calibrate from the pictures")

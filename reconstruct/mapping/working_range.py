@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from reconstruct.matching.matches import match_descriptors
 from reconstruct.views.range_shift import range_shift
 
 _STATIONS = 24
-"""Stations looked at, spread evenly."""
+"""Stations looked at, spread evenly; fewer where cameras make more pairs than there are cameras."""
 _FEATURES = 3000
 _LEAST_POINTS = 50
 _LARGEST_GAP_PX = 2.0
@@ -132,7 +133,7 @@ def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: WorkingDistances)
 
 
 def stereo_depths(task: _StereoTask) -> Array:
-    """Depths of the matches of one stereo pair along the first camera's axis, exactly refracted."""
+    """Depths of the matches of two pictures along the axis of either camera, exactly refracted."""
     a, b = load_features(task.first), load_features(task.second)
     matches = match_descriptors(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], task.ratio)
     first, second = task.cameras
@@ -141,11 +142,12 @@ def stereo_depths(task: _StereoTask) -> Array:
     first_from_second = task.second_from_first.inv()
     start_b, ray_b = first_from_second.apply(start_b), first_from_second.rotation.apply(ray_b)
     along_a, gap = ray_passes(start_a, ray_a, start_b, ray_b)
-    depth: Array = start_a[:, 2] + along_a * ray_a[:, 2]
+    points = start_a + along_a[:, None] * ray_a
+    depths = np.stack([points[:, 2], task.second_from_first.apply(points)[:, 2]])
     focal = first.focal_in_water_px
     with np.errstate(invalid="ignore"):
-        good = (along_a > 0) & (gap * focal < _LARGEST_GAP_PX * depth)
-    return depth[good]
+        good = (along_a > 0) & (gap * focal < _LARGEST_GAP_PX * depths[0]) & (depths[1] > 0)
+    return depths[:, good].ravel()
 
 
 def ray_passes(start_a: Array, ray_a: Array, start_b: Array, ray_b: Array) -> tuple[Array, Array]:
@@ -178,23 +180,19 @@ def _stereo_tasks(
     stations: dict[int, dict[str, int]] = {}
     for i, record in enumerate(records):
         stations.setdefault(record.station, {})[record.camera] = i
-    names = list(rig.cameras)[:2]
-    pairs = [
-        [members[name] for name in names]
-        for _, members in sorted(stations.items())
-        if len(names) == 2 and all(name in members for name in names)
-    ]
-    if not pairs:
-        return []
-    step = max(1, len(pairs) // _STATIONS)
+    together = [list(combinations(members.items(), 2)) for _, members in sorted(stations.items())]
+    together = [pairs for pairs in together if pairs]
+    cameras = max(map(len, stations.values()), default=0)
+    step = max(1, sum(map(len, together)) // (_STATIONS * max(1, cameras - 1)))
     poses: Mapping[str, RigidTransform] = rig.cam_from_rig
     return [
         _StereoTask(
             first=features[i],
             second=features[j],
-            cameras=(rig.cameras[names[0]], rig.cameras[names[1]]),
-            second_from_first=poses[names[1]] * poses[names[0]].inv(),
+            cameras=(rig.cameras[first], rig.cameras[second]),
+            second_from_first=poses[second] * poses[first].inv(),
             ratio=ratio,
         )
-        for i, j in pairs[::step]
+        for pairs in together[::step]
+        for (first, i), (second, j) in pairs
     ]

@@ -62,11 +62,13 @@ def choose_pairs(
 
     With a rig, positions, attitudes and altitudes: pairs of one camera whose footprints overlap
     (those across the cameras add nothing that the pairs within the stations do not link already:
-    on a simulated survey half the pairs gave the same 0.7 mm). Of many, every picture chooses the
-    best conditioned in all directions (`well_conditioned`), so that the work for a picture does not
-    grow with the survey nor with the times that a place was visited. With positions only: the
-    nearest pictures. Without either: neighbours in order, pictures that look alike, and every other
-    pair where the pictures are few. Pictures of one station are always matched.
+    on a simulated survey half the pairs gave the same 0.7 mm), and those across cameras that no
+    such link joins: one that looks ahead sees what another that looks astern sees later. Of many,
+    every picture chooses the best conditioned in all directions (`well_conditioned`), so that the
+    work for a picture does not grow with the survey nor with the times that a place was visited.
+    With positions only: the nearest pictures. Without either: neighbours in order, pictures that
+    look alike, and every other pair where the pictures are few. Pictures of one station are always
+    matched.
 
     Args:
         records: pictures.
@@ -174,21 +176,48 @@ def _overlapping(
     wider = [p.buffer(_reach_m(r)) for p, r in zip(polygons, records, strict=True)]
     centres = np.array([p.centroid.coords[0] if not p.is_empty else (np.nan, np.nan)
                         for p in polygons]).reshape(-1, 2)  # fmt: skip
+    group = joined_cameras(records, polygons)
     sure: dict[Pair, float] = {}
+    across: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
     tree = STRtree(wider)
     for i, polygon in enumerate(wider):
         for j in sorted(int(k) for k in tree.query(polygon) if k > i):
-            if records[i].camera != records[j].camera:
+            cameras = records[i].camera, records[j].camera
+            apart = group[cameras[0]] != group[cameras[1]]
+            if cameras[0] != cameras[1] and not apart:
                 continue
             overlap = _overlap(polygons[i], polygons[j])
             if overlap >= _SURE_OVERLAP:
-                sure[i, j] = overlap
+                (across if apart else sure)[i, j] = overlap
             elif _overlap(polygon, wider[j]) >= _LEAST_OVERLAP:
                 maybe[i, j] = overlap
     headings = np.array([r.heading_deg for r in records])
-    apart = {p: float(np.linalg.norm(centres[p[0]] - centres[p[1]])) for p in (*sure, *maybe)}
-    return well_conditioned(sure, centres, headings), nearest_each(maybe, apart, _LOOKS)
+    away = {(i, j): float(np.linalg.norm(centres[i] - centres[j])) for i, j in (*across, *maybe)}
+    chosen = well_conditioned(sure, centres, headings)
+    return chosen | nearest_each(across, away, _SECTORS), nearest_each(maybe, away, _LOOKS)
+
+
+def joined_cameras(records: Sequence[ImageRecord], polygons: Sequence[Polygon]) -> dict[str, str]:
+    """The cameras that overlap within most stations, one with the next, by a name for all of them.
+
+    Args:
+        records: pictures.
+        polygons: their footprints.
+    """
+    stations: dict[int, list[int]] = {}
+    for i, record in enumerate(records):
+        stations.setdefault(record.station, []).append(i)
+    overlaps: dict[tuple[str, str], list[float]] = {}
+    for members in stations.values():
+        for i, j in itertools.combinations(members, 2):
+            cameras = records[i].camera, records[j].camera
+            overlaps.setdefault(cameras, []).append(_overlap(polygons[i], polygons[j]))
+    group = {record.camera: record.camera for record in records}
+    for (one, other), shares in sorted(overlaps.items()):
+        if np.median(shares) >= _SURE_OVERLAP:
+            group = {c: group[one] if g == group[other] else g for c, g in group.items()}
+    return group
 
 
 def _overlap(first: Polygon, second: Polygon) -> float:

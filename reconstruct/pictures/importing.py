@@ -12,11 +12,18 @@ import cv2
 import numpy as np
 
 from alice_survey.base.artefacts import Stage, run_stage
-from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError, warn
+from alice_survey.base.errors import (
+    CalibrationError,
+    ImageError,
+    NavigationError,
+    WorkspaceError,
+    warn,
+)
 from alice_survey.base.executor import SERIAL, Executor, progress
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
 from alice_survey.base.records import PicturesRecord
+from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import (
     OPTIONAL,
@@ -67,8 +74,9 @@ class ImportedPictures:
     def __str__(self) -> str:
         """One line, such as `68 pictures (68 PNG) of left and right, 0 with a position`."""
         total = sum(self.cameras.values())
-        several = f" of {' and '.join(self.cameras)}" if len(self.cameras) > 1 else ""
-        text = f"{total} pictures ({_counted(self.kinds)}){several}"
+        *others, last = self.cameras
+        of = f" of {', '.join(others)} and {last}" if others else ""
+        text = f"{total} pictures ({_counted(self.kinds)}){of}"
         text += f", {self.positions} with a position"
         return text + (f"; left out: {_counted(self.left_out)}" if self.left_out else "")
 
@@ -103,8 +111,8 @@ def import_images(
 ) -> ImportedPictures:
     """Write `images/` from pictures of one camera, of cameras on a rig, or from a video.
 
-    A picture that cannot be decoded to its end is left out with a warning; the other picture of its
-    stereo station stays. HEIC, videos, folders inside and other files are left out with a warning
+    A picture that cannot be decoded to its end is left out with a warning; the others of its
+    station stay. HEIC, videos, folders inside and other files are left out with a warning
     for each kind. Where each picture was taken comes from the navigation log, else from
     GPS in EXIF, else from nothing: then the model will have neither scale nor CRS.
 
@@ -112,7 +120,8 @@ def import_images(
         workspace: folder of the survey.
         folders: folders of one camera's pictures, in order.
         cameras: folder of each camera of a rig by its name, such as left and right; the pictures of
-            one moment are paired in order of their names.
+            one moment are those of one place in the order of names or, where a camera lacks some,
+            of one number in them.
         video: a video to take frames from.
         every_s: seconds between frames.
         navigation: CSV with time and position (see `read_navigation`).
@@ -156,7 +165,10 @@ def import_images(
                 f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
                 "choose another workspace with -w"
             )
-    sides = _look_into(folders, cameras, [*given, workspace])
+    known_rig = None if rig is None else read_rig(rig)
+    mono = _MONO if known_rig is None else known_rig.reference
+    sides = _look_into(folders, cameras, mono, [*given, workspace])
+    stations = _stations(sides)
     folders_read = [each for side in sides.values() for each in side]
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
@@ -165,7 +177,7 @@ def import_images(
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),
-            **({} if set(cameras) <= {"left", "right"} else {"cameras": list(cameras)}),
+            **({} if set(cameras) in (set(), {"left", "right"}) else {"cameras": list(cameras)}),
             "every_s": every_s if video is not None else None,
             "navigation": navigation is not None,
             "clock_offset_s": clock_offset_s,
@@ -180,14 +192,13 @@ def import_images(
     def work(partial: Path) -> None:
         notes: list[str] = []
         log = None if navigation is None else read_navigation(navigation, zone)
-        known_rig = None if rig is None else read_rig(rig)
         if video is not None:
-            entries = _take_frames(video, every_s, partial, _mono_name(known_rig))
+            entries = _take_frames(video, every_s, partial, mono)
         else:
             for each in folders_read:
                 for line in each.warnings():
                     warn(line)
-            entries = _find_entries(sides, known_rig, executor)
+            entries = _find_entries(stations, executor)
         _check_entries(entries, known_rig)
         entries = _named(entries)
         entries = [replace(e, mask=_mask_of(e, masks, bool(cameras))) for e in entries]
@@ -208,30 +219,28 @@ def import_images(
 
     changed = run_stage(workspace, stage, work)
     records = read_manifest(workspace / "images" / "manifest.csv")
-    return _imported(records, sides, changed=changed)
+    return _imported(records, sides, stations, changed=changed)
 
 
 def _imported(
-    records: Sequence[ImageRecord], sides: Mapping[str, Sequence[PictureFolder]], *, changed: bool
+    records: Sequence[ImageRecord],
+    sides: Mapping[str, Sequence[PictureFolder]],
+    stations: Sequence[Mapping[str, Path]],
+    *,
+    changed: bool,
 ) -> ImportedPictures:
     """Counts by the manifest, whose stations number the pictures that were found."""
     left_out: Counter[str] = Counter()
     kinds = Counter({_FRAMES: len(records)})
-    if sides:
-        paths = {
-            side: [path for one in folders for path in one.pictures]
-            for side, folders in sides.items()
-        }
-        names = {record.camera for record in records}
-        of_camera = paths if len(paths) > 1 else dict.fromkeys(names, paths[_MONO])
-        kinds = Counter(kind_of(of_camera[r.camera][r.station]) for r in records)
-        lost = sum(map(len, paths.values())) - len(records)
-        left_out += Counter({_UNDECODABLE: lost})
+    if stations:
+        kinds = Counter(kind_of(stations[r.station][r.camera]) for r in records)
+        left_out += Counter({_UNDECODABLE: sum(map(len, stations)) - len(records)})
         for one in (one for folders in sides.values() for one in folders):
             left_out += Counter({reason: len(paths) for reason, paths in one.left_out.items()})
+    counts = Counter(record.camera for record in records)
     return ImportedPictures(
         changed=changed,
-        cameras=dict(Counter(record.camera for record in records)),
+        cameras={name: counts[name] for name in (*sides, *counts) if counts[name]},
         kinds=dict(kinds),
         positions=sum(record.has_position for record in records),
         left_out=dict(left_out),
@@ -243,26 +252,32 @@ def _counted(counts: Mapping[str, int]) -> str:
 
 
 def _look_into(
-    folders: Sequence[Path], cameras: Mapping[str, Path], apart: Sequence[Path]
+    folders: Sequence[Path], cameras: Mapping[str, Path], mono: str, apart: Sequence[Path]
 ) -> dict[str, list[PictureFolder]]:
-    """Contents of the folders of each camera; of one camera whose name follows later, `_MONO`."""
+    """Contents of the folders of each camera; `mono` names the one camera of unnamed folders."""
     if cameras:
         return {name: [look_into(folder, apart)] for name, folder in cameras.items()}
-    return {_MONO: [look_into(folder, apart) for folder in folders]} if folders else {}
+    return {mono: [look_into(folder, apart) for folder in folders]} if folders else {}
+
+
+def _stations(sides: Mapping[str, Sequence[PictureFolder]]) -> list[Mapping[str, Path]]:
+    """Pictures of every moment, by camera."""
+    found = {side: [p for one in folders for p in one.pictures] for side, folders in sides.items()}
+    if len({len(paths) for paths in found.values()}) <= 1:
+        return [dict(zip(found, paths, strict=True)) for paths in zip(*found.values(), strict=True)]
+    try:
+        return [moment.paths for moment in pair_pictures(found)]
+    except CalibrationError as error:
+        raise ImageError(str(error)) from None
 
 
 def _check_sources(
     folders: Sequence[Path], cameras: Mapping[str, Path], video: Path | None, every_s: float
 ) -> None:
-    if len(cameras) == 1:
-        raise ImageError(
-            f"pictures of a rig need two cameras, --left and --right or --camera, not just "
-            f"{next(iter(cameras))}"
-        )
     if sum([bool(folders), bool(cameras), video is not None]) != 1:
         raise ImageError(
-            "give folders of pictures, or --left and --right, or --camera for each, or --video: "
-            "one of them"
+            "give folders of pictures, or --left and --right, or --camera for each camera, or "
+            "--video: one of them"
         )
     if not every_s > 0:
         raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
@@ -289,30 +304,13 @@ def _checked_level(name: str | None, navigation: Path | None) -> str:
     return name.strip()
 
 
-def _mono_name(rig: Rig | None) -> str:
-    return _MONO if rig is None else rig.reference
-
-
-def _find_entries(
-    sides: Mapping[str, Sequence[PictureFolder]], rig: Rig | None, executor: Executor
-) -> list[_Incoming]:
-    found = {side: [p for one in folders for p in one.pictures] for side, folders in sides.items()}
-    counts = {side: len(paths) for side, paths in found.items()}
-    if len(set(counts.values())) > 1:
-        numbers = [f"{counts[name]} in {folders[0].folder}" for name, folders in sides.items()]
-        raise ImageError(
-            f"pictures of a rig are paired in order of their names, so every picture needs its "
-            f"partner, but there are {', '.join(numbers)}"
-        )
-    if len(found) == 1:
-        found = {_mono_name(rig): paths for paths in found.values()}
+def _find_entries(stations: Sequence[Mapping[str, Path]], executor: Executor) -> list[_Incoming]:
     listed = [
         (camera, station, path)
-        for camera, paths in found.items()
-        for station, path in enumerate(paths)
+        for station, paths in enumerate(stations)
+        for camera, path in paths.items()
     ]
-    paths = [path for _, _, path in listed]
-    facts = executor.map(inspect, paths, label="checking pictures")
+    facts = executor.map(inspect, [path for _, _, path in listed], label="checking pictures")
     entries = []
     for (camera, station, path), known in zip(listed, facts, strict=True):
         if known.fault:
@@ -346,9 +344,11 @@ def _check_entries(entries: Sequence[_Incoming], rig: Rig | None) -> None:
             raise ImageError(f"the rig has no camera {camera!r}, only {', '.join(rig.cameras)}")
         model = rig.cameras[camera]
         if (model.width_px, model.height_px) != (first.width_px, first.height_px):
+            others = ", ".join(name for name in rig.cameras if name != camera)
             raise ImageError(
                 f"{own[0].source} has {first.width_px} x {first.height_px} pixels, but the rig's "
                 f"camera {camera} has {model.width_px} x {model.height_px}"
+                + (f": --camera NAME=FOLDER says if {others} took them" if others else "")
             )
 
 

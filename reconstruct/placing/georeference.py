@@ -186,7 +186,7 @@ ExtraOf = Callable[[Similarity, Array], Extra]
 def fit_navigation(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
-    body_from_cam: Mapping[str, RigidTransform],
+    body_from_cam: Mapping[str, RigidTransform] | None,
     datum: Datum,
     levelled: Similarity,
     *,
@@ -200,8 +200,8 @@ def fit_navigation(
     Args:
         records: registered pictures.
         model_from_cam: pose of each picture's camera in the model.
-        body_from_cam: lever arm of every camera, metres; the identity where positions are of the
-            cameras themselves.
+        body_from_cam: mount of every camera, metres; None where it is unknown: positions are those
+            of the cameras, and attitudes, which are the vehicle's, are not used.
         datum: origin of the local frame.
         levelled: `level` of the model; where no attitude is known it keeps the model from turning
             about a straight track, with a sigma of 10 degrees.

@@ -74,12 +74,13 @@ class Epochs:
 def read_epochs(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
-    body_from_cam: Mapping[str, RigidTransform],
+    body_from_cam: Mapping[str, RigidTransform] | None,
     datum: Datum,
 ) -> Epochs | None:
     """Collect what navigation measured; None where it has no position.
 
-    Pictures of one station share one reading of navigation, which must not count twice.
+    Pictures of one station share one reading of navigation, which must not count twice. Without
+    `body_from_cam` positions are those of the cameras, and what attitudes mean for them is unknown.
     """
     chosen = [i for i, r in enumerate(records) if r.has_position]
     if not chosen:
@@ -93,12 +94,13 @@ def read_epochs(
     number = {station: k for k, station in enumerate(stations)}
     first = [next(r for r in rows if r.station == station) for station in stations]
     attitudes = np.array([[r.roll_deg, r.pitch_deg, r.heading_deg] for r in rows])
-    has = np.isfinite(attitudes).all(axis=1)
+    has = np.isfinite(attitudes).all(axis=1) & (body_from_cam is not None)
     moment = np.array([number[r.station] for r in rows])
     known = np.ones((len(stations), 6), dtype=bool)
     known[:, 3:] = False
     known[moment[has], 3:] = True
-    levers = [body_from_cam[r.camera] for r in rows]
+    unknown = RigidTransform.identity()
+    levers = [unknown if body_from_cam is None else body_from_cam[r.camera] for r in rows]
     time = [r.time_s for r in first] if timed else [float(s) for s in stations]
     return Epochs(
         time=np.array(time),

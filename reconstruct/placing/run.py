@@ -284,12 +284,8 @@ def find_place(task: Placing) -> Placed:
     )
 
 
-def body_from_pinhole(
-    rig: Rig | None, warps: Mapping[str, PinholeWarp]
-) -> dict[str, RigidTransform]:
-    """Lever arms of the pinholes, metres; the identity without a rig, when navigation is theirs."""
-    if rig is None:
-        return dict.fromkeys(warps, RigidTransform.identity())
+def body_from_pinhole(rig: Rig, warps: Mapping[str, PinholeWarp]) -> dict[str, RigidTransform]:
+    """Mounts of the pinholes, metres."""
     return {
         name: rig.body_from_cam(name) * warp.pinhole_from_cam.inv() for name, warp in warps.items()
     }
@@ -311,7 +307,7 @@ def _fit(
         fit = fit_navigation(
             task.records,
             task.pinholes,
-            body_from_pinhole(task.rig, task.warps),
+            None if task.rig is None else body_from_pinhole(task.rig, task.warps),
             task.datum,
             levelled,
             known_scale=scale,

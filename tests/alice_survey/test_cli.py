@@ -234,3 +234,11 @@ def test_version_is_that_of_the_distribution() -> None:
     result = CliRunner().invoke(app, ["--version"])
     assert result.exit_code == 0
     assert result.output.split() == ["alice-survey", metadata.version("alice-survey")]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_half_of_a_stereo_rig_is_refused(
+    side: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["import-images", f"--{side}", str(tmp_path), "-w", str(tmp_path / "w")]
+    assert "--camera NAME=FOLDER" in fails(arguments, capsys, monkeypatch)

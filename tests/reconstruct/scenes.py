@@ -47,6 +47,7 @@ def make_scene(
     port_distance_m: float = 0.02,
     port_tilt_deg: tuple[float, float] = (0.0, 0.0),
     port: PortValues | None = None,
+    rig: Rig | None = None,
     scale: int = 4,
     relief_m: float = 0.16,
     seed: int = 5,
@@ -56,12 +57,12 @@ def make_scene(
     Relief reaches `relief_m` above and below the mean; pixels are `scale` times those of the
     camera, which noise in pixels refers to.
 
-    `port` stands in for the flat one of the design. Navigation is the truth plus a constant bias
-    and 0.1 degrees of attitude noise.
+    `port` stands in for the flat one of the design, `rig` for all of it. Navigation is the truth
+    plus a constant bias and 0.1 degrees of attitude noise.
     """
     rng = np.random.default_rng(seed)
     camera = CameraConfig(port_distance_m=port_distance_m, port_tilt_deg=port_tilt_deg)
-    rig = design_rig(camera, WaterConfig(), scale=scale)
+    rig = rig or design_rig(camera, WaterConfig(), scale=scale)
     if port is not None:
         rig = replace(rig, cameras={n: replace(c, port=port) for n, c in rig.cameras.items()})
     length = 0.55 * stations

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import ConfigError
+from alice_survey.base.errors import CalibrationError, ConfigError
 from camera_calib.camera import Camera
+from camera_calib.formats.rigs import led_by
 from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.fov.table import (
     MATCH_SIGMA_PX,
@@ -24,6 +25,7 @@ from camera_calib.rig import Rig, design_rig
 from tests.cameras import changed
 from tests.oracles_camera import project_by_shortest_path
 from tests.oracles_fov import triangulated_depth_sigma_m
+from tests.reconstruct.rig_survey import four_cameras
 
 NO_PORT = CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0)
 PORT = CameraConfig()
@@ -303,3 +305,23 @@ def test_choices_out_of_range_are_refused() -> None:
     for speeds, exposures, allowed in (([0.0], [1e-3], 1), ([0.2], [-1], 1), ([0.2], [1e-3], 0)):
         with pytest.raises(ConfigError):
             blur_table(rows, speeds, exposures, allowed)
+
+
+@pytest.mark.parametrize("name", list(four_cameras().cameras))
+def test_any_camera_of_a_rig_has_its_row(name: str) -> None:
+    """Where cameras are does not depend on which of them leads; sizes are those of its own lens."""
+    rig = four_cameras()
+    led = led_by(rig, name)
+    assert led.reference == name and set(led.cameras) == set(rig.cameras)
+    for camera in rig.cameras:
+        off = led.body_from_cam(camera).inv() * rig.body_from_cam(camera)
+        np.testing.assert_allclose(off.as_matrix(), np.eye(4), atol=1e-12)
+    one = rig.cameras[name]
+    row = rig_fov_table(led, [2.0], PORT)[0]
+    middle = np.array([one.cx_px, one.cy_px])
+    spots = one.at_depth(np.stack([middle, middle + np.array([1.0, 0.0])]), 2.0 + one.front_cam[2])
+    assert 1e-3 * row.pixel_centre_mm == pytest.approx(
+        np.linalg.norm(np.diff(spots, axis=0)), rel=5e-3
+    )
+    with pytest.raises(CalibrationError, match="no camera 'mast'"):
+        led_by(rig, "mast")

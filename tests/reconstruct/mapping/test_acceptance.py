@@ -62,6 +62,7 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     scene, mapped = block(), block_mapped()
+    capsys.readouterr()  # of a slow machine's progress
     positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     good = check_mapping(mapped.model, scene.records, positions, sigmas, 0.0, SURE)
     assert good.notes() == []
@@ -189,6 +190,7 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     scene, mapped = block(), block_mapped()
+    capsys.readouterr()  # of a slow machine's progress
     positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
     rotations = navigation_rotations(scene.records, scene.rig, mapped.warps)
     straight = measure_doming(mapped.model, positions, sigmas, rotations)

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
 from camera_calib.approximation.pinhole_warp import best_warp
+from reconstruct.mapping.acceptance import measure_doming
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
@@ -28,6 +30,7 @@ from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
+from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 
@@ -106,6 +109,28 @@ def test_the_scale_is_that_of_the_rig() -> None:
     assert align_similarity(found, true).scale == pytest.approx(0.5, rel=5e-3)
 
 
+@pytest.mark.parametrize("names", [("wide", "tele", "bow", "side"), ("tele", "bow", "side")])
+def test_any_number_of_unlike_cameras_map_to_the_same_truth(names: tuple[str, ...]) -> None:
+    """Also without the camera whose frame is the rig's."""
+    rig = four_cameras()
+    chosen = replace(rig, cameras={name: rig.cameras[name] for name in names},
+                     cam_from_rig={name: rig.cam_from_rig[name] for name in names})  # fmt: skip
+    scene = make_scene(lines=2, stations=5, points=6000, noise_px=0.1, rig=chosen)
+    mapped = mapped_scene(scene)
+
+    assert mapped.models[0] == len(scene.records) == 10 * len(names)
+    assert mapped.notes == ("global mapping of stations",)
+    assert 0.02e-3 < camera_rms(mapped, scene) < 1e-3
+    found, true = pupils(mapped, scene)
+    assert abs(align_similarity(found, true).scale - 1.0) < 5e-4
+    trend = measure_doming(
+        mapped.model, np.full((len(scene.records), 3), np.nan),
+        np.full((len(scene.records), 3), np.nan), {},
+    ).scale  # fmt: skip
+    assert trend is not None
+    assert trend.mean == pytest.approx(1.0, abs=1e-3)
+
+
 def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
     scene, mapped = block(), block_mapped()
     model = mapped.model
@@ -122,18 +147,19 @@ def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
         assert (focal, cx, cy) == (expected.focal_px, expected.cx_px, expected.cy_px)
 
 
-def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
+@pytest.mark.parametrize("names", [("left", "right"), ("left", "right", "top")])
+def test_self_calibration_finds_focal_length_distortion_and_rig(names: tuple[str, ...]) -> None:
     """In plain air, with tilted views: what comes out must be what went in."""
     rng = np.random.default_rng(2)
     truth = pycolmap.Camera(
         model="OPENCV", width=800, height=600,
         params=[760.0, 760.0, 400.0, 300.0, -0.08, 0.03, 0.0, 0.0],
     )  # fmt: skip
-    scene = oblique_scene(truth, rng)
+    scene = oblique_scene(truth, rng, names)
     start = pycolmap.Camera(model="RADIAL", width=800, height=600, params=[960.0, 400, 300, 0, 0])
     seen = Observations(
         images=scene.records,
-        cameras={"left": start, "right": pycolmap.Camera(start.todict())},
+        cameras={name: pycolmap.Camera(start.todict()) for name in names},
         taken=scene.pixels,
         pairs=scene.pairs,
     )
@@ -142,6 +168,8 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
     assert mapped.models[0] == len(scene.records)
     assert not mapped.scaled
     assert mapped.baseline == 1.0
+    (rig,) = mapped.model.rigs.values()
+    assert len(rig.non_ref_sensors) == len(names) - 1
     assert model_baseline(mapped.model) == pytest.approx(1.0, rel=1e-9)
     for warp in mapped.warps.values():
         assert warp.camera.fx_px == pytest.approx(760, rel=0.01)
@@ -156,18 +184,22 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
         assert camera.model_name == "PINHOLE"
 
 
-def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator) -> Scene:
-    """Eight stereo stations 0.2 m wide around a bumpy floor, looking at its middle."""
-    from scipy.spatial.transform import Rotation
-
+def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequence[str]) -> Scene:
+    """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
     from alice_survey.base.manifest import ImageRecord
     from reconstruct.matching.matches import PairMatches
 
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
     records, poses, pixels, ids = [], [], [], []
-    right_from_left = RigidTransform.from_components(
-        [-0.2, 0.0, 0.0], Rotation.from_rotvec([0.0, 0.03, 0.01])
-    )
+    cam_from_left = {
+        "left": RigidTransform.identity(),
+        "right": RigidTransform.from_components(
+            [-0.2, 0.0, 0.0], Rotation.from_rotvec([0.0, 0.03, 0.01])
+        ),
+        "top": RigidTransform.from_components(
+            [-0.1, 0.25, 0.02], Rotation.from_rotvec([-0.1, 0.05, 0.2])
+        ),
+    }
     for station in range(8):
         angle = 0.35 * station
         place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
@@ -176,7 +208,8 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator) -> Scene:
         side /= np.linalg.norm(side)
         rotation = Rotation.from_matrix(np.column_stack([side, np.cross(forward, side), forward]))
         left = RigidTransform.from_components(place, rotation)
-        for name, pose in (("left", left), ("right", left * right_from_left.inv())):
+        for name in names:
+            pose = left * cam_from_left[name].inv()
             local = pose.inv().apply(points)
             seen = np.asarray(camera.img_from_cam(local))
             inside = np.all((seen > 0) & (seen < [800, 600]), axis=1) & (local[:, 2] > 0.3)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from alice_survey.base.errors import ReconstructionError, heard
 from alice_survey.base.executor import SERIAL
 from camera_calib.approximation.pinhole_warp import best_warp
+from camera_calib.rig import Rig
 from reconstruct.mapping.working_range import (
     WorkingDistances,
     find_distances,
@@ -16,6 +18,7 @@ from reconstruct.mapping.working_range import (
 )
 from reconstruct.matching.features import Features, save_features
 from tests.cameras import changed
+from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 
@@ -34,19 +37,21 @@ def features_of(scene: Scene, folder: Path) -> list[Path]:
     return paths
 
 
-def test_stereo_matches_give_the_distance(tmp_path: Path) -> None:
-    scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
+@pytest.mark.parametrize("rig", [None, four_cameras()], ids=["stereo", "four cameras"])
+def test_stereo_matches_give_the_distance(tmp_path: Path, rig: Rig | None) -> None:
+    """Also of cameras that look obliquely, and see farther along their axes."""
+    scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2, rig=rig)
     paths = features_of(scene, tmp_path)
     found = find_distances(
         scene.records, paths, scene.rig, given_m=None, ratio=0.8, executor=SERIAL
     )
-    depths = np.concatenate(
-        [
-            pose.inv().apply(scene.points_ned[ids])[:, 2]
-            for pose, ids in zip(scene.ned_from_cam, scene.ids, strict=True)
-        ]
-    )
-    near, far = np.percentile(depths, [2, 98])
+    depths = []
+    for (i, one), (j, other) in permutations(enumerate(scene.records), 2):
+        if one.station == other.station:
+            shared = np.intersect1d(scene.ids[i], scene.ids[j])
+            pose = scene.ned_from_cam[i].inv()
+            depths.append(pose.apply(scene.points_ned[shared]).reshape(-1, 3)[:, 2])
+    near, far = np.percentile(np.concatenate(depths), [2, 98])
     assert found.source == "stereo"
     assert found.near_m == pytest.approx(near, abs=0.02)
     assert found.far_m == pytest.approx(far, abs=0.02)

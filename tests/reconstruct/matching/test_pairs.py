@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.manifest import ImageRecord
+from camera_calib.rig import Rig
 from reconstruct.matching.features import Features, save_features
 from reconstruct.matching.pairs import (
     NEIGHBOURS,
@@ -20,6 +22,7 @@ from reconstruct.matching.pairs import (
     well_conditioned,
 )
 from tests.oracles_matching import vlad_slowly
+from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene
 
 
@@ -117,6 +120,34 @@ def test_pairs_by_footprint_are_those_that_share_the_sea_floor() -> None:
     assert all(shared[pair] > 20 for pair in sure)
     nothing = {pair for pair, n in shared.items() if n == 0}
     assert len(chosen & nothing) <= 0.02 * len(nothing)
+
+
+def test_cameras_that_see_nothing_together_are_paired_across_stations() -> None:
+    """One looks ahead and one astern, which sees what the first saw before; two beside overlap."""
+    one = four_cameras().cameras["wide"]
+    turns = {"fore": 28.0, "aft": -28.0, "beside": -26.0}
+    rig = Rig(
+        cameras=dict.fromkeys(turns, one),
+        cam_from_rig={
+            name: RigidTransform.from_rotation(Rotation.from_euler("x", turn, degrees=True)).inv()
+            for name, turn in turns.items()
+        },
+        body_from_rig=four_cameras().body_from_rig,
+        source="test",
+    )
+    scene = make_scene(lines=1, stations=9, points=9000, rig=rig)
+    sure, maybe = choose_pairs(scene.records, rig, DATUM)
+    shared = {(i, j): len(np.intersect1d(scene.ids[i], scene.ids[j])) for i, j in (*sure, *maybe)}
+    cameras: dict[frozenset[str], list[int]] = {}
+    for i, j in sure:
+        one, other = scene.records[i], scene.records[j]
+        if one.station != other.station:
+            cameras.setdefault(frozenset((one.camera, other.camera)), []).append(shared[i, j])
+    assert set(cameras) >= {frozenset(("fore", "aft")), frozenset(("fore", "beside"))}
+    assert frozenset(("aft", "beside")) not in cameras
+    assert len(cameras[frozenset(("fore", "aft"))]) >= 5
+    assert min(cameras[frozenset(("fore", "aft"))]) > 100
+    assert max(np.bincount(np.ravel(sure))) <= 30
 
 
 def test_pictures_without_navigation_are_tied_to_their_neighbours() -> None:

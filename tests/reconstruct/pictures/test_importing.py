@@ -186,13 +186,45 @@ def test_cameras_of_a_rig_pair_in_order(tmp_path: Path, draw: Draw) -> None:
     import_images(tmp_path / "w", [], cameras={name: tmp_path / name for name in names})
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
     assert {(r.camera, r.station) for r in records} == {(c, n) for c in names for n in range(2)}
-    draw(tmp_path / "down" / "2.png", 3)
-    with pytest.raises(ImageError, match=r"2 in .*bow, 2 in .*port, 3 in .*down"):
-        import_images(tmp_path / "w", [], cameras={name: tmp_path / name for name in names})
     with pytest.raises(ImageError, match="is given twice"):
         import_images(tmp_path / "w", [], cameras=dict.fromkeys(names, tmp_path / "bow"))
-    with pytest.raises(ImageError, match="not just bow"):
-        import_images(tmp_path / "w", [], cameras={"bow": tmp_path / "bow"})
+
+
+def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path, draw: Draw) -> None:
+    cameras = {name: tmp_path / name for name in ("down", "bow", "port")}
+    for side in cameras:
+        for number in range(7, 12):
+            if (side, number) != ("bow", 8):
+                draw(tmp_path / side / f"{side}_{number}.png", number)
+    with heard() as warnings:
+        found = import_images(tmp_path / "w", [], cameras=cameras)
+    assert str(found) == "14 pictures (14 PNG) of down, bow and port, 0 with a position"
+    assert not warnings
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert {(r.image, r.station) for r in records} == {
+        (f"{side}/{side}_{number}.png", number - 7)
+        for side in cameras
+        for number in range(7, 12)
+        if (side, number) != ("bow", 8)
+    }
+
+
+def test_one_camera_of_a_rig_goes_by_its_name(tmp_path: Path, draw: Draw) -> None:
+    rig = design_rig(CameraConfig(), WaterConfig())
+    cameras = {
+        name: replace(rig.cameras[name], width_px=width, height_px=48)
+        for name, width in (("left", 80), ("right", 64))
+    }
+    rig = replace(rig, cameras=cameras)
+    write_rig(tmp_path / "rig.json", rig)
+    for number in range(2):
+        draw(tmp_path / "in" / f"{number}.png", number)
+    with pytest.raises(ImageError, match="--camera NAME=FOLDER says if right took them"):
+        import_images(tmp_path / "w", [tmp_path / "in"], rig=tmp_path / "rig.json")
+    found = import_images(
+        tmp_path / "w", [], cameras={"right": tmp_path / "in"}, rig=tmp_path / "rig.json"
+    )
+    assert found.cameras == {"right": 2}
 
 
 def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
@@ -395,8 +427,7 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         ([tmp_path / "nav.csv"], {}, "nav.csv"),
         ([], {}, "--left and --right"),
         ([three], {"cameras": {"left": three, "right": three}}, "--left and --right"),
-        ([], {"cameras": {"left": three}}, "--left and --right"),
-        ([], {"cameras": {"left": three, "right": tmp_path / "one"}}, "3 in .* 1 in "),
+        ([], {"cameras": {"left": three, "right": tmp_path / "one"}}, "3 of left .* 1 of right"),
         ([], {"video": tmp_path / "no.mp4"}, "no.mp4"),
         ([], {"video": tmp_path / "no.mp4", "every_s": 0.0}, "--every"),
         ([three], {"navigation": nav}, "DateTimeOriginal"),

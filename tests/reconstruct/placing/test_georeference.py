@@ -38,12 +38,9 @@ def fit(
     poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
     points = points_in_model(scene.points_ned, truth)
     centres = np.stack([p.translation for p in poses])
-    arms = {
-        name: scene.rig.body_from_cam(name) if levers else RigidTransform.identity()
-        for name in scene.rig.cameras
-    }
+    arms = {name: scene.rig.body_from_cam(name) for name in scene.rig.cameras}
     return fit_navigation(
-        records, poses, arms, DATUM, level(points, centres),
+        records, poses, arms if levers else None, DATUM, level(points, centres),
         known_scale=truth.scale if known else None,
     )  # fmt: skip
 
@@ -91,9 +88,12 @@ def test_any_gauge_is_undone_when_navigation_is_exact(seed: int, scale: float) -
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_positions_alone_place_a_block(seed: int) -> None:
+@pytest.mark.parametrize("roll_deg", [np.nan, 0.0])
+def test_positions_alone_place_a_block(seed: int, roll_deg: float) -> None:
+    """Of cameras on an unknown mount, whose vehicle's attitude says nothing of theirs."""
     truth = gauge(seed, 3.0)
-    found = fit(site(), without_attitude(site()), truth, known=False, levers=False)
+    records = [replace(r, roll_deg=roll_deg) for r in without_attitude(site())]
+    found = fit(site(), records, truth, known=False, levers=False)
     assert found is not None
     assert_same(found.ned_from_model, truth, atol=0.02, scale_rtol=2e-3)
 
