@@ -43,6 +43,17 @@ LENSES: Mapping[str, tuple[str, ...]] = {
 """Distortion terms by the name of a lens model; only those of the fisheye are not OpenCV's."""
 
 
+USUAL_LENS: Mapping[str, str] = {OpenCVLens.model: "opencv5", FisheyeLens.model: "fisheye"}
+"""The lens model to calibrate, by the kind of lens."""
+LensNames = str | Mapping[str, str]
+"""The lens model of all cameras, or that of each by the camera's name."""
+
+
+def lens_of(lens: LensNames, camera: str) -> str:
+    """The lens model of one camera."""
+    return lens if isinstance(lens, str) else lens[camera]
+
+
 def lens_kind(lens: str) -> type[LensValues]:
     """The kind of lens behind the name of a lens model."""
     return FisheyeLens if lens == FisheyeLens.model else OpenCVLens
@@ -268,6 +279,11 @@ def of_ports(rig: Rig) -> tuple[str, ...]:
     return tuple(
         f"{name}.{p}" for name, camera in rig.cameras.items() for p in camera.port.estimated
     )
+
+
+def of_lenses(rig: Rig, lens: LensNames) -> tuple[str, ...]:
+    """Intrinsics of every camera of a rig."""
+    return tuple(f"{c}.{name}" for c in rig.cameras for name in intrinsics(lens_of(lens, c)))
 
 
 def of_cameras(rig: Rig, names: Iterable[str]) -> tuple[str, ...]:

@@ -276,9 +276,12 @@ def calibrate(
     ] = "sheet",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     lens: Annotated[
-        str,
-        typer.Option(help="pinhole, k1, k2, opencv4, opencv5, rational, prism, full or fisheye."),
-    ] = "opencv5",
+        str | None,
+        typer.Option(
+            help="pinhole, k1, k2, opencv4, opencv5, rational, prism, full or fisheye, and other "
+            "ones of some cameras: opencv5,side=fisheye."
+        ),
+    ] = None,
     water: Annotated[
         bool, typer.Option("--water/--air", help="Under water through ports, or in air.")
     ] = False,
@@ -288,8 +291,11 @@ def calibrate(
         typer.Option(help="Treatment of the intrinsics of --start; prior where it has sigmas."),
     ] = None,
     port: Annotated[
-        Literal["flat", "dome", "none", "auto"] | None,
-        typer.Option(help="Kind of the port; auto: the likeliest. That of --start, or flat."),
+        str | None,
+        typer.Option(
+            help="flat, dome or none, and other ones of some cameras: flat,side=dome; auto: the "
+            "likeliest. That of --start, or flat."
+        ),
     ] = None,
     dome_radius: Annotated[
         float | None, typer.Option(min=5, max=1000, help="Outer radius of a dome, mm.")

@@ -1,6 +1,6 @@
 """The calibration that options ask for: in air, under water, through which ports."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -11,7 +11,7 @@ from camera_calib.calibrate.housing import (
     focal_ratios,
     likely_port,
 )
-from camera_calib.calibrate.options import CalibrateOptions
+from camera_calib.calibrate.options import AUTO, PORT_KINDS, CalibrateOptions, by_camera
 from camera_calib.calibrate.solve import (
     blank_camera,
     calibrate_in_air,
@@ -22,14 +22,14 @@ from camera_calib.calibrate.solve import (
 from camera_calib.calibrate.start import same_numbering
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import Camera
+from camera_calib.freedom import LENSES, USUAL_LENS, LensNames
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.optics import PORTS
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT, NoPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
-from camera_calib.target_shape import (
-    shape_of,
-)
+from camera_calib.target_shape import shape_of
 from camera_calib.targets.target import Target
 
 
@@ -47,10 +47,11 @@ def calibrated(
     Raises:
         CalibrationError: the views do not determine it.
     """
-    points, lens = target.points, settings.lens
+    points = target.points
     start = None if start is None else matching(start, found.sizes)
+    lens = lens_names(settings, found.sizes, start)
     if not settings.water:
-        bare = start_cameras(settings, found.sizes, start, NoPort.shape)
+        bare = start_cameras(settings, found.sizes, start, dict.fromkeys(found.sizes, NoPort.shape))
         start = None if start is None else replace(start, cameras=bare)
         views = _numbered(found, target, bare, lens, known=start is not None)
         shape = shape_of(target, settings.target_shape)
@@ -59,25 +60,28 @@ def calibrated(
     if start is not None:
         views = _numbered(found, target, start.cameras, lens, known=True)
         ratios = focal_ratios(views, points, start, lens)
-    if settings.port == "auto":
-        found_by = {kind: partial(_through, settings, found, target, start, kind) for kind in PORTS}
+    kinds = port_kinds(settings, found.sizes, start)
+    if AUTO in kinds.values():
+        trials = {kind: dict.fromkeys(found.sizes, kind) for kind in PORTS}
+        found_by = {
+            k: partial(_through, settings, found, target, start, t) for k, t in trials.items()
+        }
         calibration = compare_housings(found_by)
     else:
-        kind = port_kind(settings, start)
         try:
-            calibration = _through(settings, found, target, start, kind)
+            calibration = _through(settings, found, target, start, kinds)
         except CalibrationError as error:
-            raise CalibrationError(f"{error}{_other_housing(ratios, kind)}") from None
+            raise CalibrationError(f"{error}{_other_housing(ratios, kinds)}") from None
     return replace(calibration, housing=replace(calibration.housing, focal_ratios=ratios))
 
 
-def _other_housing(ratios: Mapping[str, float], kind: str) -> str:
-    """What focal lengths say against a kind of port, for the end of a message."""
+def _other_housing(ratios: Mapping[str, float], kinds: Mapping[str, str]) -> str:
+    """What focal lengths say against the ports, for the end of a message."""
     likely = {name: likely_port(ratio) for name, ratio in ratios.items()}
     against = [
         name
         for name, port in likely.items()
-        if (port == FlatPort.shape) != (kind == FlatPort.shape)
+        if (port == FlatPort.shape) != (kinds[name] == FlatPort.shape)
     ]
     if not against:
         return ""
@@ -89,7 +93,12 @@ def _other_housing(ratios: Mapping[str, float], kind: str) -> str:
 
 
 def _numbered(
-    found: Detections, target: Target, cameras: Mapping[str, Camera], lens: str, *, known: bool
+    found: Detections,
+    target: Target,
+    cameras: Mapping[str, Camera],
+    lens: LensNames,
+    *,
+    known: bool,
 ) -> tuple[TargetView, ...]:
     """Views whose points all cameras number alike."""
     if not target.is_ambiguous or len(cameras) < 2:
@@ -100,12 +109,16 @@ def _numbered(
 
 
 def _through(
-    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None, kind: str
+    settings: CalibrateOptions,
+    found: Detections,
+    target: Target,
+    start: Rig | None,
+    kinds: Mapping[str, str],
 ) -> Calibration:
-    """The calibration under water through ports of one kind."""
-    points, lens = target.points, settings.lens
+    """The calibration under water through ports of the named kinds."""
+    points, lens = target.points, lens_names(settings, found.sizes, start)
     shape = shape_of(target, settings.target_shape)
-    cameras = start_cameras(settings, found.sizes, start, kind)
+    cameras = start_cameras(settings, found.sizes, start, kinds)
     views = _numbered(found, target, cameras, lens, known=start is not None)
     known_to = {
         "glass_thickness_m": _metres(settings.glass_sigma_mm),
@@ -129,23 +142,51 @@ def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
 
 
-def port_kind(settings: CalibrateOptions, start: Rig | None) -> str:
-    """The kind of port that is named, or that of the start, or a flat one."""
-    if settings.port in PORTS:
-        return str(settings.port)
-    old = NO_PORT if start is None else next(iter(start.cameras.values())).port
-    return old.shape if old.parameters else FlatPort.shape
+def lens_names(
+    settings: CalibrateOptions, cameras: Collection[str], start: Rig | None
+) -> dict[str, str]:
+    """The lens model of each camera: as named, or the usual one of the start's lens."""
+    if settings.lens is not None:
+        return by_camera(settings.lens, cameras, "--lens", LENSES)
+    kinds = {} if start is None else {n: one.lens.model for n, one in start.cameras.items()}
+    return {name: USUAL_LENS[kinds.get(name, OpenCVLens.model)] for name in cameras}
+
+
+def port_kinds(
+    settings: CalibrateOptions, cameras: Collection[str], start: Rig | None
+) -> dict[str, str]:
+    """The kind of port of each camera: as named, or that of the start, or a flat one.
+
+    Raises:
+        CalibrationError: a name is unknown, or auto is for some of the cameras only.
+    """
+    if settings.port is not None:
+        kinds = by_camera(settings.port, cameras, "--port", PORT_KINDS)
+        if AUTO in kinds.values() and len(set(kinds.values())) > 1:
+            raise CalibrationError(f"--port {settings.port}: auto is for all cameras alike")
+        return kinds
+    old = {} if start is None else {name: one.port for name, one in start.cameras.items()}
+    return {
+        name: old[name].shape if name in old and old[name].parameters else FlatPort.shape
+        for name in cameras
+    }
 
 
 def start_cameras(
-    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None, kind: str
+    settings: CalibrateOptions,
+    sizes: Mapping[str, Size],
+    start: Rig | None,
+    kinds: Mapping[str, str],
 ) -> dict[str, Camera]:
-    """Cameras of the start, or blank ones, behind ports of one kind."""
+    """Cameras of the start, or blank ones, behind ports of the named kinds."""
     if start is None:
-        port = _port(kind, NO_PORT, settings)
-        return {name: blank_camera(size, settings.lens, port) for name, size in sizes.items()}
+        lens = lens_names(settings, sizes, None)
+        return {
+            name: blank_camera(size, lens[name], _port(kinds[name], NO_PORT, settings))
+            for name, size in sizes.items()
+        }
     return {
-        name: replace(camera, port=_port(kind, camera.port, settings))
+        name: replace(camera, port=_port(kinds[name], camera.port, settings))
         for name, camera in start.cameras.items()
     }
 

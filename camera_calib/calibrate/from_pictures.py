@@ -15,7 +15,13 @@ from alice_survey.base.errors import CalibrationError, WorkspaceError
 from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.records import CalibrationRecord
 from alice_survey.kit.words import with_sigma
-from camera_calib.calibrate.by_options import calibrated, matching, port_kind, start_cameras
+from camera_calib.calibrate.by_options import (
+    calibrated,
+    lens_names,
+    matching,
+    port_kinds,
+    start_cameras,
+)
 from camera_calib.calibrate.detect_views import Detections, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
 from camera_calib.calibrate.moments import ClockOffset, clock_offset, track_of, views_at_moments
@@ -32,7 +38,6 @@ from camera_calib.calibrate.solve import (
 )
 from camera_calib.calibrate.text import calibration_text
 from camera_calib.calibration import Calibration, TargetView
-from camera_calib.freedom import intrinsics
 from camera_calib.ports.none import NoPort
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
@@ -64,7 +69,7 @@ def calibrate_pictures(
         raise CalibrationError("-o is missing: the folder to write the calibration into")
     _check_output(output, settings.start)
     target = parse_target(settings.target)
-    intrinsics(settings.lens)
+    lens_names(settings, places, start=None)
     start = None if settings.start is None else read_rig(settings.start)
     check_settings(settings, start)
     lists = {camera: find_pictures(place) for camera, place in places.items()}
@@ -125,15 +130,17 @@ def _on_one_clock(
     warn_of_unseen(found)
     points = target.points
     start = None if start is None else matching(start, found.sizes)
-    kind = port_kind(settings, start) if settings.water else NoPort.shape
-    cameras = start_cameras(settings, found.sizes, start, kind)
+    kinds = dict.fromkeys(found.sizes, NoPort.shape)
+    if settings.water:
+        kinds = port_kinds(settings, found.sizes, start)
+    cameras = start_cameras(settings, found.sizes, start, kinds)
     if start is None:
         some = [
             view
             for name in cameras
             for view in _spread([v for v in found.views if name in v.pixels])
         ]
-        cameras = first_cameras(some, points, cameras, settings.lens)
+        cameras = first_cameras(some, points, cameras, lens_names(settings, found.sizes, None))
     tracks = {
         name: track_of(name, camera, found.views, times_s, points)
         for name, camera in cameras.items()

@@ -16,6 +16,7 @@ from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.solve import blank_camera, first_cameras
 from camera_calib.calibration import Calibration, HousingJudgement, HousingTrial, TargetView
+from camera_calib.freedom import LensNames, lens_of
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NoPort
@@ -28,7 +29,7 @@ _ALIKE = 1.01
 
 
 def focal_ratios(
-    views: Sequence[TargetView], points: Array, in_air: Rig, lens: str
+    views: Sequence[TargetView], points: Array, in_air: Rig, lens: LensNames
 ) -> dict[str, float]:
     """Focal lengths under water, as if without a housing, over those in air, by camera.
 
@@ -36,10 +37,10 @@ def focal_ratios(
         views: under water.
         points: (N, 3) of the target, metres.
         in_air: calibrated in air.
-        lens: name of a lens model.
+        lens: name of a lens model, of all cameras or by camera.
     """
     blank = {
-        name: blank_camera((camera.width_px, camera.height_px), lens)
+        name: blank_camera((camera.width_px, camera.height_px), lens_of(lens, name))
         for name, camera in in_air.cameras.items()
     }
     found = first_cameras(views, points, blank, lens)

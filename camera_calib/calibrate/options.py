@@ -1,5 +1,6 @@
 """Options of `calibrate`: pictures, target, and prior knowledge of lens, port and water."""
 
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,12 +8,18 @@ from alice_survey.base.errors import CalibrationError
 from camera_calib.calibrate.solve import (
     Intrinsics,
 )
+from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.none import NoPort
 from camera_calib.rig import Rig
 from camera_calib.target_shape import (
     ShapeKind,
 )
 
+AUTO = "auto"
+"""The port that is found by trying all."""
+PORT_KINDS = (*PORTS, AUTO)
 ONE_CAMERA = "camera"
 """Name of the camera of `--pictures`."""
 
@@ -36,7 +43,9 @@ class CalibrateOptions:
     """How it may differ from its drawing."""
     output: Path | None = None
     """Folder to write."""
-    lens: str = "opencv5"
+    lens: str | None = None
+    """Lens model, of `freedom.LENSES`, and those of some cameras, as `by_camera` reads them; None:
+    the usual one of the start's lens, or opencv5."""
     water: bool = False
     """Whether the pictures were taken under water, through the ports."""
     start: Path | None = None
@@ -44,7 +53,8 @@ class CalibrateOptions:
     known: Intrinsics | None = None
     """Use of the intrinsics of `start`; None: prior if it has a covariance, or held."""
     port: str | None = None
-    """Kind of the port, of `optics.PORTS`, or auto: the likeliest; flat where None."""
+    """Kind of the port, of `optics.PORTS`, and those of single cameras, as `by_camera` reads them;
+    auto: the likeliest; None: that of the start, or flat."""
     dome_radius_mm: float | None = None
     """Outer radius of a dome."""
     port_distance_mm: float | None = None
@@ -90,6 +100,36 @@ class CalibrateOptions:
         return given
 
 
+def by_camera(
+    text: str, cameras: Iterable[str], option: str, known: Collection[str]
+) -> dict[str, str]:
+    """One name for all cameras, and others for some: `flat`, or `flat,bow=dome,side=none`.
+
+    Args:
+        text: the option.
+        cameras: names of all cameras.
+        option: its own name, for messages.
+        known: names that may be given.
+
+    Raises:
+        CalibrationError: a camera has none, or a name is unknown.
+    """
+    parts = [part.strip().rpartition("=")[::2] for part in text.split(",")]
+    usual = [kind for camera, kind in parts if not camera]
+    own = {camera.strip(): kind.strip() for camera, kind in parts if camera}
+    chosen = {**dict.fromkeys(cameras, usual[0] if usual else ""), **own}
+    wrong = sorted(set(own) - set(cameras))
+    if wrong or len(usual) > 1:
+        which = f"no camera is called {', '.join(wrong)}" if wrong else "two are for all cameras"
+        raise CalibrationError(f"{option} {text}: {which}; cameras are {', '.join(cameras)}")
+    for camera, kind in chosen.items():
+        if kind not in known:
+            raise CalibrationError(
+                f"{option} {text}: {kind or 'nothing'!r} for {camera}; choose {', '.join(known)}"
+            )
+    return chosen
+
+
 def check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
     """Reject options that do not go together, before the work starts.
 
@@ -122,9 +162,17 @@ def check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
         raise CalibrationError(
             f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
         )
-    if settings.port == "dome" and settings.dome_radius_mm is None:
+    names = list(settings.places())
+    kinds = {} if settings.port is None else by_camera(settings.port, names, "--port", PORT_KINDS)
+    domes = (
+        {}
+        if start is None
+        else {n: c.port.shape == DomePort.shape for n, c in start.cameras.items()}
+    )
+    unknown = [n for n, kind in kinds.items() if kind == DomePort.shape and not domes.get(n)]
+    if unknown and settings.dome_radius_mm is None:
         raise CalibrationError("--port dome needs --dome-radius, of its outer surface in mm")
-    if settings.glass_mm is None and settings.port != "none":
+    if settings.glass_mm is None and set(kinds.values()) != {NoPort.shape}:
         thin = start is None or not any(
             "glass_thickness_m" in c.parameters and c.parameter("glass_thickness_m") > 0.0
             for c in start.cameras.values()

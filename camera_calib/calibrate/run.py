@@ -16,6 +16,7 @@ from camera_calib.calibrate.solve import (
     calibrate_in_air,
     calibrate_through_ports,
 )
+from camera_calib.freedom import USUAL_LENS
 from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target
 
@@ -39,7 +40,7 @@ def run_calibrate(
     found = detect_views(_pool_pictures(pool), target, executor)
     warn_of_unseen(found)
     start = design_rig(camera, water, _scale(found.sizes["left"], camera))
-    lens = "fisheye" if camera.lens == "fisheye" else "opencv5"
+    lens = USUAL_LENS[camera.lens]
     known: Intrinsics = "free"
     if (pool / "air").is_dir():
         seen = detect_views(_pool_pictures(pool / "air"), target, executor)

@@ -32,10 +32,13 @@ from camera_calib.camera import Camera
 from camera_calib.freedom import (
     PINHOLE,
     Freedom,
+    LensNames,
     Prior,
     intrinsics,
     lens_kind,
+    lens_of,
     of_cameras,
+    of_lenses,
     of_ports,
     pose_names,
 )
@@ -167,7 +170,7 @@ def calibrate_in_air(
     views: Sequence[TargetView],
     points: Array,
     sizes: Mapping[str, tuple[int, int]],
-    lens: str = "opencv5",
+    lens: LensNames = "opencv5",
     start: Rig | None = None,
     shape: TargetShape | None = None,
 ) -> Calibration:
@@ -177,18 +180,17 @@ def calibrate_in_air(
         views: where the cameras saw the target.
         points: (N, 3) of the target, metres.
         sizes: width and height of each camera's pictures; the first is the reference.
-        lens: name of a lens model (`freedom.LENSES`).
+        lens: name of a lens model (`freedom.LENSES`), of all cameras or by camera.
         start: a rig near the truth, where one is known.
         shape: as of `calibrate`.
 
     Raises:
         CalibrationError: too few views, or they do not determine the cameras.
     """
-    names = intrinsics(lens)
     if start is None:
-        blank = {name: blank_camera(size, lens) for name, size in sizes.items()}
+        blank = {name: blank_camera(size, lens_of(lens, name)) for name, size in sizes.items()}
         start = first_rig(views, points, blank, lens)
-    free = (*of_cameras(start, names), *pose_names(start))
+    free = (*of_lenses(start, lens), *pose_names(start))
     freedom = Freedom(free=free)
     return calibrate(views, points, start, freedom, source="calibration in air", shape=shape)
 
@@ -199,7 +201,7 @@ def calibrate_through_ports(
     points: Array,
     start: Rig,
     known: Intrinsics,
-    lens: str = "opencv5",
+    lens: LensNames = "opencv5",
     sigmas: Mapping[str, float] | None = None,
     shape: TargetShape | None = None,
 ) -> Calibration:
@@ -211,7 +213,7 @@ def calibrate_through_ports(
         start: cameras calibrated in air, or a design; with glass, water and a guess of the ports.
         known: whether the cameras' intrinsics are held at the start's, taken with their
             covariance as a prior, or found again.
-        lens: name of the lens model that is found again.
+        lens: as of `calibrate_in_air`: the lens model that is found again.
         sigmas: more parameters that are known about as the start has them, such as
             `left.glass_thickness_m`, with their standard deviations.
         shape: as of `calibrate`.
@@ -223,7 +225,7 @@ def calibrate_through_ports(
     extra = Prior.around(start, sigmas or {})
     free = [*of_ports(start), *pose_names(start)]
     if known == "free":
-        free += of_cameras(start, intrinsics(lens))
+        free += of_lenses(start, lens)
     if known == "prior":
         extra = Prior.of_rig(start, of_cameras(start, intrinsics("full"))).and_also(extra)
     freedom = Freedom(
@@ -237,7 +239,7 @@ def calibrate_in_water_alone(
     views: Sequence[TargetView],
     points: Array,
     cameras: Mapping[str, Camera],
-    lens: str = "opencv5",
+    lens: LensNames = "opencv5",
     sigmas: Mapping[str, float] | None = None,
     shape: TargetShape | None = None,
 ) -> Calibration:
@@ -247,7 +249,7 @@ def calibrate_in_water_alone(
         views: where the cameras saw the target, under water.
         points: (N, 3) of the target, metres.
         cameras: blank ones (`blank_camera`) with glass, water and a guess of the port distance.
-        lens: name of a lens model.
+        lens: as of `calibrate_in_air`.
         sigmas: as of `calibrate_through_ports`.
         shape: as of `calibrate`.
 
@@ -274,7 +276,7 @@ def blank_camera(size: tuple[int, int], lens: str, port: PortValues = NO_PORT) -
 
 
 def first_rig(
-    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: str
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: LensNames
 ) -> Rig:
     """A rig near the truth from views alone: each camera, then their relative poses.
 
@@ -292,7 +294,7 @@ def first_rig(
 
 
 def first_cameras(
-    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: str
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, Camera], lens: LensNames
 ) -> dict[str, Camera]:
     """Each camera near the truth from its own views, its port held.
 
@@ -307,7 +309,10 @@ def first_cameras(
                 f"{count} views of the target from {name}; at least {_FEWEST_VIEWS} are "
                 "needed: take more, nearer and at more angles"
             )
-    return {name: _alone(name, camera, usable, points, lens) for name, camera in blank.items()}
+    return {
+        name: _alone(name, camera, usable, points, lens_of(lens, name))
+        for name, camera in blank.items()
+    }
 
 
 def _alone(

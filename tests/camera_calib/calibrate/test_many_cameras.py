@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import SERIAL
+from camera_calib.calibrate.by_options import calibrated, port_kinds
+from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
 from camera_calib.camera import Camera
+from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import Target, parse_target
 from tests.camera_calib.calibration_scenes import differences
@@ -92,10 +98,8 @@ def matrix_of(rig: Rig, name: str, pose: RigidTransform) -> np.ndarray:
     return inner @ cam_from_target[:3, [0, 1, 3]]
 
 
-def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
-    """From nothing but corners; no view is seen by all of them."""
-    truth, rng = four_cameras(), np.random.default_rng(5)
-    poses = poses_before(truth, TARGET, 40, rng)
+def seen_by(truth: Rig, poses: RigidTransform, rng: np.random.Generator) -> Detections:
+    """Corners of the target in cameras that see it whole."""
     views = []
     for v in range(len(poses)):
         pixels = {}
@@ -104,8 +108,17 @@ def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
                 seen = pixels_of(truth, name, poses[v], TARGET)
                 pixels[name] = seen + rng.normal(0.0, NOISE_PX, seen.shape)
         views.append(TargetView(name=f"{v:02d}", pixels=pixels))
-    assert {len(view.pixels) for view in views} >= {2, 3}
     sizes = {name: (c.width_px, c.height_px) for name, c in truth.cameras.items()}
+    return Detections(sizes=sizes, views=tuple(views), rejections=())
+
+
+def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
+    """From nothing but corners; no view is seen by all of them."""
+    truth, rng = four_cameras(), np.random.default_rng(5)
+    poses = poses_before(truth, TARGET, 40, rng)
+    found_corners = seen_by(truth, poses, rng)
+    views, sizes = found_corners.views, found_corners.sizes
+    assert {len(view.pixels) for view in views} >= {2, 3}
 
     found = calibrate_in_air(views, TARGET.points, sizes, "k2")
 
@@ -120,6 +133,53 @@ def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
     for name in ("right", "bow", "side"):
         assert sigmas[f"{name}.x_m"] < 2e-3
         assert sigmas[f"{name}.rx_rad"] < 1e-3
+
+
+def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> None:
+    rig, rng = four_cameras(), np.random.default_rng(8)
+    fisheye = FisheyeLens(fx_px=420.0, fy_px=421.0, cx_px=365.0, cy_px=268.0, k1=-0.02, k2=0.004)
+    dome = DomePort(outer_radius_m=0.07, glass_thickness_m=0.005, dome_x_m=0.001, dome_z_m=0.006)
+    ports = {
+        "left": FlatPort(port_distance_m=0.03, glass_thickness_m=0.005, n_glass=1.49),
+        "right": FlatPort(port_distance_m=0.015, glass_thickness_m=0.005, n_glass=1.49),
+        "bow": dome,
+        "side": replace(dome, dome_x_m=0.0, dome_z_m=-0.003),
+    }
+    lenses = {name: one.lens for name, one in rig.cameras.items()} | {"side": fisheye}
+    dry = replace(rig, cameras={n: replace(c, lens=lenses[n]) for n, c in rig.cameras.items()})
+    wet = replace(dry, cameras={n: replace(c, port=ports[n]) for n, c in dry.cameras.items()})
+    terms = "k2,side=fisheye"
+    in_air = calibrated(
+        CalibrateOptions(lens=terms),
+        seen_by(dry, poses_before(dry, TARGET, 30, rng), rng), TARGET, None,
+    ).rig  # fmt: skip
+    under_water = CalibrateOptions(
+        lens=terms, water=True, port="flat,bow=dome,side=dome", dome_radius_mm=70.0,
+        glass_mm=5.0, n_glass=1.49,
+    )  # fmt: skip
+    views = seen_by(wet, poses_before(wet, TARGET, 30, rng), rng)
+
+    found = calibrated(under_water, views, TARGET, in_air)
+
+    errors, sigmas = differences(found.rig, wet), found.rig.sigmas
+    over = np.array([errors[key] / sigmas[key] for key in sigmas])
+    assert {f"{n}.dome_z_m" for n in ("bow", "side")} <= set(sigmas)
+    assert np.abs(over).max() < 4.5
+    assert 0.6 < np.sqrt(np.mean(over**2)) < 1.4
+    assert 0.9 * NOISE_PX < found.noise_px < 1.1 * NOISE_PX
+    again = calibrated(replace(under_water, port=None, lens=None), views, TARGET, found.rig)
+    assert [c.port.shape for c in again.rig.cameras.values()] == ["flat", "flat", "dome", "dome"]
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [("flat,stern=dome", "no camera is called stern"), ("bow=dome", "'nothing' for left"),
+     ("cube", "'cube' for left; choose none, flat, dome, auto"), ("flat,dome", "two are for all"),
+     ("auto,bow=dome", "auto is for all")],
+)  # fmt: skip
+def test_a_wrong_port_is_named(text: str, fault: str) -> None:
+    with pytest.raises(CalibrationError, match=fault):
+        port_kinds(CalibrateOptions(port=text), list(four_cameras().cameras), None)
 
 
 @pytest.mark.slow
