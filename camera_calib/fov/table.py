@@ -23,6 +23,7 @@ from camera_calib.fov.focus import (
     air_rays,
     apparent_depths,
 )
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, design_rig
 
 MATCH_SIGMA_PX = 0.3
@@ -35,7 +36,7 @@ out at its edges, 1 / cos^2 of the half angle in the corner's radius, 2.4 times 
 _POINTS_PER_SIDE = 16
 """Points of a frame's border on each side."""
 
-TRUSTED_FOV_DEG = 70.0
+TRUSTED_FOV_DEG = FlatPort.trusted_deg
 """Full angle in air up to which the paper trusts a flat port (its section III.B)."""
 
 
@@ -121,7 +122,7 @@ class FovRow:
     corner_blur_px: float
     """Longer axis of its blur in the worst corner: the port's field curvature and astigmatism."""
     within_trusted_fov: bool
-    """The diagonal is within the 70 degrees for which the paper trusts a flat port."""
+    """The diagonal is within what the port is trusted for: 70 degrees for a flat one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,7 +317,7 @@ def _row(
         frame_far_altitude_m=frame_far,
         floor_blur_px=float(blur[0].max()),
         corner_blur_px=float(blur[1:].max()),
-        within_trusted_fov=air_deg <= TRUSTED_FOV_DEG,
+        within_trusted_fov=air_deg <= camera.port.trusted_deg,
     )
 
 

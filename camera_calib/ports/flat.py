@@ -71,6 +71,9 @@ class FlatPort(PortValues):
     normal: Vector = (0.0, 0.0, 1.0)
     """Unit normal of the port in the camera frame, pointing into the water."""
 
+    trusted_deg: ClassVar[float] = 70.0
+    """By the paper, section III.B."""
+
     @classmethod
     def guess(cls) -> Self:
         """Two centimetres before the pupil."""

@@ -52,6 +52,9 @@ class PortValues(ABC):
     needs_air: ClassVar[bool] = False
     """Whether views under water alone leave its place and the lens's focal length undetermined."""
 
+    trusted_deg: ClassVar[float] = math.inf
+    """Full angle of a lens in air up to which it is trusted to be sharp."""
+
     @classmethod
     @abstractmethod
     def guess(cls) -> Self:

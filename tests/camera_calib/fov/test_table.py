@@ -268,6 +268,8 @@ def test_wide_lenses_are_marked() -> None:
     narrow, wide = fov_table([12.5, 8.0], [2.0], 1.34, PORT)
     assert narrow.within_trusted_fov
     assert not wide.within_trusted_fov
+    (domed,) = fov_table([8.0], [2.0], 1.34, PORT.model_copy(update={"port": "dome"}))
+    assert domed.within_trusted_fov
 
 
 def test_blur_is_the_way_made_in_pixels_and_the_longest_exposure_its_inverse() -> None:
