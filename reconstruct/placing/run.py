@@ -4,6 +4,7 @@
 so that a new scale or georeference does not repeat the mapping.
 """
 
+import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -304,6 +305,11 @@ def _fit(
     sigma = known.sigma if known is not None and ties.informs_scale else 0.0
     fit = None
     if task.datum is not None:
+        if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
+            warn(
+                "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
+                "import the pictures with --rig, whose body_from_rig says so"
+            )
         fit = fit_navigation(
             task.records,
             task.pinholes,
