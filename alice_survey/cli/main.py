@@ -252,6 +252,8 @@ def target(
         "calibrate --left L --right R --own-clocks --target board.json -o air",
         "calibrate --left L --right R --target board.json --water --start air/rig.json"
         " --glass 10 -o pool",
+        "calibrate --camera bow=B --camera down=D --target board.json --water --start air/rig.json"
+        " --port flat,bow=dome --dome-radius 80 --glass 6 -o wet",
     )
 )
 def calibrate(

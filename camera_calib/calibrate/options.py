@@ -124,9 +124,8 @@ def by_camera(
         raise CalibrationError(f"{option} {text}: {which}; cameras are {', '.join(cameras)}")
     for camera, kind in chosen.items():
         if kind not in known:
-            raise CalibrationError(
-                f"{option} {text}: {kind or 'nothing'!r} for {camera}; choose {', '.join(known)}"
-            )
+            wrong_kind = f"{kind!r} for {camera}" if kind else f"there is none for {camera}"
+            raise CalibrationError(f"{option} {text}: {wrong_kind}; choose {', '.join(known)}")
     return chosen
 
 

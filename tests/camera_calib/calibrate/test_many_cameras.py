@@ -173,7 +173,7 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
 
 @pytest.mark.parametrize(
     ("text", "fault"),
-    [("flat,stern=dome", "no camera is called stern"), ("bow=dome", "'nothing' for left"),
+    [("flat,stern=dome", "no camera is called stern"), ("bow=dome", "there is none for left"),
      ("cube", "'cube' for left; choose none, flat, dome, auto"), ("flat,dome", "two are for all"),
      ("auto,bow=dome", "auto is for all")],
 )  # fmt: skip
