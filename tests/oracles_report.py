@@ -101,7 +101,7 @@ def adjusted(
 
 
 def all_free(rig: Rig) -> Freedom:
-    names = (*intrinsics("opencv5"), *FlatPort.estimated)
+    names = (*intrinsics("opencv5"), *FlatPort.places, *FlatPort.tilts)
     return Freedom(free=(*of_cameras(rig, names), *pose_names(rig)))
 
 
