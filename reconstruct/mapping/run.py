@@ -268,6 +268,12 @@ def _match_all(
 ) -> list[VerifiedPair]:
     placed = placed_pictures(inputs.records, inputs.rig, inputs.datum)
     lost = [i for i in range(len(inputs.records)) if i not in placed]
+    unseen = sum(inputs.records[i].has_attitude for i in lost)
+    if inputs.rig is not None and inputs.datum is not None and unseen:
+        warn(
+            f"{unseen} pictures with an attitude have no footprint (they see the horizon, or have "
+            "no altitude): their partners are sought in their order and by their looks"
+        )
     alike: list[tuple[int, int]] = []
     if len(inputs.records) > SMALL_SET:
         alike = alike_pairs(features, lost, _ALIKE, seed=seed, executor=executor)

@@ -80,7 +80,7 @@ def choose_pairs(
     maybe: set[Pair] = set()
     placed = placed_pictures(records, rig, datum)
     if datum is not None and rig is not None:
-        posed = [i for i, r in enumerate(records) if _has_pose(r)]
+        posed = sorted(placed)
         near, touching = _overlapping([records[i] for i in posed], rig, datum)
         sure |= {(posed[i], posed[j]) for i, j in near}
         maybe |= {(posed[i], posed[j]) for i, j in touching}
@@ -99,11 +99,16 @@ def choose_pairs(
 def placed_pictures(
     records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
 ) -> set[int]:
-    """Pictures whose partners navigation names."""
+    """Pictures whose partners navigation names.
+
+    One that sees the horizon has no footprint: what it shares with others is not known.
+    """
     if datum is None:
         return set()
     if rig is not None:
-        return {i for i, r in enumerate(records) if _has_pose(r)}
+        posed = [i for i, r in enumerate(records) if _has_pose(r)]
+        ground = footprints([records[i] for i in posed], rig, datum)
+        return {i for i, polygon in zip(posed, ground, strict=True) if not polygon.is_empty}
     if len(records) > SMALL_SET:
         return {i for i, r in enumerate(records) if r.has_position}
     return set()
@@ -174,8 +179,7 @@ def _overlapping(
 ) -> tuple[set[Pair], set[Pair]]:
     polygons = footprints(records, rig, datum)
     wider = [p.buffer(_reach_m(r)) for p, r in zip(polygons, records, strict=True)]
-    centres = np.array([p.centroid.coords[0] if not p.is_empty else (np.nan, np.nan)
-                        for p in polygons]).reshape(-1, 2)  # fmt: skip
+    centres = np.array([p.centroid.coords[0] for p in polygons]).reshape(-1, 2)
     group = joined_cameras(records, polygons)
     sure: dict[Pair, float] = {}
     across: dict[Pair, float] = {}

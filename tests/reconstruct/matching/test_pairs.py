@@ -19,6 +19,7 @@ from reconstruct.matching.pairs import (
     make_codebook,
     nearest_each,
     neighbours,
+    placed_pictures,
     well_conditioned,
 )
 from tests.oracles_matching import vlad_slowly
@@ -291,3 +292,15 @@ def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
     save_features(files[2], empty)
     words = make_codebook(files, seed=4)
     assert not describe(files[2], words).any()
+
+
+@pytest.mark.parametrize("off_nadir_deg", [75.0, 90.0])
+def test_pictures_that_see_the_horizon_are_paired_by_order_and_looks(off_nadir_deg: float) -> None:
+    scene = make_scene(lines=1, stations=70, points=50)
+    tilt = RigidTransform.from_rotation(Rotation.from_euler("x", off_nadir_deg, degrees=True))
+    rig = replace(scene.rig, body_from_rig=scene.rig.body_from_rig * tilt)
+    assert not placed_pictures(scene.records, rig, DATUM)
+    sure, maybe = choose_pairs(scene.records, rig, DATUM, alike=[(0, 60)])
+    assert set(sure) == neighbours(scene.records, NEIGHBOURS)
+    assert maybe == [(0, 60)]
+    assert len(placed_pictures(scene.records, scene.rig, DATUM)) == len(scene.records)
