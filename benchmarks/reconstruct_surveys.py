@@ -2,8 +2,10 @@
 
 import csv
 import os
+import re
 import shutil
 import subprocess
+from importlib import resources
 from pathlib import Path
 
 from alice_survey.base.artefacts import read_stage, write_csv
@@ -34,32 +36,16 @@ def survey_toml(pictures: int, scale: int) -> str:
         scale: divides the camera's resolution.
     """
     side = (1.1 * pictures / 116) ** 0.5  # the demo has 116 pictures of 4.5 x 3.7 m; and a margin
-    return f"""name = "benchmark"
-seed = 7
+    return demo_like(4.5 * side + 0.6, 3.7 * side + 0.6, scale)
 
-[area]
-length_m = {4.5 * side + 0.6:.2f}
-width_m = {3.7 * side + 0.6:.2f}
-seafloor_depth_m = 15.0
 
-[plan]
-altitude_m = 2.0
-speed_mps = 0.2
-forward_overlap = 0.62
-side_overlap = 0.3
-cross_lines = 1
-
-[seafloor]
-relief_m = 0.35
-rocks_per_m2 = 0.8
-amphora = true
-
-[imaging]
-scale = {scale}
-
-[reconstruct]
-max_features = 3000
-"""
+def demo_like(length_m: float, width_m: float, scale: int = 4) -> str:
+    """Settings of the demo, over an area of another size."""
+    text = (resources.files("alice_survey") / "demo.toml").read_text()
+    for name, value in (("length_m", length_m), ("width_m", width_m), ("scale", scale)):
+        text, count = re.subn(rf"(?m)^{name} = .*$", f"{name} = {value:.6g}", text)
+        assert count == 1, name
+    return text
 
 
 def subset(whole: Path, part: Path, pictures: int) -> Path:

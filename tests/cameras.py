@@ -1,11 +1,15 @@
 """Cameras for tests."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
+
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
+from camera_calib.rig import Rig
 
 
 def flat_port_camera(*, width_px: int, height_px: int, **values: Any) -> Camera:
@@ -26,4 +30,25 @@ def changed(camera: Camera, **values: Any) -> Camera:
     return replace(
         camera,
         **{"lens": replace(camera.lens, **lens), "port": replace(camera.port, **port), **size},
+    )
+
+
+def rig_of(
+    cameras: Mapping[str, Camera],
+    turns_deg: Mapping[str, Sequence[float]],
+    places_m: Mapping[str, Sequence[float]],
+    body_from_rig: RigidTransform,
+) -> Rig:
+    """A rig of cameras turned about its x, y and z, and at places on it."""
+    poses = {
+        name: RigidTransform.from_components(
+            places_m[name], Rotation.from_euler("xyz", turns_deg[name], degrees=True)
+        )
+        for name in cameras
+    }
+    return Rig(
+        cameras=cameras,
+        cam_from_rig={name: pose.inv() for name, pose in poses.items()},
+        body_from_rig=body_from_rig,
+        source="truth",
     )

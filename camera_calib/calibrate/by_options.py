@@ -51,7 +51,7 @@ def calibrated(
     start = None if start is None else matching(start, found.sizes)
     lens = lens_names(settings, found.sizes, start)
     if not settings.water:
-        bare = start_cameras(settings, found.sizes, start, dict.fromkeys(found.sizes, NoPort.shape))
+        bare = start_cameras(settings, found.sizes, start)
         start = None if start is None else replace(start, cameras=bare)
         views = _numbered(found, target, bare, lens, known=start is not None)
         shape = shape_of(target, settings.target_shape)
@@ -155,11 +155,13 @@ def lens_names(
 def port_kinds(
     settings: CalibrateOptions, cameras: Collection[str], start: Rig | None
 ) -> dict[str, str]:
-    """The kind of port of each camera: as named, or that of the start, or a flat one.
+    """The kind of port of each camera: as named, or that of the start, or flat; none in air.
 
     Raises:
         CalibrationError: a name is unknown, or auto is for some of the cameras only.
     """
+    if not settings.water:
+        return dict.fromkeys(cameras, NoPort.shape)
     if settings.port is not None:
         kinds = by_camera(settings.port, cameras, "--port", PORT_KINDS)
         if AUTO in kinds.values() and len(set(kinds.values())) > 1:
@@ -176,9 +178,10 @@ def start_cameras(
     settings: CalibrateOptions,
     sizes: Mapping[str, Size],
     start: Rig | None,
-    kinds: Mapping[str, str],
+    kinds: Mapping[str, str] | None = None,
 ) -> dict[str, Camera]:
-    """Cameras of the start, or blank ones, behind ports of the named kinds."""
+    """Cameras of the start, or blank ones, behind ports of some kinds, or of `port_kinds`."""
+    kinds = port_kinds(settings, sizes, start) if kinds is None else kinds
     if start is None:
         lens = lens_names(settings, sizes, None)
         return {

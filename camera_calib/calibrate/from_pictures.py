@@ -19,7 +19,6 @@ from camera_calib.calibrate.by_options import (
     calibrated,
     lens_names,
     matching,
-    port_kinds,
     start_cameras,
 )
 from camera_calib.calibrate.detect_views import Detections, detect_views
@@ -38,7 +37,6 @@ from camera_calib.calibrate.solve import (
 )
 from camera_calib.calibrate.text import calibration_text
 from camera_calib.calibration import Calibration, TargetView
-from camera_calib.ports.none import NoPort
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
 
@@ -130,10 +128,7 @@ def _on_one_clock(
     warn_of_unseen(found)
     points = target.points
     start = None if start is None else matching(start, found.sizes)
-    kinds = dict.fromkeys(found.sizes, NoPort.shape)
-    if settings.water:
-        kinds = port_kinds(settings, found.sizes, start)
-    cameras = start_cameras(settings, found.sizes, start, kinds)
+    cameras = start_cameras(settings, found.sizes, start)
     if start is None:
         some = [
             view

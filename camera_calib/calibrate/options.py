@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.solve import (
-    Intrinsics,
-)
+from camera_calib.calibrate.solve import Intrinsics
 from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras
 from camera_calib.ports.dome import DomePort

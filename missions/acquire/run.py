@@ -224,7 +224,7 @@ def _believed(path: Path, at_s: Array) -> list[ImageRecord]:
     columns = {"time_s": at_s, **log.at(at_s)}
     nameless = ImageRecord(image="", camera="", station=0)
     return [
-        replace(nameless, **{name: float(values[i]) for name, values in columns.items()})  # type: ignore[arg-type]
+        replace(nameless, **{name: float(values[i]) for name, values in columns.items()})  # type: ignore[arg-type]  # all are numbers
         for i in range(len(at_s))
     ]
 

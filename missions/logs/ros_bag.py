@@ -170,7 +170,7 @@ def _bounded_chunks() -> Iterator[None]:
 
     It has no setting for that: its tables of what unpacks a chunk are changed, and put back.
     """
-    import lz4.frame  # type: ignore[import-untyped]
+    import lz4.frame  # type: ignore[import-untyped]  # it has no types
     from rosbags.rosbag1.reader import decompressors as of_ros1
     from rosbags.rosbag2.storage_mcap import DECOMPRESSORS as OF_MCAP
     from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]  # by Python's age

@@ -9,6 +9,7 @@ triangulation, so that an error of the baseline scales a length and leaves its p
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,11 @@ def polyline(points: Array) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
+def _segment(number: int, points: Array) -> float:
+    """Length of one segment of that line."""
+    return polyline(points[number : number + 2])
+
+
 def polygon_area(points: Array) -> float:
     """Area of the closed polygon through points (N, 3): the length of its vector area."""
     local = points - points.mean(axis=0)
@@ -162,7 +168,7 @@ def _described(words: list[str], located: Located) -> tuple[str, dict[str, Any]]
         }
 
     for n in range(count - 1):
-        found = entry(lambda p, n=n: polyline(p[n : n + 2]), "m")  # type: ignore[misc]
+        found = entry(partial(_segment, n), "m")
         segments.append({"from": words[n], "to": words[n + 1], **found})
         lines.append(
             f"{words[n]} to {words[n + 1]}: {1e3 * found['value_m']:.2f} mm, sigma "

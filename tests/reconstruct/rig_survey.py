@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.base.config import ImagingConfig, SeafloorConfig
@@ -41,6 +41,7 @@ from reconstruct.evaluate.mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate.surface import SurfaceScore, score_surface
 from reconstruct.evaluate.truth import count_stations, ground_pixel_m
 from reconstruct.placing.track import read_track_poses
+from tests.cameras import rig_of
 
 DATUM = Datum(32.8236, 34.9553)
 DEPTH_M, ALTITUDE_M = 6.0, 1.6
@@ -82,17 +83,8 @@ def four_cameras() -> Rig:
         "wide": [0, 0, 0], "tele": [0.14, 0.01, 0], "bow": [0.06, -0.12, 0.02],
         "side": [0.2, 0.1, -0.01],
     }  # fmt: skip
-    return Rig(
-        cameras=cameras,
-        cam_from_rig={
-            name: RigidTransform.from_components(
-                places[name], Rotation.from_euler("xyz", turns[name], degrees=True)
-            ).inv()
-            for name in cameras
-        },
-        body_from_rig=RigidTransform.from_components([0.1, -0.1, 0.05], BODY_FROM_NADIR_CAM),
-        source="truth of a rendered survey",
-    )
+    body_from_rig = RigidTransform.from_components([0.1, -0.1, 0.05], BODY_FROM_NADIR_CAM)
+    return rig_of(cameras, turns, places, body_from_rig)
 
 
 def bodies(lines: int = LINES) -> RigidTransform:

@@ -91,7 +91,7 @@ def test_names_for_readers_and_for_type_checkers_are_the_same() -> None:
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="reed_plan"):
-        _ = alice.reed_plan  # type: ignore[attr-defined]
+        _ = alice.reed_plan  # type: ignore[attr-defined]  # on purpose
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import Target, parse_target
 from tests.camera_calib.calibration_scenes import differences
-from tests.cameras import changed
+from tests.cameras import changed, rig_of
 from tests.oracles_targets import picture_light, to_srgb
 
 TARGET = parse_target("chessboard 9x6 40mm")
@@ -54,17 +54,7 @@ def four_cameras() -> Rig:
         "left": [0, 0, 0], "right": [0.18, 0.01, 0.0], "bow": [0.05, -0.35, 0.03],
         "side": [-0.4, 0.02, 0.05],
     }  # fmt: skip
-    return Rig(
-        cameras=cameras,
-        cam_from_rig={
-            name: RigidTransform.from_components(
-                places[name], Rotation.from_euler("xyz", turns[name], degrees=True)
-            ).inv()
-            for name in cameras
-        },
-        body_from_rig=RigidTransform.identity(),
-        source="truth",
-    )
+    return rig_of(cameras, turns, places, RigidTransform.identity())
 
 
 def poses_before(rig: Rig, target: Target, count: int, rng: np.random.Generator) -> RigidTransform:
@@ -179,7 +169,7 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
 )  # fmt: skip
 def test_a_wrong_port_is_named(text: str, fault: str) -> None:
     with pytest.raises(CalibrationError, match=fault):
-        port_kinds(CalibrateOptions(port=text), list(four_cameras().cameras), None)
+        port_kinds(CalibrateOptions(port=text, water=True), list(four_cameras().cameras), None)
 
 
 @pytest.mark.slow
