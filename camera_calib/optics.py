@@ -5,8 +5,6 @@ its port with the port's. A new lens or port is one file, and one branch in each
 Rows without a solution are NaN.
 """
 
-import math
-
 import numpy as np
 
 from alice_survey.base.compiled import BLOCK as _BLOCK
@@ -15,8 +13,8 @@ from alice_survey.base.frames import Array
 from camera_calib.lenses.fisheye import FisheyeLens, fisheye_pixels, fisheye_rays, fisheye_slopes
 from camera_calib.lenses.opencv import OpenCVLens, opencv_pixels, opencv_rays, opencv_slopes
 from camera_calib.lenses.values import LensValues
-from camera_calib.ports.dome import DomePort, dome_leave, dome_ray, dome_rays, dome_slopes
-from camera_calib.ports.flat import FlatPort, flat_leave, flat_ray, flat_rays, flat_slopes
+from camera_calib.ports.dome import DomePort, dome_leave, dome_rays, dome_slopes
+from camera_calib.ports.flat import FlatPort, flat_leave, flat_rays, flat_slopes
 from camera_calib.ports.none import NoPort, bare_leave, bare_rays
 from camera_calib.ports.values import PortValues
 
@@ -29,11 +27,11 @@ _FLAT, _DOME = FlatPort.kind, DomePort.kind
 
 
 @compiled_ieee
-def _air_rays(points: Array, port_kind: int, port: Array, rays: Array) -> None:
+def _air_rays(points: Array, port_kind: int, port: Array, rays: Array, turns: Array) -> None:
     if port_kind == _FLAT:
-        flat_rays(points, port, rays)
+        flat_rays(points, port, rays, turns)
     elif port_kind == _DOME:
-        dome_rays(points, port, rays)
+        dome_rays(points, port, rays, turns)
     else:
         bare_rays(points, rays)
 
@@ -51,10 +49,10 @@ def project(points: Array, optics: Optics) -> Array:
     """(N, 2) pixels of (N, 3) points."""
     lens_kind, lens, port_kind, port = optics
     pixels = np.empty((points.shape[0], 2))
-    rays = np.empty((_BLOCK, 3))
+    rays, turns = np.empty((_BLOCK, 3)), np.empty(_BLOCK)
     for first in range(0, points.shape[0], _BLOCK):
         block = points[first : first + _BLOCK]
-        _air_rays(block, port_kind, port, rays)
+        _air_rays(block, port_kind, port, rays, turns)
         _pixels(rays[: len(block)], lens_kind, lens, pixels[first : first + _BLOCK])
     return pixels
 
@@ -100,30 +98,23 @@ def project_jacobian(
     pixels = np.empty((count, 2))
     by_point = np.empty((count, 2, 3))
     by_parameter = np.empty((count, 2, of_lens + of_port))
-    by_ray = np.empty((2, 3))
-    for i in range(count):
-        point = points[i]
-        turn = 0.0
-        if port_kind == _FLAT:
-            dx, dy, dz, turn = flat_ray(point, port)
-        elif port_kind == _DOME:
-            dx, dy, dz, turn = dome_ray(point, port)
-        else:
-            dx, dy, dz = point[0], point[1], point[2]
-        ray = dx, dy, dz
-        by_lens, by_port = by_parameter[i, :, :of_lens], by_parameter[i, :, of_lens:]
+    air, turns, by_air = np.empty((_BLOCK, 3)), np.empty(_BLOCK), np.empty((_BLOCK, 2, 3))
+    for first in range(0, count, _BLOCK):
+        end = min(first + _BLOCK, count)
+        block, rays, by_ray = points[first:end], air[: end - first], by_air[: end - first]
+        by_lens, by_port = (
+            by_parameter[first:end, :, :of_lens],
+            by_parameter[first:end, :, of_lens:],
+        )
+        _air_rays(block, port_kind, port, rays, turns)
         if lens_kind == _FISHEYE:
-            x, y = fisheye_slopes(ray, lens, by_ray, by_lens)
+            fisheye_slopes(rays, lens, pixels[first:end], by_ray, by_lens)
         else:
-            x, y = opencv_slopes(ray, lens, by_ray, by_lens)
-        pixels[i, 0], pixels[i, 1] = x, y
-        if not math.isfinite(x):
-            by_point[i, :, :] = math.nan
-            by_parameter[i, :, :] = math.nan
-        elif port_kind == _FLAT:
-            flat_slopes(point, turn, port, by_ray, by_point[i], by_port)
+            opencv_slopes(rays, lens, pixels[first:end], by_ray, by_lens)
+        if port_kind == _FLAT:
+            flat_slopes(block, turns, port, by_ray, by_point[first:end], by_port)
         elif port_kind == _DOME:
-            dome_slopes(point, turn, port, by_ray, by_point[i], by_port)
+            dome_slopes(block, turns, port, by_ray, by_point[first:end], by_port)
         else:
-            by_point[i, :, :] = by_ray
+            by_point[first:end] = by_ray
     return pixels, by_point, by_parameter

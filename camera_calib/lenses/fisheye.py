@@ -125,44 +125,46 @@ def _angle_of(radius: float, most: float, lens: Array) -> float:
 
 
 @compiled_ieee
-def fisheye_slopes(
-    ray: tuple[float, float, float], lens: Array, by_ray: Array, by_lens: Array
-) -> tuple[float, float]:
-    """The pixel of one ray in air, NaN without one; fill in its slopes.
+def fisheye_slopes(rays: Array, lens: Array, pixels: Array, by_ray: Array, by_lens: Array) -> None:
+    """Pixels of rays in air with their slopes, all to be filled in; NaN without a pixel.
 
     Args:
-        ray: of any length.
+        rays: (B, 3), of any length.
         lens: `FisheyeLens.values`.
-        by_ray: (2, 3) to be filled in.
-        by_lens: (2, 8) to be filled in.
+        pixels: (B, 2).
+        by_ray: (B, 2, 3).
+        by_lens: (B, 2, 8).
     """
-    dx, dy, dz = ray
-    side2 = dx * dx + dy * dy
-    length2 = side2 + dz * dz
-    sideways = math.sqrt(side2)
-    angle = math.atan2(sideways, dz)
-    if not angle < lens[_LIMIT]:
-        return math.nan, math.nan
-    radius, steep = _radius(angle, lens)
-    by_lens[:, :] = 0.0
-    if sideways > 0.0:
-        stretch = radius / sideways
-        radial, ex, ey = steep * dz / length2, dx / sideways, dy / sideways
-    else:
-        stretch = radial = 1.0 / dz
-        ex = ey = 0.0
-    bend = radial - stretch
-    for row in range(2):
-        focal = lens[row]
-        along = ex if row == 0 else ey
-        by_ray[row, 0] = focal * bend * along * ex
-        by_ray[row, 1] = focal * bend * along * ey
-        by_ray[row, row] += focal * stretch
-        by_ray[row, 2] = -focal * steep * (dx if row == 0 else dy) / length2
-        by_lens[row, row] = stretch * (dx if row == 0 else dy)
-        by_lens[row, 2 + row] = 1.0
-        power = angle
-        for i in range(4):
-            power *= angle * angle
-            by_lens[row, 4 + i] = focal * along * power
-    return lens[0] * stretch * dx + lens[2], lens[1] * stretch * dy + lens[3]
+    for j in range(len(rays)):
+        dx, dy, dz = rays[j, 0], rays[j, 1], rays[j, 2]
+        side2 = dx * dx + dy * dy
+        length2 = side2 + dz * dz
+        sideways = math.sqrt(side2)
+        angle = math.atan2(sideways, dz)
+        if not angle < lens[_LIMIT]:
+            pixels[j, :] = math.nan
+            by_ray[j, :, :] = math.nan
+            by_lens[j, :, :] = math.nan
+            continue
+        radius, steep = _radius(angle, lens)
+        if sideways > 0.0:
+            stretch = radius / sideways
+            radial, ex, ey = steep * dz / length2, dx / sideways, dy / sideways
+        else:
+            stretch = radial = 1.0 / dz
+            ex = ey = 0.0
+        bend = radial - stretch
+        for row in range(2):
+            focal, across = lens[row], 1 - row
+            along, side = (ex, dx) if row == 0 else (ey, dy)
+            by_ray[j, row, 0] = focal * bend * along * ex
+            by_ray[j, row, 1] = focal * bend * along * ey
+            by_ray[j, row, row] += focal * stretch
+            by_ray[j, row, 2] = -focal * steep * side / length2
+            by_lens[j, row, row], by_lens[j, row, across] = stretch * side, 0.0
+            by_lens[j, row, 2 + row], by_lens[j, row, 2 + across] = 1.0, 0.0
+            pixels[j, row] = focal * stretch * side + lens[2 + row]
+            power = angle
+            for i in range(4):
+                power *= angle * angle
+                by_lens[j, row, 4 + i] = focal * along * power

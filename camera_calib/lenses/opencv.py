@@ -228,41 +228,47 @@ def opencv_rays(pixels: Array, lens: Array, rays: Array) -> None:
 
 
 @compiled_ieee
-def opencv_slopes(
-    ray: tuple[float, float, float], lens: Array, by_ray: Array, by_lens: Array
-) -> tuple[float, float]:
-    """The pixel of one ray in air, NaN without one; fill in its slopes.
+def opencv_slopes(rays: Array, lens: Array, pixels: Array, by_ray: Array, by_lens: Array) -> None:
+    """Pixels of rays in air with their slopes, all to be filled in; NaN without a pixel.
 
     Args:
-        ray: of any length.
+        rays: (B, 3), of any length.
         lens: `OpenCVLens.values`.
-        by_ray: (2, 3) to be filled in.
-        by_lens: (2, 16) to be filled in.
+        pixels: (B, 2).
+        by_ray: (B, 2, 3).
+        by_lens: (B, 2, 16).
     """
-    dx, dy, dz = ray
-    u, v = dx / dz, dy / dz
-    if not (dz > 0.0 and u * u + v * v < lens[_COUNT]):
-        return math.nan, math.nan
-    fx, fy, k = lens[0], lens[1], lens[4:_COUNT]
-    x, y, x_u, x_v, y_u, y_v = distort_slopes(u, v, k)
-    by_ray[0, 0], by_ray[0, 1] = fx * x_u / dz, fx * x_v / dz
-    by_ray[1, 0], by_ray[1, 1] = fy * y_u / dz, fy * y_v / dz
-    for row in range(2):
-        by_ray[row, 2] = -(u * by_ray[row, 0] + v * by_ray[row, 1])
-    r2 = u * u + v * v
-    ratio, _, bottom = radial(r2, k)
-    by_lens[:, :] = 0.0
-    by_lens[0, 0], by_lens[1, 1], by_lens[0, 2], by_lens[1, 3] = x, y, 1.0, 1.0
-    xu, yv = fx * u, fy * v
-    one, two, three = r2 / bottom, r2 * r2 / bottom, r2 * r2 * r2 / bottom
-    by_lens[0, 4], by_lens[1, 4] = xu * one, yv * one
-    by_lens[0, 5], by_lens[1, 5] = xu * two, yv * two
-    by_lens[0, 6], by_lens[1, 6] = fx * 2.0 * u * v, fy * (r2 + 2.0 * v * v)
-    by_lens[0, 7], by_lens[1, 7] = fx * (r2 + 2.0 * u * u), fy * 2.0 * u * v
-    by_lens[0, 8], by_lens[1, 8] = xu * three, yv * three
-    by_lens[0, 9], by_lens[1, 9] = -xu * ratio * one, -yv * ratio * one
-    by_lens[0, 10], by_lens[1, 10] = -xu * ratio * two, -yv * ratio * two
-    by_lens[0, 11], by_lens[1, 11] = -xu * ratio * three, -yv * ratio * three
-    by_lens[0, 12], by_lens[0, 13] = fx * r2, fx * r2 * r2
-    by_lens[1, 14], by_lens[1, 15] = fy * r2, fy * r2 * r2
-    return fx * x + lens[2], fy * y + lens[3]
+    fold2, k = lens[_COUNT], lens[4:_COUNT]
+    for j in range(len(rays)):
+        dz = rays[j, 2]
+        u, v = rays[j, 0] / dz, rays[j, 1] / dz
+        r2 = u * u + v * v
+        if not (dz > 0.0 and r2 < fold2):
+            pixels[j, :] = math.nan
+            by_ray[j, :, :] = math.nan
+            by_lens[j, :, :] = math.nan
+            continue
+        x, y, x_u, x_v, y_u, y_v = distort_slopes(u, v, k)
+        ratio, _, bottom = radial(r2, k)
+        one = r2 / bottom
+        two = r2 * one
+        three = r2 * two
+        for row in range(2):
+            focal, tangent, seen = lens[row], u if row == 0 else v, x if row == 0 else y
+            by_u, by_v = (x_u, x_v) if row == 0 else (y_u, y_v)
+            by_u, by_v = focal * by_u / dz, focal * by_v / dz
+            pixels[j, row] = focal * seen + lens[2 + row]
+            by_ray[j, row, 0], by_ray[j, row, 1] = by_u, by_v
+            by_ray[j, row, 2] = -(u * by_u + v * by_v)
+            out = by_lens[j, row]
+            across = 1 - row
+            out[row], out[across] = seen, 0.0
+            out[2 + row], out[2 + across] = 1.0, 0.0
+            outward = focal * tangent
+            out[4], out[5], out[8] = outward * one, outward * two, outward * three
+            out[6 + row] = focal * 2.0 * u * v
+            out[6 + across] = focal * (r2 + 2.0 * tangent * tangent)
+            inward = -outward * ratio
+            out[9], out[10], out[11] = inward * one, inward * two, inward * three
+            out[12 + 2 * row], out[13 + 2 * row] = focal * r2, focal * r2 * r2
+            out[12 + 2 * across], out[13 + 2 * across] = 0.0, 0.0

@@ -236,8 +236,15 @@ def _sine(along: float, aside: float, reach: float, port: Array) -> float:
 
 
 @compiled_ieee
-def dome_rays(points: Array, port: Array, rays: Array) -> None:
-    """Rays in air (B, 3), to be filled in, of points in water (B, 3); at most 128 at a time."""
+def dome_rays(points: Array, port: Array, rays: Array, leans: Array) -> None:
+    """Rays in air of points in water (B, 3), at most 128 at a time.
+
+    Args:
+        points: (B, 3).
+        port: (7,).
+        rays: (B, 3) to be filled in; NaN without one.
+        leans: (B,) to be filled in for `dome_slopes`: sin(a) / aside.
+    """
     count = len(points)
     cx, cy, cz, outer = port[0], port[1], port[2], port[3]
     reach, along, aside = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
@@ -263,9 +270,8 @@ def dome_rays(points: Array, port: Array, rays: Array) -> None:
             continue
         if not abs(last[j]) <= _SETTLED:
             sin[j] = _sine(along[j], aside[j], reach[j], port)
-        lean = 0.0
-        if aside[j] > 0.0:
-            lean = sin[j] / aside[j]
+        lean = sin[j] / aside[j] if aside[j] > 0.0 else _first_lean(along[j], reach[j], port)
+        leans[j] = lean
         stretch = (math.sqrt(1.0 - sin[j] * sin[j]) - lean * along[j]) / reach[j]
         rays[j, 0] = stretch * (points[j, 0] - cx) - lean * cx
         rays[j, 1] = stretch * (points[j, 1] - cy) - lean * cy
@@ -304,104 +310,88 @@ def _bent(
 
 
 @compiled_ieee
-def dome_ray(point: Array, port: Array) -> tuple[float, float, float, float]:
-    """The unit ray in air of one point in water, and its `lean` of `dome_slopes`; NaN without."""
-    cx, cy, cz = port[0], port[1], port[2]
-    x, y, z = point[0] - cx, point[1] - cy, point[2] - cz
-    reach = math.sqrt(x * x + y * y + z * z)
-    if not reach > port[3]:
-        return math.nan, math.nan, math.nan, math.nan
-    along = -(x * cx + y * cy + z * cz) / reach
-    aside = math.sqrt(max(cx * cx + cy * cy + cz * cz - along * along, 0.0))
-    sin = _sine(along, aside, reach, port)
-    lean = _first_lean(along, reach, port)
-    if aside > 0.0:
-        lean = sin / aside
-    stretch = (math.sqrt(1.0 - sin * sin) - lean * along) / reach
-    return stretch * x - lean * cx, stretch * y - lean * cy, stretch * z - lean * cz, lean
-
-
-@compiled_ieee
 def dome_slopes(
-    point: Array,
-    lean: float,
+    points: Array,
+    leans: Array,
     port: Array,
     by_ray: Array,
     by_point: Array,
     by_port: Array,
 ) -> None:
-    """Slopes of a pixel by the point and the port, from those by its ray in air.
+    """Slopes of pixels by the point and the port, from those by the ray in air.
 
     With w the direction from the centre to the point, o = along w + aside q the pupil and a the
     angle that `dome_rays` finds, the ray is cos(a) w + sin(a) q. Slopes of a follow from the
     equation it solves; sin(a) / aside is kept as one number, which has a limit where aside is 0.
 
     Args:
-        point: (3,).
-        lean: sin(a) / aside, of `dome_ray`.
+        points: (B, 3).
+        leans: (B,) their sin(a) / aside, of `dome_rays`.
         port: (7,).
-        by_ray: (2, 3) slopes of the pixel by the ray.
-        by_point: (2, 3) to be filled in.
-        by_port: (2, 7) to be filled in.
+        by_ray: (B, 2, 3) slopes of the pixels by the rays.
+        by_point: (B, 2, 3) to be filled in.
+        by_port: (B, 2, 7) to be filled in.
     """
     cx, cy, cz = port[0], port[1], port[2]
     outer, inner, n_glass, n_water = port[3], port[3] - port[4], port[5], port[6]
-    wx, wy, wz = point[0] - cx, point[1] - cy, point[2] - cz
-    reach = math.sqrt(wx * wx + wy * wy + wz * wz)
-    wx, wy, wz = wx / reach, wy / reach, wz / reach
-    along = -(wx * cx + wy * cy + wz * cz)
-    qx, qy, qz = -cx - along * wx, -cy - along * wy, -cz - along * wz
-    aside = math.sqrt(qx * qx + qy * qy + qz * qz)
-    if aside > 0.0:
-        qx, qy, qz = qx / aside, qy / aside, qz / aside
-    sin = lean * aside
-    cos = math.sqrt(1.0 - sin * sin)
-    h = along * sin - aside * cos
-    # Of each turn asin(h / (n r)): the slope by h, which is 1 / (n r cos).
-    by_a = 1.0 / math.sqrt(inner**2 - h * h)
-    by_b = 1.0 / math.sqrt((n_glass * inner) ** 2 - h * h)
-    by_c = 1.0 / math.sqrt((n_glass * outer) ** 2 - h * h)
-    by_d = 1.0 / math.sqrt((n_water * outer) ** 2 - h * h)
-    by_e = 1.0 / math.sqrt((n_water * reach) ** 2 - h * h)
-    bend = by_b - by_a + by_d - by_c - by_e
-    steep = 1.0 + bend * (along * cos + aside * sin)
-    # Slopes of the angle by along, aside, reach and the port.
-    by_along, by_aside, by_reach = (
-        -bend * sin / steep,
-        bend * cos / steep,
-        -h * by_e / reach / steep,
-    )
-    at_inner = h * (by_a - by_b) / inner / steep
-    at_outer = h * (by_c - by_d) / outer / steep
-    by_glass = h * (by_b - by_c) / n_glass / steep
-    by_water = h * (by_d - by_e) / n_water / steep
-    by_inner, by_outer = -at_inner, -at_outer
-    for row in range(2):
-        gx, gy, gz = by_ray[row, 0], by_ray[row, 1], by_ray[row, 2]
-        g_w = gx * wx + gy * wy + gz * wz
-        g_q = gx * qx + gy * qy + gz * qz
-        g_turn = cos * g_q - sin * g_w
-        # The pixel moves by x . dw + y . do, with what the angle adds.
-        for axis in range(3):
-            g = gx if axis == 0 else (gy if axis == 1 else gz)
-            w = wx if axis == 0 else (wy if axis == 1 else wz)
-            q = qx if axis == 0 else (qy if axis == 1 else qz)
-            o = along * w + aside * q
-            d_along = o  # by dw; its part along w is taken off below
-            d_aside = -along * q
-            d_w = (cos - lean * along) * g - lean * g_w * d_along - lean * g_q * d_aside
-            d_w += g_turn * (by_along * d_along + by_aside * d_aside)
-            d_o = lean * (g - g_w * w - g_q * q)
-            d_o += g_turn * (by_along * w + by_aside * q)
-            by_point[row, axis] = d_w
-            by_port[row, axis] = d_o
-        across = by_point[row, 0] * wx + by_point[row, 1] * wy + by_point[row, 2] * wz
-        for axis in range(3):
-            w = wx if axis == 0 else (wy if axis == 1 else wz)
-            moved = (by_point[row, axis] - across * w) / reach + g_turn * by_reach * w
-            by_point[row, axis] = moved
-            by_port[row, axis] = -moved - by_port[row, axis]
-        by_port[row, 3] = g_turn * (by_inner + by_outer)
-        by_port[row, 4] = -g_turn * by_inner
-        by_port[row, 5] = g_turn * by_glass
-        by_port[row, 6] = g_turn * by_water
+    for j in range(len(points)):
+        wx, wy, wz = points[j, 0] - cx, points[j, 1] - cy, points[j, 2] - cz
+        reach = math.sqrt(wx * wx + wy * wy + wz * wz)
+        wx, wy, wz = wx / reach, wy / reach, wz / reach
+        along = -(wx * cx + wy * cy + wz * cz)
+        qx, qy, qz = -cx - along * wx, -cy - along * wy, -cz - along * wz
+        aside = math.sqrt(qx * qx + qy * qy + qz * qz)
+        if aside > 0.0:
+            qx, qy, qz = qx / aside, qy / aside, qz / aside
+        lean = leans[j]
+        sin = lean * aside
+        cos = math.sqrt(1.0 - sin * sin)
+        h = along * sin - aside * cos
+        # Of each turn asin(h / (n r)): the slope by h, which is 1 / (n r cos).
+        by_a = 1.0 / math.sqrt(inner**2 - h * h)
+        by_b = 1.0 / math.sqrt((n_glass * inner) ** 2 - h * h)
+        by_c = 1.0 / math.sqrt((n_glass * outer) ** 2 - h * h)
+        by_d = 1.0 / math.sqrt((n_water * outer) ** 2 - h * h)
+        by_e = 1.0 / math.sqrt((n_water * reach) ** 2 - h * h)
+        bend = by_b - by_a + by_d - by_c - by_e
+        steep = 1.0 + bend * (along * cos + aside * sin)
+        # Slopes of the angle by along, aside, reach and the port.
+        by_along, by_aside, by_reach = (
+            -bend * sin / steep,
+            bend * cos / steep,
+            -h * by_e / reach / steep,
+        )
+        at_inner = h * (by_a - by_b) / inner / steep
+        at_outer = h * (by_c - by_d) / outer / steep
+        by_glass = h * (by_b - by_c) / n_glass / steep
+        by_water = h * (by_d - by_e) / n_water / steep
+        by_inner, by_outer = -at_inner, -at_outer
+        for row in range(2):
+            gx, gy, gz = by_ray[j, row, 0], by_ray[j, row, 1], by_ray[j, row, 2]
+            g_w = gx * wx + gy * wy + gz * wz
+            g_q = gx * qx + gy * qy + gz * qz
+            g_turn = cos * g_q - sin * g_w
+            # The pixel moves by x . dw + y . do, with what the angle adds.
+            for axis in range(3):
+                g = gx if axis == 0 else (gy if axis == 1 else gz)
+                w = wx if axis == 0 else (wy if axis == 1 else wz)
+                q = qx if axis == 0 else (qy if axis == 1 else qz)
+                o = along * w + aside * q
+                d_along = o  # by dw; its part along w is taken off below
+                d_aside = -along * q
+                d_w = (cos - lean * along) * g - lean * g_w * d_along - lean * g_q * d_aside
+                d_w += g_turn * (by_along * d_along + by_aside * d_aside)
+                d_o = lean * (g - g_w * w - g_q * q)
+                d_o += g_turn * (by_along * w + by_aside * q)
+                by_point[j, row, axis] = d_w
+                by_port[j, row, axis] = d_o
+            across = by_point[j, row, 0] * wx + by_point[j, row, 1] * wy + by_point[j, row, 2] * wz
+            for axis in range(3):
+                w = wx if axis == 0 else (wy if axis == 1 else wz)
+                moved = (by_point[j, row, axis] - across * w) / reach + g_turn * by_reach * w
+                by_point[j, row, axis] = moved
+                by_port[j, row, axis] = -moved - by_port[j, row, axis]
+            by_port[j, row, 3] = g_turn * (by_inner + by_outer)
+            by_port[j, row, 4] = -g_turn * by_inner
+            by_port[j, row, 5] = g_turn * by_glass
+            by_port[j, row, 6] = g_turn * by_water

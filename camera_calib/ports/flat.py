@@ -254,8 +254,15 @@ def _air_tangents(radius: Array, water: Array, port: Array, tangent: Array, step
 
 
 @compiled_ieee
-def flat_rays(points: Array, port: Array, rays: Array) -> None:
-    """Rays in air (B, 3), to be filled in, of points in water (B, 3); at most 128 at a time."""
+def flat_rays(points: Array, port: Array, rays: Array, turns: Array) -> None:
+    """Rays in air of points in water (B, 3), at most 128 at a time.
+
+    Args:
+        points: (B, 3).
+        port: (7,).
+        rays: (B, 3) to be filled in; NaN without one.
+        turns: (B,) to be filled in for `flat_slopes`: tangent in air over the radius.
+    """
     count = len(points)
     before, nx, ny, nz = port[0] + port[1], port[4], port[5], port[6]
     radius, water = np.empty(_BLOCK), np.empty(_BLOCK)
@@ -272,9 +279,11 @@ def flat_rays(points: Array, port: Array, rays: Array) -> None:
             continue
         if not abs(step[j]) <= _SETTLED * tangent[j]:
             tangent[j] = air_tangent(radius[j], water[j], port)
-        turn = 0.0
         if radius[j] > 0.0:
             turn = tangent[j] / radius[j]
+        else:
+            turn = 1.0 / (port[0] + port[1] / port[2] + water[j] / port[3])
+        turns[j] = turn
         x, y, z = points[j, 0], points[j, 1], points[j, 2]
         along = nx * x + ny * y + nz * z
         rays[j, 0] = (x - along * nx) * turn + nx
@@ -310,82 +319,68 @@ def flat_leave(rays: Array, port: Array, points: Array, directions: Array) -> No
 
 
 @compiled_ieee
-def flat_ray(point: Array, port: Array) -> tuple[float, float, float, float]:
-    """The ray in air of one point in water, and its tangent over the radius; NaN without one."""
-    nx, ny, nz = port[4], port[5], port[6]
-    px, py, pz = point[0], point[1], point[2]
-    along = nx * px + ny * py + nz * pz
-    water = along - port[0] - port[1]
-    ex, ey, ez = px - along * nx, py - along * ny, pz - along * nz
-    radius = math.sqrt(ex * ex + ey * ey + ez * ez)
-    if not water > 0.0:
-        return math.nan, math.nan, math.nan, math.nan
-    turn = 1.0 / (port[0] + port[1] / port[2] + water / port[3])
-    if radius > 0.0:
-        turn = air_tangent(radius, water, port) / radius
-    return turn * ex + nx, turn * ey + ny, turn * ez + nz, turn
-
-
-@compiled_ieee
 def flat_slopes(
-    point: Array,
-    turn: float,
+    points: Array,
+    turns: Array,
     port: Array,
     by_ray: Array,
     by_point: Array,
     by_port: Array,
 ) -> None:
-    """Slopes of a pixel by the point and the port, from those by its ray in air.
+    """Slopes of pixels by the point and the port, from those by the ray in air.
 
     With n the normal, h = n . p, w = p - h n = r e and t(r, h) the tangent in air, the ray is
     D = (t / r) w + n. Slopes of t follow from the implicit equation that `air_tangent` solves;
     those of D by the chain rule, written so that r may be 0 (t is odd in r).
 
     Args:
-        point: (3,).
-        turn: its tangent over the radius, of `flat_ray`.
+        points: (B, 3).
+        turns: (B,) their tangents over the radius, of `flat_rays`.
         port: (7,).
-        by_ray: (2, 3) slopes of the pixel by the ray.
-        by_point: (2, 3) to be filled in.
-        by_port: (2, 6) to be filled in.
+        by_ray: (B, 2, 3) slopes of the pixels by the rays.
+        by_point: (B, 2, 3) to be filled in.
+        by_port: (B, 2, 6) to be filled in.
     """
     air, glass, n_glass, n_water = port[0], port[1], port[2], port[3]
     nx, ny, nz = port[4], port[5], port[6]
-    px, py, pz = point[0], point[1], point[2]
-    along = nx * px + ny * py + nz * pz
-    water = along - air - glass
-    ex, ey, ez = px - along * nx, py - along * ny, pz - along * nz
-    radius = math.sqrt(ex * ex + ey * ey + ez * ez)
-    tangent = turn * radius
-    if radius > 0.0:
-        ex, ey, ez = ex / radius, ey / radius, ez / radius
-    t2 = tangent * tangent
-    root_glass = math.sqrt(n_glass * n_glass + (n_glass * n_glass - 1.0) * t2)
-    root_water = math.sqrt(n_water * n_water + (n_water * n_water - 1.0) * t2)
-    glass3, water3 = root_glass**3, root_water**3
-    steep = air + glass * n_glass * n_glass / glass3 + water * n_water * n_water / water3
-    # Slopes of the tangent, which move D along e.
-    by_r, by_h = 1.0 / steep, -tangent / (root_water * steep)
-    bend = by_r - turn
-    by_air = (tangent / root_water - tangent) / steep
-    by_glass = (tangent / root_water - tangent / root_glass) / steep
-    by_n_glass = tangent * glass * n_glass * (1.0 + t2) / (glass3 * steep)
-    by_n_water = tangent * water * n_water * (1.0 + t2) / (water3 * steep)
-    for row in range(2):
-        gx, gy, gz = by_ray[row, 0], by_ray[row, 1], by_ray[row, 2]
-        g_e, g_n = gx * ex + gy * ey + gz * ez, gx * nx + gy * ny + gz * nz
-        by_e, by_n = g_e * bend, g_e * by_h - turn * g_n
-        by_point[row, 0] = by_e * ex + by_n * nx + turn * gx
-        by_point[row, 1] = by_e * ey + by_n * ny + turn * gy
-        by_point[row, 2] = by_e * ez + by_n * nz + turn * gz
-        by_port[row, 0] = g_e * by_air
-        by_port[row, 1] = g_e * by_glass
-        by_port[row, 2] = g_e * by_n_glass
-        by_port[row, 3] = g_e * by_n_water
-        for j in range(2):  # n moves by dn = (1, 0, -nx / nz) or (0, 1, -ny / nz)
-            down = -(nx if j == 0 else ny) / nz
-            p_dn = (px if j == 0 else py) + pz * down
-            e_dn = (ex if j == 0 else ey) + ez * down
-            g_dn = (gx if j == 0 else gy) + gz * down
-            outward = by_h * p_dn - bend * along * e_dn
-            by_port[row, 4 + j] = outward * g_e - turn * p_dn * g_n + (1.0 - turn * along) * g_dn
+    for j in range(len(points)):
+        px, py, pz, turn = points[j, 0], points[j, 1], points[j, 2], turns[j]
+        along = nx * px + ny * py + nz * pz
+        water = along - air - glass
+        ex, ey, ez = px - along * nx, py - along * ny, pz - along * nz
+        radius = math.sqrt(ex * ex + ey * ey + ez * ez)
+        tangent = turn * radius
+        if radius > 0.0:
+            ex, ey, ez = ex / radius, ey / radius, ez / radius
+        t2 = tangent * tangent
+        root_glass = math.sqrt(n_glass * n_glass + (n_glass * n_glass - 1.0) * t2)
+        root_water = math.sqrt(n_water * n_water + (n_water * n_water - 1.0) * t2)
+        glass3, water3 = root_glass**3, root_water**3
+        steep = air + glass * n_glass * n_glass / glass3 + water * n_water * n_water / water3
+        # Slopes of the tangent, which move D along e.
+        by_r, by_h = 1.0 / steep, -tangent / (root_water * steep)
+        bend = by_r - turn
+        by_air = (tangent / root_water - tangent) / steep
+        by_glass = (tangent / root_water - tangent / root_glass) / steep
+        by_n_glass = tangent * glass * n_glass * (1.0 + t2) / (glass3 * steep)
+        by_n_water = tangent * water * n_water * (1.0 + t2) / (water3 * steep)
+        for row in range(2):
+            gx, gy, gz = by_ray[j, row, 0], by_ray[j, row, 1], by_ray[j, row, 2]
+            g_e, g_n = gx * ex + gy * ey + gz * ez, gx * nx + gy * ny + gz * nz
+            by_e, by_n = g_e * bend, g_e * by_h - turn * g_n
+            by_point[j, row, 0] = by_e * ex + by_n * nx + turn * gx
+            by_point[j, row, 1] = by_e * ey + by_n * ny + turn * gy
+            by_point[j, row, 2] = by_e * ez + by_n * nz + turn * gz
+            by_port[j, row, 0] = g_e * by_air
+            by_port[j, row, 1] = g_e * by_glass
+            by_port[j, row, 2] = g_e * by_n_glass
+            by_port[j, row, 3] = g_e * by_n_water
+            for i in range(2):  # n moves by dn = (1, 0, -nx / nz) or (0, 1, -ny / nz)
+                down = -(nx if i == 0 else ny) / nz
+                p_dn = (px if i == 0 else py) + pz * down
+                e_dn = (ex if i == 0 else ey) + ez * down
+                g_dn = (gx if i == 0 else gy) + gz * down
+                outward = by_h * p_dn - bend * along * e_dn
+                by_port[j, row, 4 + i] = (
+                    outward * g_e - turn * p_dn * g_n + (1.0 - turn * along) * g_dn
+                )
