@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.block_solver import Equations
 from alice_survey.base.frames import Array
-from reconstruct.mapping.normal_equations import LinearObservations
-from reconstruct.mapping.uncertainty import Uncertainty
+from reconstruct.adjustment.normal_equations import LinearObservations
+from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.views.model_files import as_transform
 from tests.reconstruct.scenes import Scene
 

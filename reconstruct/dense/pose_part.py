@@ -85,7 +85,7 @@ def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
     if not path.is_file():
         warn("no mapping/covariance.npz: sigma.tif leaves out what errors of poses do to heights")
         return None
-    from reconstruct.mapping.uncertainty import read_uncertainty
+    from reconstruct.adjustment.uncertainty import read_uncertainty
 
     known = read_uncertainty(path)
     placed = RegistrationRecord.read(workspace / "sparse" / "registration.json")

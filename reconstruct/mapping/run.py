@@ -23,14 +23,13 @@ from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesReco
 from alice_survey.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, read_rig
-from reconstruct.mapping.acceptance import judge_model
+from reconstruct.adjustment.rig_refinement import RefinedSurvey, frees_rig, refine_rig
+from reconstruct.adjustment.uncertainty import save_uncertainty
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
-from reconstruct.mapping.rig_refinement import RefinedSurvey, frees_rig, refine_rig
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
-from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import (
     WorkingDistances,
     find_distances,
@@ -48,6 +47,7 @@ from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px, named
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
+from reconstruct.placing.acceptance import judge_model
 from reconstruct.views.model import datum_of
 from reconstruct.views.model_files import colmap_pinhole
 

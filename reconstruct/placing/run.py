@@ -32,9 +32,9 @@ from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, read_rig
+from reconstruct.adjustment.uncertainty import read_uncertainty
 from reconstruct.mapping.mapper import model_baseline
 from reconstruct.mapping.run import read_inputs
-from reconstruct.mapping.uncertainty import read_uncertainty
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import (

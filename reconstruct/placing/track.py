@@ -21,8 +21,8 @@ from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_r
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
+from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observed
-from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import attitude_axes
 from reconstruct.views.model import WorldFrame

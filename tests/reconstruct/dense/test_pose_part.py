@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import heard
 from alice_survey.base.records import MappingRecord, RegistrationRecord, SimilarityRecord
+from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
-from reconstruct.mapping.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 from tests.oracles_dense import write_workspace as write

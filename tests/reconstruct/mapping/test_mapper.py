@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
 from camera_calib.approximation.pinhole_warp import best_warp
-from reconstruct.mapping.acceptance import measure_doming
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
@@ -28,6 +27,7 @@ from reconstruct.mapping.mapper import (
 from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
+from reconstruct.placing.acceptance import measure_doming
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.rig_survey import four_cameras

@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
+from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices
-from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import attitude_axes
 from reconstruct.placing.track import (

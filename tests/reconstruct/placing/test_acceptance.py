@@ -6,7 +6,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruct.mapping.acceptance import (
+from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.priors import pinhole_positions
+from reconstruct.placing.acceptance import (
     Bend,
     ScaleTrend,
     bend_of,
@@ -19,8 +21,6 @@ from reconstruct.mapping.acceptance import (
     navigation_rotations,
     scale_trend,
 )
-from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.priors import pinhole_positions
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM
 

@@ -16,12 +16,7 @@ from alice_survey.base.errors import ReconstructionError
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig, read_rig
-from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.database import Observations
-from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.priors import NavigationAdjuster
-from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.rig_refinement import (
+from reconstruct.adjustment.rig_refinement import (
     NavigationFixes,
     RefinedSurvey,
     RigFit,
@@ -30,6 +25,11 @@ from reconstruct.mapping.rig_refinement import (
     on_rig,
     refine_rig,
 )
+from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.priors import NavigationAdjuster
+from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.views.model_files import as_transform
@@ -234,7 +234,7 @@ def test_points_that_took_no_part_move_along(
     distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     models = []
     for most in (200_000, mapped.model.compute_num_observations() // 4):
-        monkeypatch.setattr("reconstruct.mapping.exact_observations._MOST_OBSERVATIONS", most)
+        monkeypatch.setattr("reconstruct.adjustment.exact_observations._MOST_OBSERVATIONS", most)
         found = refine_rig(mapped, seen, wrong, distances, adjust, None, tmp_path, RIG)
         assert isinstance(found, RefinedSurvey)
         before = mapped.model.compute_num_observations()

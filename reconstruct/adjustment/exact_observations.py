@@ -13,10 +13,10 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from camera_calib.freedom import chosen_slopes, wanted_slopes
 from camera_calib.rig import Rig
+from reconstruct.adjustment.normal_equations import LinearObservations
 from reconstruct.mapping.arrays import Indices, observed, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import LinearObservations
 
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""

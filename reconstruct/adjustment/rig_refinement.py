@@ -29,10 +29,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, at_bound, moved, pose_names, value
 from camera_calib.rig import Covariance, Rig, write_rig
-from reconstruct.mapping.arrays import Indices, cross_matrices, first_pictures, frames_of
-from reconstruct.mapping.bundle import move_points
-from reconstruct.mapping.database import Observations
-from reconstruct.mapping.exact_observations import (
+from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
     calibrated_parameters,
@@ -40,14 +37,17 @@ from reconstruct.mapping.exact_observations import (
     exact_observations,
     start_state,
 )
-from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.normal_equations import (
+from reconstruct.adjustment.normal_equations import (
     POSE,
     TURN_INFORMATION,
     LinearObservations,
     PointEquations,
     reduce_points,
 )
+from reconstruct.mapping.arrays import Indices, cross_matrices, first_pictures, frames_of
+from reconstruct.mapping.bundle import move_points
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.robust import cauchy_cost, cauchy_weights, sigma_of, variance_of

@@ -11,15 +11,12 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.block_solver import BlockStep
 from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
-from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import (
+from reconstruct.adjustment.normal_equations import (
     Gauge,
     LinearObservations,
     reduce_points,
 )
-from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.uncertainty import (
+from reconstruct.adjustment.uncertainty import (
     CalibrationPart,
     calibration_part,
     estimate,
@@ -28,6 +25,9 @@ from reconstruct.mapping.uncertainty import (
     save_uncertainty,
     write_uncertainty,
 )
+from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
 from tests.reconstruct.scenes import Scene, make_scene

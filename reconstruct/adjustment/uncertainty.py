@@ -28,6 +28,20 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
+from reconstruct.adjustment.exact_observations import (
+    calibrated_parameters,
+    choose_pixels,
+    exact_observations,
+    start_state,
+)
+from reconstruct.adjustment.normal_equations import (
+    LEAST_POINTS,
+    POSE,
+    TURN_INFORMATION,
+    Gauge,
+    LinearObservations,
+    reduce_points,
+)
 from reconstruct.mapping.arrays import (
     Indices,
     Observed,
@@ -37,21 +51,7 @@ from reconstruct.mapping.arrays import (
     rig_poses,
 )
 from reconstruct.mapping.database import Observations
-from reconstruct.mapping.exact_observations import (
-    calibrated_parameters,
-    choose_pixels,
-    exact_observations,
-    start_state,
-)
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import (
-    LEAST_POINTS,
-    POSE,
-    TURN_INFORMATION,
-    Gauge,
-    LinearObservations,
-    reduce_points,
-)
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 
