@@ -370,8 +370,7 @@ def _model_inputs(workspace: Path) -> list[Path]:
 
 
 def _dense_inputs(workspace: Path) -> list[Path]:
-    poses = workspace / "mapping" / "covariance.npz", workspace / "sparse" / "registration.json"
-    return [*_there(*poses), *_model_inputs(workspace)]
+    return _model_inputs(workspace)
 
 
 def _dense_summary(folder: Path) -> Summary:
@@ -598,7 +597,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="mapping",
         command="reconstruct",
         about="cameras and points in the model's own gauge",
-        version=6,
+        version=7,
         work="reconstruct.mapping.run:run_mapping",
         takes=("reconstruct", "seed"),
         needs=("image",),
@@ -609,25 +608,23 @@ STAGES: tuple[StageSpec, ...] = (
             "max_features": "reconstruct.max_features",
             "working_range_m": "reconstruct.working_range_m",
             "mapper": "reconstruct.mapper",
-            "refine_port": "reconstruct.refine_port",
-            "refine_rig": "reconstruct.refine_rig",
         },
         inputs=_mapping_inputs,
         summary=_mapping_summary,
         resumes=True,
-        reported=("mapping.json", "port.json"),
+        reported=("mapping.json",),
     ),
     StageSpec(
         name="placing",
         folder="sparse",
         command="reconstruct",
         about="the model placed in the world",
-        version=4,
+        version=5,
         work="reconstruct.placing.run:run_sparse",
         takes=("reconstruct",),
         needs=("image", "mapping"),
         uses=("calibrate",),
-        settings={"mount_sigma_deg": "reconstruct.mount_sigma_deg"},
+        settings=only("reconstruct", "mount_sigma_deg", "refine_port", "refine_rig"),
         inputs=_placing_inputs,
         summary=_placing_summary,
         products={"track.csv": "camera track with sigmas", "model": "COLMAP model"},

@@ -199,17 +199,15 @@ class MappingRecord(JsonRecord):
     distances: RangeRecord | None = None
     refraction: RefractionRecord | None = None
     warps: dict[str, WarpRecord] = Field(default_factory=dict)
-    doming: DomingRecord | None = None
-    acceptance: AcceptanceRecord | None = None
     gauge: str = ""
     """Digest of the model: a known length applies to this one alone."""
     notes: Notes = ()
 
 
 class PortRecord(JsonRecord):
-    """`mapping/port.json`: the rig as refined by the survey's own pictures."""
+    """`sparse/port.json`: the rig as refined by the survey's own pictures."""
 
-    path: ClassVar = "mapping/port.json"
+    path: ClassVar = "sparse/port.json"
     stations: int
     observations: int
     parameters: tuple[str, ...]
@@ -262,6 +260,8 @@ class RegistrationRecord(JsonRecord):
     """Digest of the mapped model, as in its `MappingRecord`."""
     world_from_mapping: SimilarityRecord = SimilarityRecord()
     working_range: RangeRecord | None = None
+    doming: DomingRecord | None = None
+    acceptance: AcceptanceRecord | None = None
     georeference: GeoreferenceRecord | None = None
 
 

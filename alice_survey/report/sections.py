@@ -273,7 +273,8 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         ("reprojection error, mean", f"{digits(found.mean_reprojection_px)} px"),
         ("scale", found.scale_source or "unknown"),
     ]
-    doming = figures.mapping.doming or DomingRecord()
+    placed = figures.registration
+    doming = (None if placed is None else placed.doming) or DomingRecord()
     for way, bend in doming.bends.items():
         rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
     scale = doming.scale
@@ -357,7 +358,7 @@ def _camera(figures: Figures) -> Section:
     elif own is not None:
         drawn.append(plots.correlations(own.parameters, np.array(own.correlation)))
     if cameras is not None:
-        rig_file = held.file("mapping/rig.json") or stages.rig_file(held.workspace)
+        rig_file = held.file("sparse/rig.json") or stages.rig_file(held.workspace)
         rig = None if rig_file is None else read_rig(rig_file)
         if rig is None:
             text.append("The cameras calibrated themselves from the survey's pictures.")

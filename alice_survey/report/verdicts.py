@@ -120,8 +120,8 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
         good=whole,
         bad=registered < _LEAST_REGISTERED * total,
     )
-    mapping = figures.mapping
-    for note in () if mapping.acceptance is None else mapping.acceptance.notes:
+    mapping, found = figures.mapping, figures.registration
+    for note in () if found is None or found.acceptance is None else found.acceptance.notes:
         yield Verdict(
             level="look", text=note, action="Look at the stations that the first lines name."
         )
@@ -161,7 +161,7 @@ def _scale(figures: Figures) -> Iterator[Verdict]:
 
 
 def _shape(figures: Figures) -> Iterator[Verdict]:
-    doming = figures.mapping.doming
+    doming = None if figures.registration is None else figures.registration.doming
     if doming is None:
         return
     for note in doming.notes:

@@ -55,7 +55,6 @@ class RigState:
     """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
     centres: Array
     points: Array
-    lever: Array
 
 
 def calibrated_parameters(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
@@ -124,17 +123,16 @@ def start_state(
         turns=poses.rotation.as_matrix(),
         centres=poses.translation,
         points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
-        lever=np.asarray((reference * rig.body_from_rig.inv()).translation),
     )
 
 
 def exact_observations(
-    state: RigState, pixels: Pixels, fields: Sequence[str], *, lever: bool
+    state: RigState, pixels: Pixels, fields: Sequence[str]
 ) -> LinearObservations:
     """The observations linearised; those that no ray explains do not count."""
     arm = state.points[pixels.point] - state.centres[pixels.station]
     by_point = np.zeros((len(arm), 2, 3))
-    rest = np.zeros((len(arm), 2, len(fields) + 3 * lever + 1))
+    rest = np.zeros((len(arm), 2, len(fields) + 1))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
         source, target = wanted_slopes(state.rig, fields, name)

@@ -20,8 +20,6 @@ POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""
 LEAST_POINTS = 4
 """A station that sees fewer is not determined."""
-TURN_INFORMATION = 1.0
-"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -306,7 +304,8 @@ class Gauge:
         self.motions = np.zeros((len(arms), POSE, 7 if scale_free else 6))
         self.motions[:, :3, :3] = np.eye(3)
         self.motions[:, 3:] = self.of_points(centres)
-        self.weighed = self.motions * np.array([depth**2] * 3 + [1.0] * 3)[:, None]
+        self.weights = np.array([depth**2] * 3 + [1.0] * 3)
+        self.weighed = self.motions * self.weights[:, None]
         self.spread = np.linalg.inv(product_of(self.motions, self.weighed))
         self.held: Flags = np.zeros((len(arms), POSE), dtype=np.bool_)
         self.held[0] = True
@@ -329,23 +328,6 @@ class Gauge:
         """How much of each motion (6 or 7, G) steps (F, 6, G) of the stations are."""
         found: Array = self.spread @ product_of(self.weighed, steps)
         return found
-
-    def placed(self, equations: PointEquations, given: Array) -> PointEquations:
-        """The equations of steps on top of a motion of the whole block, which is what is shared.
-
-        Pictures say nothing of that motion, so that given poses alone determine it. Steps and
-        motion are apart, since the information on a vague place would be lost in that on the shape.
-
-        Args:
-            equations: of the stations, with nothing shared.
-            given: (F, 6) information on each pose from elsewhere; those held move with the whole.
-        """
-        count = self.motions.shape[2]
-        border, shared = given[:, :, None] * self.motions, np.zeros((count + 1, count + 1))
-        shared[:-1, :-1] = product_of(self.motions, border)
-        border = np.concatenate([border, equations.border], axis=2)
-        found = equations.knowing(given[:, :, None] * np.eye(POSE))
-        return replace(found, border=border, shared=shared)
 
     def shape_blocks(self, equations: Equations) -> Array:
         """Covariances (B, 6, 6) of stations without these motions, where the equations have blocks.

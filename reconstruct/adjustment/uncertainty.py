@@ -1,4 +1,4 @@
-"""How well a model's stations and points are known: `mapping/covariance.npz`.
+"""How well a model's stations and points are known: `sparse/covariance.npz`.
 
 The covariance is that of the last adjustment: the inverse of its weighted normal equations, scaled
 by the variance of the keypoints that its residuals show (see `reconstruct.mapping.robust`), and
@@ -8,51 +8,57 @@ truth by a rigid motion (and by a scale, where nothing fixes that) with the leas
 inner constraints of a free network; Baarda's S-transformation, 1973). Where the whole lies in the
 world is for the georeference to say.
 
-An adjustment that holds rig and ports assumes that they are exact. They are not: a lens that is off
-by its sigma bends the whole block a little, and every picture more does the same again. To first
-order stations and points move with the rig's parameters as the adjustment's normal equations say
-(implicit function theorem), and the covariance of the calibration moves with them.
+Rig and ports are not exact: a lens that is off by its sigma bends the whole block a little, and
+every picture more does the same again. To first order stations and points move with the rig's
+parameters as the adjustment's normal equations say (implicit function theorem), and the covariance
+of the calibration moves with them.
+
+Pictures leave few deformations of a block soft: its bends, its twist, its scale. These soft modes,
+the leading eigenvectors of the covariance, are what measurements from outside can improve; all
+others are known better from the pictures. Updating them alone is the best approximation of its rank
+to the joint estimate (Spantini et al. 2015, "Optimal low-rank approximations of Bayesian linear
+inverse problems").
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import pycolmap
+from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from alice_survey.base.contents import read_arrays, taken_from
-from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.run import progress
-from camera_calib.rig import Rig
-from reconstruct.adjustment.exact_observations import (
-    calibrated_parameters,
-    choose_pixels,
-    exact_observations,
-    start_state,
-)
 from reconstruct.adjustment.normal_equations import (
     LEAST_POINTS,
     POSE,
-    TURN_INFORMATION,
     Gauge,
     LinearObservations,
+    PointEquations,
     reduce_points,
 )
 from reconstruct.mapping.arrays import (
     Indices,
     Observed,
-    first_pictures,
     frames_of,
     observed,
     rig_poses,
 )
-from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
+
+_MODES = 32
+"""Soft modes at most: of a block of lines the tenth is known a hundred times as well as the first.
+"""
+_MODES_TOLERANCE = 1e-4
+_LEAST_MODE = 1e-5
+"""Variance of a mode over that of the softest below which it is left to the pictures."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,14 +82,54 @@ class Uncertainty:
     """(P, 3, 3): of it, what the noise of the point's own keypoints does; the rest are poses."""
     sigma_px: float
     """Sigma of one coordinate of a keypoint, from the residuals."""
+    modes: "SoftModes"
+    """What of these errors is soft."""
+
+    def knowing(self, left: Array) -> Self:
+        """The same where measurements leave the modes the covariance (K, K)."""
+        gain, modes = np.eye(len(left)) - left, self.modes
+        return replace(
+            self,
+            frame_cov=self.frame_cov - _spread(modes.stations, gain),
+            point_cov=self.point_cov - _spread(modes.points, gain),
+        )
+
+    def moved(self, scale: float, rotation: Rotation) -> Self:
+        """The same in the world, `scale` and `rotation` being those of `world_from_model`."""
+        turn = rotation.as_matrix()
+        both = np.kron(np.eye(2), turn)
+        both[3:] *= scale
+        places, noise = (
+            scale**2 * turn @ part @ turn.T for part in (self.point_cov, self.point_noise)
+        )
+        return replace(
+            self, frame_cov=both @ self.frame_cov @ both.T, point_cov=places, point_noise=noise,
+            modes=replace(
+                self.modes, stations=both @ self.modes.stations,
+                points=scale * turn @ self.modes.points,
+            ),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CalibrationPart:
+class SoftModes:
+    """Deformations of a block that pictures determine least, the softest first, each by a sigma.
+
+    They are independent of each other and of what else the covariance holds.
+    """
+
+    stations: Array
+    """(F, 6, K) turns and motions of the stations, in the model's axes."""
+    points: Array
+    """(P, 3, K) motions of the points."""
+    calibration: Array
+    """(G, K) changes of the parameters of the rig; G is 0 where it is held."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motions:
     """How a block moves with the parameters of its rig, and how uncertain those are."""
 
-    frames: Indices
-    """(F,) ids of COLMAP's frames, ascending."""
     stations: Array
     """(F, 6, G) turns and motions of the stations by the parameters, in the model's axes."""
     places: Array
@@ -99,12 +145,16 @@ class CalibrationPart:
 
     def of_points(self, points: Array) -> Array:
         """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
-        nearest = np.asarray(KDTree(self.places).query(points)[1])
-        given, which = np.unique(nearest, return_inverse=True)
+        given, which = np.unique(self.nearest(points), return_inverse=True)
         found: Array = _spread(self.points[given], self.covariance)[which]
         return found
 
-    def without(self, gauge: Gauge) -> "CalibrationPart":
+    def nearest(self, points: Array) -> Indices:
+        """(N,) which of `places` are nearest to (N, 3) points."""
+        found: Indices = np.asarray(KDTree(self.places).query(points)[1])
+        return found
+
+    def without(self, gauge: Gauge) -> "Motions":
         """The same minus what a motion of the whole block does, which does not change its shape."""
         whole = gauge.motion_in(self.stations)
         return replace(
@@ -117,17 +167,17 @@ class CalibrationPart:
 def estimate(
     mapped: Mapped,
     records: Sequence[ImageRecord],
-    position_sigmas: Array | None,
-    calibration: CalibrationPart | None = None,
+    calibration: Motions | None = None,
+    *,
+    held: bool = False,
 ) -> Uncertainty:
-    """Covariances of an adjusted model of ideal pinholes with held rig and lenses.
+    """Covariances of an adjusted model of ideal pinholes.
 
     Args:
         mapped: adjusted; picture i of `records` has the id i + 1.
         records: pictures.
-        position_sigmas: (N, 3) of the pictures' given positions along the model's axes, NaN where
-            none took part in the adjustment; None for an adjustment without.
         calibration: what errors of the rig do; None where they are unknown.
+        held: whether the rig stays as it is, so that no mode may move it.
 
     Raises:
         ReconstructionError: the model is too small to determine its covariance.
@@ -150,19 +200,18 @@ def estimate(
     linear = linear.weighted(weights / variance)
     centres = rig_poses(model, frames).inv().translation
     gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
-    given = navigation_information(model, position_sigmas)
     loose = np.bincount(linear.station, minlength=len(frames)) < LEAST_POINTS
     equations = replace(reduce_points(linear, len(frames)), free=~(gauge.held | loose[:, None]))
-    if given is not None:
-        equations = gauge.placed(equations, given * ~loose[:, None])
     blocks = gauge.shape_blocks(equations)
     blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
     points = equations.point_covariances(blocks)
     frame_cov = blocks[equations.own]
+    moving = None
     if calibration is not None:
         shape = calibration.without(gauge)
         frame_cov = frame_cov + shape.of_stations()
         points += shape.of_points(seen.points)
+        moving = None if held else calibration
     first = _first_pictures(model, seen, frames)
     return Uncertainty(
         frames=frames,
@@ -173,28 +222,66 @@ def estimate(
         point_cov=points,
         point_noise=equations.point_inverse,
         sigma_px=float(np.sqrt(variance / weights.mean())),
+        modes=_soft_modes(equations, gauge, moving, seen.points),
     )
 
 
-@progress.step("covariance of the model")
-def save_uncertainty(
-    folder: Path,
-    mapped: Mapped,
-    seen: Observations,
-    rig: Rig | None,
-    position_sigmas: Array | None = None,
-) -> None:
-    """Write `covariance.npz` of a model (see `estimate`), with a warning where it cannot be."""
-    try:
-        calibration = None
-        if rig is not None:
-            given = navigation_information(mapped.model, position_sigmas)
-            calibration = calibration_part(mapped, seen, rig, given)
-        found = estimate(mapped, seen.images, position_sigmas, calibration)
-    except ReconstructionError as error:
-        warn(f"no covariance: {error}")
-        return
-    write_uncertainty(folder / "covariance.npz", found)
+def _soft_modes(
+    equations: PointEquations, gauge: Gauge, calibration: Motions | None, points: Array
+) -> SoftModes:
+    """The leading eigenvectors of the covariance of the shape.
+
+    Turns count as what they move at the usual distance, like the gauge's. A mode of the stations
+    takes with it what it makes likely of the points and of the rig.
+
+    Args:
+        equations: of the stations, with nothing shared.
+        gauge: motions of the whole block, which are no change of its shape.
+        calibration: what errors of the rig do; None without.
+        points: (P, 3) in the model.
+    """
+    weigh = np.sqrt(gauge.weights)
+    stations, width = equations.free.shape
+
+    def moved(weighed: Array) -> tuple[Array, Array, Array]:
+        """Covariance times (F, 6): of stations in a fixed rig, in all, and of the rig."""
+        kick = weigh * (weighed - weigh * gauge.motions @ gauge.motion_in(weighed / weigh))
+        own = equations.covariance_times(kick[..., None])[..., 0]
+        if calibration is None:
+            return own, own, np.zeros(0)
+        rig = calibration.covariance @ np.tensordot(
+            calibration.stations, kick, axes=([0, 1], [0, 1])
+        )
+        return own, own + calibration.stations @ rig, rig
+
+    def product(flat: Array) -> Array:
+        step = moved(flat.reshape(stations, width))[1]
+        shape: Array = weigh * (step - gauge.motions @ gauge.motion_in(step))
+        return shape.ravel()
+
+    size = stations * width
+    count = min(_MODES, size - gauge.motions.shape[2] - 1)
+    operator: Any = LinearOperator((size, size), matvec=product, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
+    values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
+    kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
+    shape, places, rigs = [], [], []
+    nearest = None if calibration is None else calibration.nearest(points)
+    for k in kept.tolist():
+        own, step, rig = moved(vectors[:, k].reshape(stations, width))
+        place = equations.follow(own, np.zeros(1))
+        if calibration is not None:
+            place = place + calibration.points[nearest] @ rig
+        whole = gauge.motion_in(step)
+        size_of = np.sqrt(values[k])
+        shape.append((step - gauge.motions @ whole) / size_of)
+        places.append((place - gauge.of_points(points) @ whole) / size_of)
+        rigs.append(rig / size_of)
+    return SoftModes(
+        stations=np.stack(shape, axis=-1),
+        points=np.stack(places, axis=-1),
+        calibration=np.stack(rigs, axis=-1),
+    )
 
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
@@ -209,6 +296,9 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
         point_cov=found.point_cov.astype(np.float32),
         point_noise=found.point_noise.astype(np.float32),
         sigma_px=np.array(found.sigma_px),
+        mode_stations=found.modes.stations,
+        mode_points=found.modes.points.astype(np.float32),
+        mode_calibration=found.modes.calibration,
     )
 
 
@@ -220,7 +310,7 @@ def read_uncertainty(path: Path) -> Uncertainty:
     """
     data = read_arrays(
         path, "frames", "stations", "images", "cov", "point_ids", "point_cov", "point_noise",
-        "sigma_px",
+        "sigma_px", "mode_stations", "mode_points", "mode_calibration",
     )  # fmt: skip
     with taken_from(path):
         return Uncertainty(
@@ -232,6 +322,11 @@ def read_uncertainty(path: Path) -> Uncertainty:
             point_cov=data["point_cov"].astype(np.float64),
             point_noise=data["point_noise"].astype(np.float64),
             sigma_px=float(data["sigma_px"]),
+            modes=SoftModes(
+                stations=data["mode_stations"].astype(np.float64),
+                points=data["mode_points"].astype(np.float64),
+                calibration=data["mode_calibration"].astype(np.float64),
+            ),
         )
 
 
@@ -269,23 +364,6 @@ def pinhole_observations(
     return linear, order.astype(np.int64)
 
 
-def navigation_information(model: pycolmap.Reconstruction, sigmas: Array | None) -> Array | None:
-    """(F, 6) information of stations whose positions are given; None where there are none.
-
-    Args:
-        model: picture i of `sigmas` has the id i + 1.
-        sigmas: (N, 3) of the pictures' given positions; NaN where none is given.
-    """
-    if sigmas is None:
-        return None
-    frames = frames_of(model)
-    given = np.zeros((len(frames), POSE))
-    for frame, number in first_pictures(model, sigmas).items():
-        row = int(np.searchsorted(frames, frame))
-        given[row] = [*[TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
-    return given if given.any() else None
-
-
 def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indices) -> list[int]:
     """The picture of the reference camera of every frame, else its first."""
     chosen: dict[int, tuple[bool, int]] = {}
@@ -300,47 +378,3 @@ def _spread(motions: Array, covariance: Array) -> Array:
     """Covariances (N, k, k) of what moves by (N, k, G)."""
     spread: Array = motions @ covariance @ motions.swapaxes(1, 2)
     return spread
-
-
-def calibration_part(
-    mapped: Mapped, seen: Observations, rig: Rig, given: Array | None = None
-) -> CalibrationPart | None:
-    """How a finished model depends on its calibration.
-
-    Args:
-        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
-        seen: keypoints as warped by the model's lenses.
-        rig: with the covariance of its calibration.
-        given: (F, 6) information of the stations' given poses, as in the adjustment; None without.
-
-    Returns:
-        None where the rig states no covariance: then it is unknown.
-    """
-    names = list(seen.cameras)
-    fields = calibrated_parameters(rig, names)
-    if not fields or rig.covariance is None:
-        return None
-    frames = frames_of(mapped.model)
-    pixels, ids = choose_pixels(mapped, seen, names, frames)
-    state = start_state(mapped, rig, names, frames, ids)
-    linear = exact_observations(state, pixels, fields, lever=False)
-    sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
-    linear = linear.weighted(cauchy_weights(linear.miss, sigma) / sigma**2)
-    equations = reduce_points(linear, len(frames))
-    equations.free[np.bincount(linear.station, minlength=len(frames)) < LEAST_POINTS] = False
-    if given is None:
-        equations.free[0] = False
-    else:
-        equations = equations.knowing(given[:, :, None] * np.eye(POSE))
-    stations = equations.response
-    points = [
-        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
-        for g, unit in enumerate(np.eye(len(fields), len(fields) + 1))
-    ]
-    return CalibrationPart(
-        frames=frames,
-        stations=stations,
-        places=state.points,
-        points=np.stack(points, axis=-1),
-        covariance=rig.covariance.marginal(fields).matrix,
-    )

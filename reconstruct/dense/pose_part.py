@@ -1,7 +1,7 @@
 """How far errors of poses move the surface: the share of its error that fusing views leaves.
 
 Depths of one place from many views share errors, since they rest on the same poses. How much
-is known at every sparse point: its covariance from the adjustment (`mapping/covariance.npz`), which
+is known at every sparse point: its covariance from the adjustment (`sparse/covariance.npz`), which
 holds poses and pixels together, minus what its own observations leave with poses held.
 The rest is what the poses around it do to a surface there.
 """
@@ -12,11 +12,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
-from alice_survey.base.records import MappingRecord, RegistrationRecord
 from alice_survey.base.run import progress
 from reconstruct.views.model import SparseModel
 
@@ -81,25 +79,19 @@ def spread_over(nodes: Array, rows: int, columns: int) -> Array:
 @progress.step("find what poses add to errors")
 def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
     """The surface's uncertainty from poses; None, with a warning, where it is not known."""
-    path = workspace / "mapping" / "covariance.npz"
+    path = workspace / "sparse" / "covariance.npz"
     if not path.is_file():
-        warn("no mapping/covariance.npz: sigma.tif leaves out what errors of poses do to heights")
+        warn("no sparse/covariance.npz: sigma.tif leaves out what errors of poses do to heights")
         return None
     from reconstruct.adjustment.uncertainty import read_uncertainty
 
     known = read_uncertainty(path)
-    placed = RegistrationRecord.read(workspace / "sparse" / "registration.json")
-    mapped = MappingRecord.read(workspace / "mapping" / "mapping.json")
-    if mapped.gauge != placed.gauge or len(known.point_ids) != len(model.points_world):
-        warn("mapping/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
+    if len(known.point_ids) != len(model.points_world):
+        warn("sparse/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
         return None
-    # The world's third axis in the mapping's axes, as long as a unit there is in the world.
-    place = placed.world_from_mapping
-    down = place.scale * Rotation.from_quat(place.quaternion_xyzw).as_matrix()[2]
-    poses = known.point_cov - known.point_noise
-    own = np.einsum("i,nij,j->n", down, poses, down)
+    own = known.point_cov[:, 2, 2] - known.point_noise[:, 2, 2]
     seen = np.isfinite(own)
     if not seen.any():
-        warn("mapping/covariance.npz knows no point: sigma.tif leaves out errors of poses")
+        warn("sparse/covariance.npz knows no point: sigma.tif leaves out errors of poses")
         return None
     return PosePart(places=model.points_world[seen, :2], variances=np.maximum(own[seen], 0.0))

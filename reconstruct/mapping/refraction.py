@@ -21,10 +21,9 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.bundle import FULLY, ROUGHLY
+from reconstruct.mapping.bundle import all_pictures, held_options
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.priors import Adjust, adjust_freely
 from reconstruct.mapping.robust import pixel_sigma
 
 SETTLED_PX = 1e-4
@@ -161,11 +160,7 @@ def refract(
     mapped: Mapped,
     seen: Observations,
     folder: Path,
-    adjust: Adjust = adjust_freely,
     cam_from_rig: Mapping[str, RigidTransform] | None = None,
-    *,
-    settle: bool = True,
-    near: bool = False,
 ) -> tuple[Mapped, Convergence]:
     """Make a model exact that was mapped from keypoints warped at one working depth.
 
@@ -177,11 +172,7 @@ def refract(
         mapped: picture i of `seen` has the id i + 1.
         seen: keypoints, and the matches from which tracks are completed.
         folder: for scratch files.
-        adjust: how to adjust, such as with priors.
         cam_from_rig: poses of the cameras on one rig; None without one.
-        settle: go on until keypoints converge; else end after the first turn, near enough to refine
-            the rig from.
-        near: the model is exact already but for what the rig has moved since: judge at once.
 
     Returns:
         The exact model, and how the keypoints converged.
@@ -203,22 +194,17 @@ def refract(
     removed = added = 0
     settled = False
     corrected = 0.0
-    least = 1 if near else 2
     while len(moves) < _ROUNDS:
         scale = 1.0 if mapped.scaled else keypoints.metres_per_unit(model)
         moved, corrected = keypoints.correct(model, scale)
         moves.append(moved)
-        if len(moves) > least and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
+        if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
             settled = True
             break
-        if len(moves) == 1 and near:
-            removed, added = judge(model, scale)
-        mapped = adjust(replace(mapped, model=model, notes=notes), FULLY if settle else ROUGHLY)
+        mapped = _adjusted(replace(mapped, model=model, notes=notes))
         model = pycolmap.Reconstruction(mapped.model)
-        if len(moves) == 1 and not near:
+        if len(moves) == 1:
             removed, added = judge(model, scale)
-            if not settle:
-                break
     model.update_point_3d_errors()
     found = Convergence(
         moved_px=tuple(moves),
@@ -227,12 +213,28 @@ def refract(
         added=added,
         settled=settled,
     )
-    if settle and not settled:
+    if not settled:
         warn(
             f"refraction did not settle in {_ROUNDS} rounds: keypoints still move by "
             f"{moves[-1]:.2g} px; check the port's distance and the working range"
         )
     return replace(mapped, model=model), found
+
+
+def _adjusted(mapped: Mapped) -> Mapped:
+    """Adjust all poses and points.
+
+    A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
+    """
+    model = pycolmap.Reconstruction(mapped.model)
+    config = all_pictures(model)
+    if np.isfinite(mapped.baseline):
+        config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+    else:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(held_options(pixel_sigma(model)), config, model).solve()
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)
 
 
 def _pinholes(

@@ -7,7 +7,7 @@ interrupted run goes on with the features it has.
 import hashlib
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,8 @@ from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesReco
 from alice_survey.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, read_rig
-from reconstruct.adjustment.rig_refinement import RefinedSurvey, frees_rig, refine_rig
-from reconstruct.adjustment.uncertainty import save_uncertainty
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
-from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.mapping.working_range import (
@@ -47,7 +44,6 @@ from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px, named
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
-from reconstruct.placing.acceptance import judge_model
 from reconstruct.views.model import datum_of
 from reconstruct.views.model_files import colmap_pinhole
 
@@ -130,22 +126,9 @@ def _map(
             method=settings.mapper,
             executor=executor,
         )
-        adjust = NavigationAdjuster(inputs.records, inputs.rig, warps, inputs.datum)
-        rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
-        mapped, refracted = refract(mapped, seen, folder, adjust, poses, settle=not free)
-        if free:
-            found = refine_rig(mapped, seen, rig, distances, adjust, inputs.datum, folder, settings)
-            if isinstance(found, RefinedSurvey):
-                mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
-                seen, rig = found.seen, found.rig
-            else:
-                mapped = replace(mapped, notes=(*mapped.notes, found))
-                mapped, refracted = refract(mapped, seen, folder, adjust, poses)
-        sigmas = adjust.sigmas
+        mapped, refracted = refract(mapped, seen, folder, poses)
     else:
-        mapped = map_self_calibrated(seen, exif_focal, folder, seed)
-        refracted, sigmas, rig = None, None, None
-    save_uncertainty(folder, mapped, seen, rig, sigmas)
+        mapped, refracted = map_self_calibrated(seen, exif_focal, folder, seed), None
     _write(folder, inputs, mapped, distances, refracted)
     shutil.rmtree(folder / "features")
 
@@ -328,9 +311,6 @@ def _write(
             },
         },
     )
-    doming = accepted = None
-    if inputs.rig is not None and mapped.scaled:
-        doming, accepted = judge_model(mapped, inputs.records, inputs.rig, inputs.datum)
     content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
     MappingRecord.save(
         partial / "mapping.json",
@@ -346,8 +326,6 @@ def _write(
             "warps": {
                 name: warp_record(warp, distances).to_json() for name, warp in mapped.warps.items()
             },
-            "doming": None if doming is None else doming.to_json(),
-            "acceptance": None if accepted is None else accepted.to_json(),
             "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),
             "notes": list(mapped.notes),
         },

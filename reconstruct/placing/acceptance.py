@@ -28,8 +28,8 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, first_pictures, observed
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.mapping.working_range import ray_passes
+from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import named
 from reconstruct.views.model_files import as_transform
 
@@ -244,6 +244,34 @@ def scale_trend(
         range=float(np.ptp(values)),
         range_sigma=float(np.sqrt(between @ covariance @ between)),
     )
+
+
+def pinhole_positions(
+    records: Sequence[ImageRecord], rig: Rig, warps: Mapping[str, PinholeWarp], datum: Datum
+) -> tuple[Array, Array]:
+    """The pinholes' centres by navigation.
+
+    Returns:
+        (N, 3) positions in NED and their sigmas, both metres; NaN where position, attitude or a
+        sigma is unknown.
+    """
+    bodies = positions_ned(records, datum)
+    positions, sigmas = np.full((len(records), 3), np.nan), np.full((len(records), 3), np.nan)
+    for i, record in enumerate(records):
+        sigma = np.array(
+            [record.sigma_horizontal_m, record.sigma_horizontal_m, record.sigma_depth_m]
+        )
+        turn = np.deg2rad(max(record.sigma_attitude_deg, record.sigma_heading_deg))
+        if not (record.has_position and record.has_attitude and np.all(sigma > 0) and turn > 0):
+            continue
+        attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
+        body_from_pinhole = (
+            rig.body_from_cam(record.camera) * warps[record.camera].pinhole_from_cam.inv()
+        )
+        lever = body_from_pinhole.translation
+        positions[i] = bodies[i] + rotation_from_attitude(*attitude).apply(lever)
+        sigmas[i] = np.hypot(sigma, turn * np.linalg.norm(lever))
+    return positions, sigmas
 
 
 def navigation_rotations(

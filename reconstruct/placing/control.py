@@ -1,6 +1,6 @@
 """Control of a model: known points and lengths place and scale it, or show how accurate it is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,10 @@ from reconstruct.placing.picked_points import Spot
 _CONTRADICTED_SIGMAS = 4.0
 _LEAST_SPREAD = 1e-3
 """Points this close to one line, over their length, do not say how the model is turned about it."""
+
+
+MotionAt = Callable[[Array], Array]
+"""Motions (N, 3, K) of points (N, 3) of the model by its soft modes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,6 +69,8 @@ class ControlFit:
     bars: tuple[_Bar, ...]
     lost: Mapping[str, str]
     """Why other control is not used, by name."""
+    motion_at: MotionAt | None = None
+    """How the model moves with its soft modes; None where it is stiff."""
 
     @property
     def used_points(self) -> tuple[_Tie, ...]:
@@ -86,27 +92,43 @@ class ControlFit:
         """Whether the scale is seen."""
         return len(self.used_points) > 1 or bool(self.used_bars)
 
-    def equations(self, place: Similarity, middle: Array) -> Extra:
+    def equations(self, place: Similarity, middle: Array, sizes: Array) -> Extra:
         """White equations of what is used, for `georeference.fit_navigation`."""
-        misfits, rows = [np.zeros(0)], [np.zeros((0, PARAMETERS))]
+        columns = PARAMETERS + len(sizes)
+        misfits, rows = [np.zeros(0)], [np.zeros((0, columns))]
         turn = place.rotation.as_matrix()
         for tie in self.used_points:
-            at = place.apply(tie.spot.model[None])[0]
+            motion = self._motion(tie.spot, len(sizes))
+            at = place.apply((tie.spot.model + motion @ sizes)[None])[0]
             spread = place.scale**2 * turn @ tie.spot.covariance @ turn.T + np.diag(tie.sigma**2)
             white = np.linalg.inv(np.linalg.cholesky(spread))
-            jacobian = np.zeros((3, PARAMETERS))
+            jacobian = np.zeros((3, columns))
             jacobian[:, :3] = -cross_matrices((at - middle)[None])[0]
             jacobian[:, 3:6] = np.eye(3)
             jacobian[:, SCALE] = at - middle
+            jacobian[:, PARAMETERS:] = place.scale * turn @ motion
             misfits.append(white @ (at - tie.ned))
             rows.append(white @ jacobian)
         for bar in self.used_bars:
             factor, sigma = _log_factor(bar)
-            jacobian = np.zeros((1, PARAMETERS))
+            jacobian = np.zeros((1, columns))
             jacobian[0, SCALE] = 1.0 / sigma
-            misfits.append(np.array([(np.log(place.scale) - factor) / sigma]))
+            grown = np.zeros(len(sizes))
+            for a, b in bar.pairs:
+                way = b.model - a.model
+                moved = self._motion(b, len(sizes)) - self._motion(a, len(sizes))
+                grown += way @ moved / (way @ way) / len(bar.pairs)
+            jacobian[0, PARAMETERS:] = grown / sigma
+            misfits.append(np.array([(np.log(place.scale) + grown @ sizes - factor) / sigma]))
             rows.append(jacobian)
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
+
+    def _motion(self, spot: Spot, modes: int) -> Array:
+        """(3, K) of a point by the soft modes."""
+        if self.motion_at is None:
+            return np.zeros((3, modes))
+        motion: Array = self.motion_at(spot.model[None])[0]
+        return motion
 
     def start(self, known_scale: float | None) -> Similarity | None:
         """A first placement from the points alone; None where fewer than three, or on a line."""

@@ -67,10 +67,12 @@ class Extra:
     misfit: Array
     """(E,) misfits."""
     jacobian: Array
-    """(E, PARAMETERS) their slopes."""
+    """(E, P) their slopes."""
 
 
-NO_EXTRA = Extra(misfit=np.zeros(0), jacobian=np.zeros((0, PARAMETERS)))
+def no_extra(columns: int = PARAMETERS) -> Extra:
+    """No further equations, in so many parameters."""
+    return Extra(misfit=np.zeros(0), jacobian=np.zeros((0, columns)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,9 +80,9 @@ class Estimate:
     """The parameters' change that the equations give, with its covariance."""
 
     change: Array
-    """(PARAMETERS,) change, zero for what is held."""
+    """(P,) change, zero for what is held."""
     covariance: Array
-    """(PARAMETERS, PARAMETERS) covariance, zero for what is held."""
+    """(P, P) covariance, zero for what is held."""
     correlation: Mapping[str, Correlation]
     """Correlation by group, of those with readings."""
     used: NDArray[np.bool_]
@@ -92,7 +94,7 @@ def estimate(
     found: NavigationEquations,
     used: NDArray[np.bool_],
     free: Sequence[int],
-    extra: Extra = NO_EXTRA,
+    extra: Extra,
     *,
     frame_bounds: Mapping[int, float],
     correlation: Mapping[str, Correlation] | None = None,
@@ -423,7 +425,8 @@ def _averaged(
 
 def _filled(problem: _PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Parameters and covariance with zeros for what is held."""
-    full, matrix = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+    columns = problem.found.jacobian.shape[2]
+    full, matrix = np.zeros(columns), np.zeros((columns, columns))
     full[problem.free] = mean
     matrix[np.ix_(problem.free, problem.free)] = covariance
     return full, matrix

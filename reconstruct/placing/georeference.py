@@ -12,15 +12,17 @@ from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.generalised_fit import (
-    NO_EXTRA,
     Correlation,
     Estimate,
     Extra,
     estimate,
+    no_extra,
     without_gross_errors,
 )
 from reconstruct.placing.navigation_equations import (
+    CLOCK,
     GROUPS,
+    LEVER,
     MOUNT,
     PARAMETERS,
     PLACE,
@@ -45,6 +47,12 @@ _SETTLED_SIGMAS = 0.01
 _LEAST_BOUND = 1e-9
 _SHRUNK = 1e-6
 """Share of its first scale below which a model has shrunk to a point."""
+_LEVER_SIGMA_M = 0.02
+"""Of the measured place of a camera on its vehicle, along each axis."""
+_CLOCK_SIGMA_S = 0.2
+"""Of the clock of cameras against that of navigation."""
+_FOUND_SIGMAS = 4.0
+"""A nuisance this far from what is expected of it is reported."""
 _STRETCH = 0.005
 """Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
 `vehicle.navigation.sensors`)."""
@@ -74,6 +82,13 @@ class PlacementFit:
     """For each group, how navigation's errors are correlated."""
     time_unit: str
     mount_sigma_deg: float
+    modes: Array
+    """(K,) sizes of the model's soft modes, in their sigmas."""
+    joint: Array
+    """(7 + K, 7 + K) covariance of the placement and the modes."""
+    nuisances: Mapping[str, tuple[float, float]]
+    """What was found of the errors of the lever arm (m), the clock (s) and navigation's own frame
+    (turn in degrees, stretch), and their sigmas."""
 
     @property
     def sigma_position_m(self) -> Array:
@@ -123,6 +138,11 @@ class PlacementFit:
             "scale_of_navigation": self.free_scale,
             "scale_of_navigation_sigma": self.free_scale_sigma,
             "mount_sigma_deg": self.mount_sigma_deg,
+            "nuisances": {
+                name: {"value": found, "sigma": sigma}
+                for name, (found, sigma) in self.nuisances.items()
+            },
+            "soft_modes": self.modes.tolist(),
             "middle_ned_m": self.middle_ned.tolist(),
             "covariance": self.covariance.tolist(),
             "covariance_order": [
@@ -141,6 +161,14 @@ class PlacementFit:
         }  # fmt: skip
 
 
+_NUISANCES = {
+    "turn_deg": (TURN, float(np.rad2deg(1.0))),
+    "stretch": (STRETCH, 1.0),
+    "lever_forward_m": (LEVER.start, 1.0),
+    "lever_right_m": (LEVER.start + 1, 1.0),
+    "lever_down_m": (LEVER.start + 2, 1.0),
+    "clock_s": (CLOCK, 1.0),
+}
 _METHOD = (
     "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
     "stated sigmas, correlation times and white shares by restricted maximum likelihood"
@@ -179,8 +207,9 @@ def level(points: Array, centres: Array) -> Similarity:
     return Similarity(scale=1.0, rotation=rotation, translation=-rotation.apply(middle))
 
 
-ExtraOf = Callable[[Similarity, Array], Extra]
-"""Equations in addition to navigation's, at a placement, whose rotation acts about a point (3,)."""
+ExtraOf = Callable[[Similarity, Array, Array], Extra]
+"""Equations in addition to navigation's at a placement, whose rotation acts about a point (3,), and
+with soft modes of sizes (K,)."""
 
 
 def fit_navigation(
@@ -194,6 +223,7 @@ def fit_navigation(
     mount_sigma_deg: float = 0.0,
     scale_sigma: float = 0.0,
     control: ExtraOf | None = None,
+    modes: Array | None = None,
 ) -> PlacementFit | None:
     """Fit a model to the positions and attitudes of navigation.
 
@@ -209,12 +239,13 @@ def fit_navigation(
         mount_sigma_deg: of the rotation of the mount about each axis of the body.
         scale_sigma: relative, of a known scale; above 0 the scale is fitted about it.
         control: equations of control points and bars.
+        modes: (N, 6, K) of the pictures by the model's soft modes; None where it is stiff.
 
     Returns:
         The fit; None, after a warning, where positions are too few or too close together, or have
         no scale in common with the model.
     """
-    epochs = read_epochs(records, model_from_cam, body_from_cam, datum)
+    epochs = read_epochs(records, model_from_cam, body_from_cam, datum, modes)
     if epochs is None:
         return None
     start = _start(epochs, levelled, known_scale)
@@ -249,6 +280,7 @@ def fit_control(
     *,
     known_scale: float | None,
     scale_sigma: float,
+    modes: Array | None = None,
 ) -> PlacementFit:
     """Place a model by control points alone.
 
@@ -259,12 +291,13 @@ def fit_control(
         control: equations of three or more points that are not on one line.
         known_scale: metres in a unit of the model, or None: then the scale is fitted too.
         scale_sigma: relative, of a known scale.
+        modes: as in `fit_navigation`.
     """
     free = [0, 1, 2, 3, 4, 5]
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
     task = _NavigationTask(
-        epochs=without_navigation(records, model_from_cam),
+        epochs=without_navigation(records, model_from_cam, modes),
         levelled=None,
         known_scale=known_scale,
         scale_sigma=scale_sigma,
@@ -286,51 +319,81 @@ class _NavigationTask:
 
     def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
         """Iterate from a robust placement to the final one."""
-        epochs = self.epochs
+        epochs, sizes = self.epochs, np.zeros(self.epochs.modes.shape[2])
+        nuisances = np.zeros(PARAMETERS)
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(found.misfit, epochs.known)
         bounds = self._frame_bounds()
-        solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND)]
-        if self.mount_sigma_rad > 0 and epochs.has_attitude:
-            solved_for += range(MOUNT.start, MOUNT.stop)
+        modes = range(PARAMETERS, PARAMETERS + len(sizes))
+        solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND), *modes]
+        if epochs.has_attitude:
+            solved_for += range(LEVER.start, LEVER.stop)
+            if self.mount_sigma_rad > 0:
+                solved_for += range(MOUNT.start, MOUNT.stop)
+        if epochs.timed and len(epochs.time) > 1:
+            solved_for.append(CLOCK)
+        settling = [*free, *modes]
         for _ in range(_STEPS):
             middle = self._middle(place)
-            found = equations(epochs, place, middle)
+            bent = epochs.deformed(sizes)
+            found = equations(bent, place, middle)
             got = estimate(
                 epochs.time,
                 found,
                 used,
                 solved_for,
-                self._extra(place, middle),
+                self._extra(place, middle, sizes),
                 frame_bounds=bounds,
             )
             place = _moved(place, got.change, middle)
-            sigma = np.sqrt(np.diag(got.covariance))[free]
-            if np.all(np.abs(got.change[free]) <= _SETTLED_SIGMAS * sigma):
+            sizes = sizes + got.change[PARAMETERS:]
+            nuisances = got.change[:PARAMETERS]
+            sigma = np.sqrt(np.diag(got.covariance))[settling]
+            if np.all(np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma):
                 break
         middle = self._middle(place)
         scaled = got
         if SCALE not in free:
-            found = equations(epochs, place, middle)
+            found = equations(epochs.deformed(sizes), place, middle)
+            stiff = [p for p in solved_for if p < PARAMETERS]
             scaled = estimate(
                 epochs.time,
                 found,
                 got.used,
-                [*solved_for, SCALE],
-                self._extra(place, middle),
+                [*stiff, SCALE],
+                self._extra(place, middle, sizes),
                 frame_bounds=bounds,
                 correlation=got.correlation,
             )
-        return self._report(place, middle, got, scaled, held=SCALE not in free)
+        return self._report(
+            place, middle, sizes, nuisances, got, scaled, held=SCALE not in free,
+            free=solved_for,
+        )  # fmt: skip
 
     def _report(
-        self, place: Similarity, middle: Array, got: Estimate, scaled: Estimate, *, held: bool
+        self,
+        place: Similarity,
+        middle: Array,
+        sizes: Array,
+        nuisances: Array,
+        got: Estimate,
+        scaled: Estimate,
+        *,
+        held: bool,
+        free: Sequence[int],
     ) -> PlacementFit:
-        epochs = self.epochs
+        epochs = self.epochs.deformed(sizes)
         kept = got.used[epochs.moment, 0]
         misses = (epochs.positions(place) - epochs.measured_ned)[kept]
         lost = epochs.known & ~got.used
         first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
+        joint = [*range(PLACE), *range(PARAMETERS, len(got.change))]
+        sigmas = np.sqrt(np.diag(got.covariance))
+        named = {
+            name: (float(unit * nuisances[at]), float(unit * sigmas[at]))
+            for name, (at, unit) in _NUISANCES.items()
+            if at in free
+        }
         return PlacementFit(
             ned_from_model=place,
             used=int(got.used[:, 0].sum()),
@@ -343,6 +406,9 @@ class _NavigationTask:
             correlation=got.correlation,
             time_unit="s" if epochs.timed else "stations",
             mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
+            modes=sizes,
+            joint=got.covariance[np.ix_(joint, joint)],
+            nuisances=named,
         )
 
     def _middle(self, place: Similarity) -> Array:
@@ -364,28 +430,32 @@ class _NavigationTask:
         bound = sigma / radius if radius > sigma else 1.0
         return {TURN: bound, STRETCH: min(bound, _STRETCH)}
 
-    def _extra(self, place: Similarity, middle: Array) -> Extra:
-        misfits, rows = [NO_EXTRA.misfit], [NO_EXTRA.jacobian]
+    def _extra(self, place: Similarity, middle: Array, sizes: Array) -> Extra:
+        columns = PARAMETERS + len(sizes)
+        misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
         if self.levelled is not None and not self.epochs.has_attitude:
             down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
             sigma = np.deg2rad(_LEVEL_SIGMA_DEG)
-            tilt = np.zeros((2, PARAMETERS))
+            tilt = np.zeros((2, columns))
             tilt[0, 1], tilt[0, 2] = down[2], -down[1]
             tilt[1, 0], tilt[1, 2] = -down[2], down[0]
             misfits.append(down[:2] / sigma)
             rows.append(tilt / sigma)
         if self.known_scale is not None and self.scale_sigma > 0:
-            scale = np.zeros((1, PARAMETERS))
+            scale = np.zeros((1, columns))
             scale[0, SCALE] = 1.0 / self.scale_sigma
             misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
             rows.append(scale)
+        known = np.zeros(columns)
+        known[PARAMETERS:] = 1.0
+        known[LEVER], known[CLOCK] = 1.0 / _LEVER_SIGMA_M, 1.0 / _CLOCK_SIGMA_S
         if self.mount_sigma_rad > 0:
-            mount = np.zeros((3, PARAMETERS))
-            mount[:, MOUNT] = np.eye(3) / self.mount_sigma_rad
-            misfits.append(np.zeros(3))
-            rows.append(mount)
+            known[MOUNT] = 1.0 / self.mount_sigma_rad
+        at = np.flatnonzero(known)
+        misfits.append(np.concatenate([np.zeros(columns - len(sizes)), sizes])[at])
+        rows.append(np.diag(known)[at])
         if self.control is not None:
-            more = self.control(place, middle)
+            more = self.control(place, middle, sizes)
             misfits.append(more.misfit)
             rows.append(more.jacobian)
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
@@ -398,15 +468,17 @@ class _NavigationTask:
         place = start
         for _ in range(_ROBUST_STEPS):
             middle = self._middle(place)
-            found, extra = equations(self.epochs, place, middle), self._extra(place, middle)
+            found = equations(self.epochs, place, middle)
+            extra = self._extra(place, middle, np.zeros(self.epochs.modes.shape[2]))
             known = self.epochs.known
             misfit = np.concatenate([found.misfit[known], extra.misfit])
-            rows = np.concatenate([found.jacobian[known], extra.jacobian])[:, free]
+            rows_of = np.concatenate([found.jacobian[known], extra.jacobian])
+            rows = rows_of[:, free]
             weight = (1.0 + (misfit / _ROBUST_SIGMAS) ** 2) ** -0.25
             size = np.linalg.norm(rows, axis=0)
             size = np.where(size > 0, size, 1.0)
             step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
-            change = np.zeros(PARAMETERS)
+            change = np.zeros(rows_of.shape[1])
             change[free] = step
             if change[SCALE] > 0:  # a scale alone is solved by 1 + step; exp overshoots
                 change[SCALE] = np.log1p(change[SCALE])

@@ -3,12 +3,14 @@
 A placement is `ned = scale * rotation * model + translation`. Its parameters here are small changes
 about a present one, in this order: rotation about north, east and down (radians), shift north, east
 and down of the middle of the track (metres), logarithm of the scale, and after these seven the
-nuisances: a turn (radians) and a stretch (relative) of navigation's own frame, and the error of the
-mount (radians about forward, right, down).
+nuisances: a turn (radians) and a stretch (relative) of navigation's own frame, the error of the
+mount (radians about forward, right, down), that of the lever arm (metres forward, right, down) and
+that of the clock (seconds by which pictures are later than navigation has them). After these come
+the sizes of the model's soft modes, in their sigmas.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +22,16 @@ from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.placing.alignment import Similarity
 
-PARAMETERS = 12
+PARAMETERS = 16
+"""Number of parameters before the soft modes."""
 PLACE = 7
 """Number of parameters of the placement; the rest are nuisances."""
-SCALE, TURN, STRETCH, MOUNT = 6, 7, 8, slice(9, 12)
+SCALE, TURN, STRETCH, MOUNT, LEVER, CLOCK = 6, 7, 8, slice(9, 12), slice(12, 15), 15
 GROUPS = ("horizontal", "depth", "tilt", "heading")
 GROUP_OF = ("horizontal", "horizontal", "depth", "tilt", "tilt", "heading")
 """Groups of the six channels: north, east, depth, roll, pitch, heading."""
+_NEAR_STEPS = 3.0
+"""Usual time steps between stations within which a vehicle's motion is taken as even."""
 _SIGMA_HORIZONTAL_M = 3.0
 _SIGMA_DEPTH_M = 3.0
 _SIGMA_ATTITUDE_DEG = 2.0
@@ -58,6 +63,17 @@ class Epochs:
     """(M, 6) north, east, depth (m), roll, pitch, heading (rad) as navigation states it."""
     known: NDArray[np.bool_]
     """(M, 6) whether navigation gives the value."""
+    modes: Array
+    """(N, 6, K) by the model's soft modes: motions of the centres, and turns about its axes."""
+
+    def deformed(self, sizes: Array) -> "Epochs":
+        """The same of the model with its soft modes (K,) of these sizes."""
+        steps = self.modes @ sizes
+        return replace(
+            self,
+            centres=self.centres + steps[:, :3],
+            model_from_body=Rotation.from_rotvec(steps[:, 3:]) * self.model_from_body,
+        )
 
     def positions(self, ned_from_model: Similarity) -> Array:
         """Body origins in NED, (N, 3)."""
@@ -76,8 +92,11 @@ def read_epochs(
     model_from_cam: Sequence[RigidTransform],
     body_from_cam: Mapping[str, RigidTransform] | None,
     datum: Datum,
+    modes: Array | None = None,
 ) -> Epochs | None:
     """Collect what navigation measured; None where it has no position.
+
+    `modes` are those of all pictures, (N, 6, K); None where the model is stiff.
 
     Pictures of one station share one reading of navigation, which must not count twice. Without
     `body_from_cam` positions are those of the cameras, and what attitudes mean for them is unknown.
@@ -118,11 +137,14 @@ def read_epochs(
         ned_from_body=rotation_from_attitude(*np.deg2rad(np.where(has[:, None], attitudes, 0)).T),
         sigma=_sigmas(first),
         known=known,
+        modes=np.zeros((len(chosen), 6, 0)) if modes is None else modes[chosen],
     )
 
 
 def without_navigation(
-    records: Sequence[ImageRecord], model_from_cam: Sequence[RigidTransform]
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    modes: Array | None = None,
 ) -> Epochs:
     """Epochs of a model without navigation."""
     stations = sorted({r.station for r in records})
@@ -139,6 +161,7 @@ def without_navigation(
         ned_from_body=identity,
         sigma=np.ones((len(stations), 6)),
         known=np.zeros((len(stations), 6), dtype=bool),
+        modes=np.zeros((count, 6, 0)) if modes is None else modes,
     )
 
 
@@ -161,7 +184,7 @@ class NavigationEquations:
     misfit: Array
     """(M, 6) model minus navigation, over the stated sigma; NaN where nothing is known."""
     jacobian: Array
-    """(M, 6, PARAMETERS) its slopes."""
+    """(M, 6, PARAMETERS + K) its slopes."""
     sigma: Array
     """(M, 6) as stated."""
 
@@ -177,7 +200,8 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     count = len(epochs.centres)
     positions = epochs.positions(place)
     attitudes = place.rotation * epochs.model_from_body
-    misfit, jacobian = np.empty((count, 6)), np.zeros((count, 6, PARAMETERS))
+    columns = PARAMETERS + epochs.modes.shape[2]
+    misfit, jacobian = np.empty((count, 6)), np.zeros((count, 6, columns))
     misfit[:, :3] = positions - epochs.measured_ned
     jacobian[:, :3, :3] = -cross_matrices(positions - middle_ned)
     jacobian[:, :3, 3:6] = np.eye(3)
@@ -192,10 +216,19 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     misfit[:, 3:] = (found - stated + np.pi) % (2.0 * np.pi) - np.pi
     angles_from_ned = np.linalg.pinv(attitude_axes(attitudes))
     jacobian[:, 3:, :3] = angles_from_ned
-    jacobian[:, 3:, MOUNT] = angles_from_ned @ attitudes.as_matrix()
+    ned_from_body = attitudes.as_matrix()
+    jacobian[:, 3:, MOUNT] = angles_from_ned @ ned_from_body
+    jacobian[:, :3, LEVER] = ned_from_body
+    jacobian[:, :3, CLOCK], jacobian[:, 3:, CLOCK] = _rates(epochs, positions, stated)
+    turn = place.rotation.as_matrix()
+    turned = turn @ epochs.modes[:, 3:]
+    moved = place.scale * turn @ epochs.modes[:, :3]
+    arms = attitudes.apply(epochs.levers)
+    jacobian[:, :3, PARAMETERS:] = moved - cross_matrices(arms) @ turned
+    jacobian[:, 3:, PARAMETERS:] = angles_from_ned @ turned
     moments = len(epochs.time)
     shared = np.bincount(epochs.moment, minlength=moments).astype(np.float64)
-    mean_misfit, mean_jacobian = np.zeros((moments, 6)), np.zeros((moments, 6, PARAMETERS))
+    mean_misfit, mean_jacobian = np.zeros((moments, 6)), np.zeros((moments, 6, columns))
     np.add.at(mean_misfit, epochs.moment, misfit)
     np.add.at(mean_jacobian, epochs.moment, jacobian)
     scale = epochs.sigma * shared[:, None]
@@ -204,6 +237,36 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
         jacobian=np.where(epochs.known[..., None], mean_jacobian / scale[..., None], np.nan),
         sigma=epochs.sigma,
     )
+
+
+def _rates(epochs: Epochs, positions: Array, angles: Array) -> tuple[Array, Array]:
+    """Velocities of the pictures' bodies (N, 3), m/s, and rates of their angles (N, 3), rad/s.
+
+    Differences to the neighbour in time that is nearer; 0 where times are unknown or no neighbour
+    is near, as where a line ends.
+    """
+    if not epochs.timed:
+        return np.zeros_like(positions), np.zeros_like(angles)
+    # One picture stands for its moment.
+    _, first = np.unique(epochs.moment, return_index=True)
+    time = epochs.time
+    step = np.diff(time)
+    usual = float(np.median(step[step > 0])) if np.any(step > 0) else 1.0
+    good = (step > 0) & (step < _NEAR_STEPS * usual)
+    safe = np.where(good, step, 1.0)[:, None]
+    found = []
+    for values, whole in ((positions[first], np.inf), (angles[first], 2.0 * np.pi)):
+        change = np.diff(values, axis=0)
+        if np.isfinite(whole):
+            change = (change + whole / 2.0) % whole - whole / 2.0
+        rate = np.where(good[:, None], change / safe, np.nan)
+        both = np.stack([np.vstack([rate, np.full((1, 3), np.nan)]),
+                         np.vstack([np.full((1, 3), np.nan), rate])])  # fmt: skip
+        known = np.isfinite(both).any(axis=(0, 2))
+        mean = np.zeros_like(values)
+        mean[known] = np.nanmean(both[:, known], axis=0)
+        found.append(mean[epochs.moment])
+    return found[0], found[1]
 
 
 def attitude_axes(ned_from_body: Rotation) -> Array:

@@ -5,13 +5,14 @@ so that a new scale or georeference does not repeat the mapping.
 """
 
 import math
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import ReconstructConfig
@@ -20,10 +21,14 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import (
+    AcceptanceRecord,
+    CamerasRecord,
     ControlRecord,
+    DomingRecord,
     GeoreferenceRecord,
     MappingRecord,
     PicturesRecord,
+    PortRecord,
     RegistrationRecord,
     ScaleRecord,
     SimilarityRecord,
@@ -31,10 +36,12 @@ from alice_survey.base.records import (
 from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from camera_calib.rig import Rig, read_rig
-from reconstruct.adjustment.uncertainty import read_uncertainty
-from reconstruct.mapping.mapper import model_baseline
+from camera_calib.rig import Rig, write_rig
+from reconstruct.adjustment.adjusted import adjust_survey
+from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
+from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
+from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import (
@@ -46,11 +53,12 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.georeference import PlacementFit, fit_control, fit_navigation, level
+from reconstruct.placing.navigation_equations import PLACE
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.track import (
     TrackRow,
-    placed_covariances,
-    shape_covariances,
+    picture_modes,
+    pose_covariances,
     track_rows,
     track_sigmas,
     write_covariances,
@@ -101,6 +109,8 @@ class Placing:
     survey: PicturesRecord
     mapping: MappingRecord
     settings: ReconstructConfig
+    shape: Uncertainty | None
+    """How well the model's shape is known; None where it is not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +125,7 @@ class _KnownScale:
 def run_sparse(
     workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig
 ) -> None:
-    """Place the model of `mapping/` in the world.
+    """Adjust the model of `mapping/` a last time, and place it in the world.
 
     Raises:
         WorkspaceError: a file of the mapping is missing or damaged.
@@ -123,43 +133,55 @@ def run_sparse(
     """
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
-    warps = read_warps(workspace / "mapping" / "cameras.json")
-    model = read_reconstruction(workspace / "mapping" / "model")
-    of_name = {r.image: r for r in inputs.records}
-    refined = workspace / "mapping" / "rig.json"  # where the settings refine it
-    rig = read_rig(refined) if refined.is_file() else inputs.rig
+    known = _mapped(workspace, mapping)
+    adjusted = adjust_survey(known, inputs.records, inputs.rig, mapping.distances, reconstruct)
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()
-        for image in model.images.values()
+        for image in adjusted.mapped.model.images.values()
         if image.has_pose
     }
+    of_name = {r.image: r for r in inputs.records}
     names = sorted(poses)
     placed = find_place(
         Placing(
             workspace=workspace,
-            model=model,
+            model=adjusted.mapped.model,
             records=[of_name[name] for name in names],
             pinholes=[poses[name] for name in names],
-            warps=warps,
-            rig=rig,
+            warps=adjusted.mapped.warps,
+            rig=adjusted.rig,
             datum=inputs.datum,
             survey=inputs.survey,
             mapping=mapping,
             settings=reconstruct,
+            shape=adjusted.shape,
         )
     )
-
+    shape = adjusted.shape
+    if placed.fit is not None and len(placed.fit.modes):
+        adjusted = adjusted.deformed(placed.fit.modes, placed.fit.joint[PLACE:, PLACE:])
+    model, warps = pycolmap.Reconstruction(adjusted.mapped.model), adjusted.mapped.warps
     move = placed.world_from_model
     rotation = pycolmap.Rotation3d(move.rotation.as_quat())
     model.transform(pycolmap.Sim3d(move.scale, rotation, move.translation))
     (folder / "model").mkdir()
     model.write_binary(folder / "model")
     model.export_PLY(folder / "sparse.ply")
-    shutil.copyfile(workspace / "mapping" / "cameras.json", folder / "cameras.json")
+    cameras = CamerasRecord.read(workspace / "mapping" / "cameras.json").to_json()
+    cameras["cameras"] = {name: warp.to_json() for name, warp in warps.items()}
+    CamerasRecord.save(folder / "cameras.json", cameras)
+    if adjusted.exact is not None and adjusted.exact.fit.parameters:
+        PortRecord.save(folder / "port.json", adjusted.exact.fit.to_json())
+        write_rig(folder / "rig.json", adjusted.exact.fit.rig)
     write_frame(folder / "frame.json", placed.frame)
+    rig = adjusted.rig
     mounts = {} if rig is None else {n: rig.body_from_cam(n).rotation for n in rig.cameras}
     rows = track_rows(model, of_name, warps, placed.frame, mounts)
-    covariances = _covariances(workspace, folder, placed, rows)
+    covariances = _covariances(folder, placed, rows, shape)
+    if adjusted.shape is not None:
+        write_uncertainty(
+            folder / "covariance.npz", adjusted.shape.moved(move.scale, move.rotation)
+        )
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)
     write_track_tum(folder / "track.tum", rows)
@@ -170,33 +192,47 @@ def run_sparse(
     if placed.control is not None:
         score = placed.control.score(move, located=placed.located)
         ControlRecord.save(folder / "control.json", score)
-    _registration(model, mapping, placed, rows).write(folder / "registration.json")
+    doming = accepted = None
+    if rig is not None and adjusted.mapped.scaled:
+        doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum)
+    _registration(model, mapping, placed, rows, doming, accepted).write(
+        folder / "registration.json"
+    )
+
+
+def _mapped(workspace: Path, mapping: MappingRecord) -> Mapped:
+    """The model of the mapping."""
+    return Mapped(
+        model=read_reconstruction(workspace / "mapping" / "model"),
+        warps=read_warps(workspace / "mapping" / "cameras.json"),
+        models=mapping.models,
+        scaled=mapping.scaled,
+        baseline=math.nan if mapping.baseline is None else mapping.baseline,
+        rig_factor=1.0 if mapping.rig_factor is None else mapping.rig_factor,
+        notes=mapping.notes,
+    )
 
 
 def _covariances(
-    workspace: Path, partial: Path, placed: Placed, rows: Sequence[TrackRow]
+    folder: Path, placed: Placed, rows: Sequence[TrackRow], shape: Uncertainty | None
 ) -> Array | None:
-    """Covariances of all poses in the world; written as far as known, None where unknown."""
-    poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
-    names, parts = [row.image for row in rows], []
-    total = np.zeros((len(rows), 6, 6))
-    if placed.fit is not None:
-        fit = placed.fit
-        total = total + placed_covariances(poses, fit.middle_ned, fit.covariance)
-        parts.append("place")
-    path = workspace / "mapping" / "covariance.npz"
-    if path.is_file():
-        found = read_uncertainty(path)
-        reference = np.isin(names, found.images)
-        stations = np.array([row.station for row in rows], dtype=np.int64)
-        total = total + shape_covariances(
-            poses, stations, reference, found, placed.world_from_model
-        )
-        parts.append("shape of the model")
-    else:
-        parts.append("no model covariance")
-    if placed.fit is not None or path.is_file():
-        write_covariances(partial / "track_covariance.npz", names, total, "; ".join(parts))
+    """Covariances of all poses in the world; written as far as known, None where unknown.
+
+    Args:
+        folder: to write into.
+        placed: place of the model.
+        rows: the track.
+        shape: of the model before its soft modes were found.
+    """
+    if placed.fit is None and shape is None:
+        return None
+    total = pose_covariances(rows, placed.fit, shape, placed.world_from_model)
+    parts = [
+        *(["place"] if placed.fit is not None else []),
+        "no model covariance" if shape is None else "shape of the model",
+    ]
+    names = [row.image for row in rows]
+    write_covariances(folder / "track_covariance.npz", names, total, "; ".join(parts))
     return None if placed.fit is None else total
 
 
@@ -205,6 +241,8 @@ def _registration(
     mapping: MappingRecord,
     placed: Placed,
     rows: Sequence[TrackRow],
+    doming: Doming | None,
+    accepted: Acceptance | None,
 ) -> RegistrationRecord:
     baseline = model_baseline(model)
     fit = placed.fit
@@ -226,6 +264,10 @@ def _registration(
             translation=tuple(placed.world_from_model.translation.tolist()),
         ),
         working_range=mapping.distances,
+        doming=None if doming is None else DomingRecord.model_validate(doming.to_json()),
+        acceptance=None
+        if accepted is None
+        else AcceptanceRecord.model_validate(accepted.to_json()),
         georeference=None if fit is None else GeoreferenceRecord.model_validate(fit.to_json()),
     )
 
@@ -303,7 +345,9 @@ def _fit(
     """The fit to navigation and control, to one of them, or None where nothing places it."""
     # Control corrects a known scale within its sigma; without control it is held.
     sigma = known.sigma if known is not None and ties.informs_scale else 0.0
-    fit = None
+    fit, modes = None, None
+    if task.shape is not None:
+        modes = picture_modes(task.shape, task.records, task.pinholes)
     if task.datum is not None:
         if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
             warn(
@@ -320,6 +364,7 @@ def _fit(
             mount_sigma_deg=task.settings.mount_sigma_deg,
             scale_sigma=sigma,
             control=ties.equations if ties.informs else None,
+            modes=modes,
         )
     if fit is not None:
         return fit
@@ -332,8 +377,9 @@ def _fit(
             )
         return None
     return fit_control(
-        task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma
-    )
+        task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma,
+        modes=modes,
+    )  # fmt: skip
 
 
 def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
@@ -359,7 +405,17 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
         end for length in control.lengths for end in length.ends or ()
     }
     lost = {name: why for name, why in lost.items() if name in wanted}
-    return tie_control(control, spots, lost, datum)
+    found = tie_control(control, spots, lost, datum)
+    if task.shape is None:
+        return found
+    xyz = np.array([p.xyz for _, p in sorted(task.model.points3D.items())])
+    return replace(found, motion_at=partial(_motions_near, KDTree(xyz), task.shape.modes.points))
+
+
+def _motions_near(tree: KDTree, motions: Array, places: Array) -> Array:
+    """Motions (N, 3, K) of places (N, 3): those of the nearest points (P, 3, K)."""
+    found: Array = motions[np.asarray(tree.query(places)[1])]
+    return found
 
 
 def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import atomic_path, read_csv, write_csv, write_json
@@ -24,7 +23,8 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observed
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.navigation_equations import attitude_axes
+from reconstruct.placing.georeference import PlacementFit
+from reconstruct.placing.navigation_equations import PLACE, SCALE, attitude_axes
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform
 
@@ -108,61 +108,91 @@ def track_rows(
     return sorted(rows, key=lambda row: (row.station, row.image))
 
 
-def placed_covariances(poses: RigidTransform, middle: Array, covariance: Array) -> Array:
-    """Covariance of poses from the place alone, (N, 6, 6): the same errors for all of them.
+def picture_modes(
+    shape: Uncertainty, records: Sequence[ImageRecord], pinholes: Sequence[RigidTransform]
+) -> Array:
+    """(N, 6, K) of pictures by a model's soft modes: motions of the pinholes, turns about its axes.
 
     Args:
-        poses: (N,) in the world.
-        middle: (3,) middle of the track in the world.
-        covariance: (7, 7) of the place, see `georeference.PlacementFit`.
+        shape: of the model.
+        records: (N,) pictures.
+        pinholes: `model_from_pinhole` of these.
     """
-    away = poses.translation - middle
-    jacobian = np.zeros((len(away), 6, 7))
-    jacobian[:, :3, :3] = -cross_matrices(away)
-    jacobian[:, :3, 3:6] = np.eye(3)
-    jacobian[:, :3, 6] = away
-    jacobian[:, 3:, :3] = np.eye(3)
-    found: Array = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-    return found
+    arms = _arms_of(shape, records, pinholes)
+    modes = np.zeros((len(records), 6, shape.modes.stations.shape[2]))
+    for i, (row, arm) in enumerate(arms):
+        if row is not None:
+            turn, shift = shape.modes.stations[row, :3], shape.modes.stations[row, 3:]
+            modes[i, :3], modes[i, 3:] = shift - cross_matrices(arm[None])[0] @ turn, turn
+    return modes
+
+
+def _arms_of(
+    shape: Uncertainty, records: Sequence[ImageRecord | TrackRow], poses: Sequence[RigidTransform]
+) -> list[tuple[int | None, Array]]:
+    """For each picture the row of its station, None if unknown, and its place from there."""
+    row_of = {int(station): row for row, station in enumerate(shape.stations)}
+    references = set(shape.images)
+    first = {
+        record.station: pose.translation
+        for record, pose in zip(records, poses, strict=True)
+        if record.image in references
+    }
+    return [
+        (row_of.get(r.station), pose.translation - first.get(r.station, pose.translation))
+        for r, pose in zip(records, poses, strict=True)
+    ]
 
 
 @progress.step("covariance of the track")
-def shape_covariances(
-    poses: RigidTransform,
-    stations: NDArray[np.int64],
-    reference: NDArray[np.bool_],
-    found: Uncertainty,
+def pose_covariances(
+    rows: Sequence[TrackRow],
+    fit: PlacementFit | None,
+    shape: Uncertainty | None,
     world_from_model: Similarity,
 ) -> Array:
-    """Covariance of poses from the model's own shape, (N, 6, 6); NaN where it is unknown.
+    """Covariance of poses in the world, (N, 6, 6); NaN where that of the shape is unknown.
+
+    The place and the soft modes were estimated together; what else there is of the shape is
+    independent of them.
 
     Args:
-        poses: (N,) of the pictures in the world.
-        stations: (N,) theirs.
-        reference: (N,) whether a picture is that whose pose `found` has.
-        found: covariances of the stations, in the model's axes and unit.
+        rows: the pictures.
+        fit: of the place and the modes; None without.
+        shape: of the model before its modes were found; None where unknown.
         world_from_model: the model's place.
     """
-    turn = world_from_model.rotation.as_matrix()
-    # There: turn, then position; here: position, then turn.
-    move = np.zeros((6, 6))
-    move[:3, 3:] = world_from_model.scale * turn
-    move[3:, :3] = turn
-    of_station = dict(zip(found.stations.tolist(), found.frame_cov, strict=True))
-    origins = {
-        int(s): p
-        for s, p, first in zip(stations, poses.translation, reference, strict=True)
-        if first
-    }
-    result = np.full((len(stations), 6, 6), np.nan)
-    for i, (station, place) in enumerate(zip(stations.tolist(), poses.translation, strict=True)):
-        if station not in of_station or station not in origins:
-            continue
-        arm = np.eye(6)
-        arm[:3, 3:] = -cross_matrices((place - origins[station])[None])[0]
-        jacobian = arm @ move
-        result[i] = jacobian @ of_station[station] @ jacobian.T
-    return result
+    poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
+    total = np.zeros((len(rows), 6, 6))
+    count = 0 if fit is None else len(fit.modes)
+    jacobian = np.zeros((len(rows), 6, PLACE + count))
+    if fit is not None:
+        away = poses.translation - fit.middle_ned
+        jacobian[:, :3, :3] = -cross_matrices(away)
+        jacobian[:, :3, 3:6] = np.eye(3)
+        jacobian[:, :3, SCALE] = away
+        jacobian[:, 3:, :3] = np.eye(3)
+    if shape is not None:
+        turn = world_from_model.rotation.as_matrix()
+        # There: turn, then position; here: position, then turn.
+        move = np.zeros((6, 6))
+        move[:3, 3:] = world_from_model.scale * turn
+        move[3:, :3] = turn
+        for i, (row, arm) in enumerate(_arms_of(shape, rows, list(poses))):
+            if row is None:
+                total[i] = np.nan
+                continue
+            lever = np.eye(6)
+            lever[:3, 3:] = -cross_matrices(arm[None])[0]
+            lever = lever @ move
+            total[i] = lever @ shape.frame_cov[row] @ lever.T
+            if count:
+                modes = lever @ shape.modes.stations[row]
+                total[i] -= modes @ modes.T
+                jacobian[i, :, PLACE:] = modes
+    if fit is not None:
+        total = total + jacobian @ fit.joint @ np.swapaxes(jacobian, 1, 2)
+    return total
 
 
 def attitude_sigmas_deg(ned_from_body: Rotation, covariances: Array) -> Array:

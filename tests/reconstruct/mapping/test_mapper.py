@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 import pytest
+from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
@@ -24,7 +25,6 @@ from reconstruct.mapping.mapper import (
     scale_model,
     second_from_first,
 )
-from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
 from reconstruct.placing.acceptance import measure_doming

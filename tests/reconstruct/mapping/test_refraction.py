@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 
 from alice_survey.base.frames import Array
 from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
 from reconstruct.mapping.working_range import WorkingDistances, warp_record
 from reconstruct.placing.alignment import align_rigid, align_similarity

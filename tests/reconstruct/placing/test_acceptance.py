@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from reconstruct.mapping.priors import pinhole_positions
 from scipy.spatial.transform import Rotation
 
 from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.placing.acceptance import (
     Bend,
     ScaleTrend,

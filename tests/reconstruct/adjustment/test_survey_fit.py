@@ -9,13 +9,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
-
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError
-from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.freedom import POSE, value
-from camera_calib.rig import Covariance, Rig, read_rig
 from reconstruct.adjustment.rig_refinement import (
     NavigationFixes,
     RefinedSurvey,
@@ -25,10 +18,17 @@ from reconstruct.adjustment.rig_refinement import (
     on_rig,
     refine_rig,
 )
+from reconstruct.mapping.priors import NavigationAdjuster
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import ReconstructionError
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.freedom import POSE, value
+from camera_calib.rig import Covariance, Rig, read_rig
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid

@@ -1,0 +1,191 @@
+"""A mapped survey after its last adjustment, with what is known of its shape."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.records import RangeRecord
+from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.rig import Rig
+from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
+from reconstruct.adjustment.uncertainty import Uncertainty, estimate
+from reconstruct.mapping.arrays import frames_of, observed, rig_poses
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.views.model_files import colmap_pinhole, keypoints_of, rigid3d
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExactSurvey:
+    """A survey adjusted on exact rays."""
+
+    mapped: Mapped
+    """As it was mapped."""
+    seen: Observations
+    distances: RangeRecord
+    """For which the pinholes are the best."""
+    fit: SurveyFit
+
+    def on_pinholes(self) -> Mapped:
+        """As a model of the pinholes of its rig."""
+        warps = self.mapped.warps
+        if self.fit.parameters:
+            near, far = self.distances.near_m, self.distances.far_m
+            warps = {name: best_warp(self.fit.rig.cameras[name], near, far) for name in warps}
+        return on_pinholes(self.mapped, self.seen, self.fit, warps)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AdjustedSurvey:
+    """A model of pinholes after the last adjustment."""
+
+    mapped: Mapped
+    rig: Rig | None
+    exact: ExactSurvey | None
+    """What the model stands for; None where lenses or scale are not known beforehand."""
+    shape: Uncertainty | None
+    """How well its shape is known; None where it is not."""
+
+    def deformed(self, sizes: Array, left: Array) -> Self:
+        """The same after measurements from outside have said how its soft modes lie.
+
+        Args:
+            sizes: (K,) of every mode of the `shape`, in its sigmas.
+            left: (K, K) covariance of these.
+        """
+        if self.shape is None:
+            raise ValueError("a model of unknown shape has no modes")
+        shape, modes = self.shape.knowing(left), self.shape.modes
+        if self.exact is None:
+            steps, moved = modes.stations @ sizes, modes.points @ sizes
+            mapped = _moved(self.mapped, steps, moved)
+            return replace(self, mapped=mapped, shape=shape)
+        fit = self.exact.fit.deformed(modes, self.shape.point_ids, sizes, left)
+        exact = replace(self.exact, fit=fit)
+        return replace(self, mapped=exact.on_pinholes(), rig=fit.rig, exact=exact, shape=shape)
+
+
+def adjust_survey(
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig | None,
+    distances: RangeRecord | None,
+    settings: ReconstructConfig,
+) -> AdjustedSurvey:
+    """Adjust a mapped survey a last time by its pictures and its calibration.
+
+    Args:
+        mapped: exact model; picture i of `records` has the id i + 1.
+        records: pictures.
+        rig: as calibrated; None where the cameras calibrated themselves.
+        distances: for which the model's pinholes are the best.
+        settings: `refine_port` and `refine_rig`.
+
+    Raises:
+        ReconstructionError: the settings insist on a refinement of the rig, and the model has no
+            scale or does not determine it.
+    """
+    exact, notes = None, mapped.notes
+    try:
+        if rig is not None and distances is not None and mapped.scaled:
+            exact = _exact(mapped, records, rig, distances, settings)
+        elif settings.refine_port or settings.refine_rig == "on":
+            raise ReconstructionError(
+                "refine_port and refine_rig need two cameras, whose known baseline gives the "
+                'scale: set refine_port = false and refine_rig = "off" in survey.toml'
+            )
+    except ReconstructionError as error:
+        if settings.refine_port or settings.refine_rig == "on":
+            raise
+        notes = (*notes, f"rig as calibrated: {error}")
+    found = replace(mapped, notes=notes) if exact is None else exact.on_pinholes()
+    shape = None
+    try:
+        shape = _shape(found, records, exact)
+    except ReconstructionError as error:
+        warn(f"no covariance: {error}")
+    if exact is not None:
+        rig = exact.fit.rig
+    return AdjustedSurvey(mapped=found, rig=rig, exact=exact, shape=shape)
+
+
+def _exact(
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig,
+    distances: RangeRecord,
+    settings: ReconstructConfig,
+) -> ExactSurvey:
+    names = list(mapped.warps)
+    seen = Observations(
+        images=records,
+        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in mapped.warps.items()},
+        taken=taken_pixels(mapped.model, records, mapped.warps),
+        pairs=(),
+        warps=mapped.warps,
+    )
+    pose = frees_poses(settings, rig, names)
+    fit = fit_survey(mapped, seen, rig, port=settings.refine_port, pose=pose)
+    return ExactSurvey(mapped=mapped, seen=seen, distances=distances, fit=fit)
+
+
+@progress.step("covariance of the model")
+def _shape(
+    mapped: Mapped, records: Sequence[ImageRecord], exact: ExactSurvey | None
+) -> Uncertainty:
+    if exact is None:
+        return estimate(mapped, records)
+    return estimate(mapped, records, exact.fit.calibration, held=not exact.fit.parameters)
+
+
+def taken_pixels(
+    model: pycolmap.Reconstruction,
+    records: Sequence[ImageRecord],
+    warps: Mapping[str, PinholeWarp],
+) -> list[Array]:
+    """The keypoints of all pictures as taken, (N, 2) each.
+
+    A keypoint that has a point is where its pinhole sees that spot, at the point's depth; others
+    are as at the working range.
+
+    Args:
+        model: exact, in metres; picture i of `records` has the id i + 1.
+        records: pictures.
+        warps: by camera.
+    """
+    seen, stored = observed(model), keypoints_of(model)
+    found = [np.zeros((0, 2))] * len(records)
+    for number, rows in sorted(stored.items()):
+        warp = warps[records[number - 1].camera]
+        depths = np.full(len(rows), warp.working_depth_m)
+        if number in seen.pictures:
+            mine = seen.of(seen.row(number))
+            depths[seen.keypoint[mine]] = seen.in_cameras[mine, 2]
+        spots = np.column_stack([warp.pinhole.slopes(rows["xy"]), np.ones(len(rows))])
+        in_cam = spots * depths[:, None] + np.array(warp.centre_m)
+        found[number - 1] = warp.camera.project(in_cam)
+    return found
+
+
+def _moved(mapped: Mapped, steps: Array, points: Array) -> Mapped:
+    """A model of pinholes after steps of its stations (F, 6), and of its points (P, 3)."""
+    model = pycolmap.Reconstruction(mapped.model)
+    frames, ids = frames_of(model), observed(model).point_ids
+    poses = rig_poses(model, frames).inv()
+    turned = Rotation.from_rotvec(steps[:, :3]) * poses.rotation
+    stations = RigidTransform.from_components(poses.translation + steps[:, 3:], turned)
+    for frame, station in zip(frames.tolist(), stations, strict=True):
+        model.frames[frame].rig_from_world = rigid3d(station.inv())
+    for point, step in zip(ids.tolist(), points, strict=True):
+        model.points3D[point].xyz += step
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)

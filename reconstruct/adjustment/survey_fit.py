@@ -1,0 +1,385 @@
+"""The last adjustment: stations, points and the rig's parameters, on exact rays.
+
+Each parameter of the rig moves within what calibration knew of it: the covariance of `rig.json`, or
+wide bounds where it has none. Where anything is free, all uncertain parameters of the calibration
+(focal lengths, say) move within its covariance, since holding them would push their errors into
+what is free. The model is then rebuilt on the pinholes of the refined rig.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.block_solver import BlockStep, Flags, inverse_of, minimise
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.freedom import POSE as TURN_AND_SHIFT
+from camera_calib.freedom import Prior, at_bound, moved, pose_names, value
+from camera_calib.rig import Covariance, Rig
+from reconstruct.adjustment.exact_observations import (
+    Pixels,
+    RigState,
+    calibrated_parameters,
+    choose_pixels,
+    exact_observations,
+    start_state,
+)
+from reconstruct.adjustment.normal_equations import (
+    LEAST_POINTS,
+    POSE,
+    LinearObservations,
+    PointEquations,
+    reduce_points,
+)
+from reconstruct.adjustment.uncertainty import Motions, SoftModes
+from reconstruct.mapping.arrays import Indices, frames_of
+from reconstruct.mapping.bundle import move_points
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.refraction import Keypoints
+from reconstruct.mapping.robust import cauchy_cost, cauchy_weights, sigma_of, variance_of
+from reconstruct.views.model_files import colmap_pinhole, rigid3d
+
+_RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
+"""Prior sigmas of parameters that no calibration determines: very wide."""
+_BASELINE_SIGMA_M = 1e-7
+"""Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
+_STEPS = 20
+_SETTLED = 0.05
+"""Length of a step of all parameters, in sigmas, at which the adjustment ends."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurveyFit:
+    """An adjusted survey, and how well its rig is known."""
+
+    calibrated: Rig
+    """The rig before."""
+    state: RigState
+    """Stations by ascending frame, and those points that took part."""
+    point_ids: Indices
+    parameters: tuple[str, ...]
+    """What was adjusted of the rig."""
+    before: Array
+    """(G,) values, in the parameters' units."""
+    prior_sigmas: Array
+    covariance: Array
+    """(G, G) covariance of the values."""
+    calibration: Motions | None
+    """What errors of the rig do to the block; None where they are unknown."""
+    sigma_px: float
+    """Sigma of one coordinate of a keypoint."""
+    observations: int
+
+    @property
+    def after(self) -> Array:
+        """(G,) adjusted values."""
+        return np.array([value(self.state.rig, name) for name in self.parameters])
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The rig with the covariance of all that was adjusted; as calibrated if nothing was."""
+        if not self.parameters:
+            return self.calibrated
+        reference = self.calibrated.cam_from_rig[next(iter(self.state.rig.cameras))]
+        poses = {name: pose * reference for name, pose in self.state.rig.cam_from_rig.items()}
+        return replace(
+            self.calibrated,
+            cameras={**self.calibrated.cameras, **self.state.rig.cameras},
+            cam_from_rig={**self.calibrated.cam_from_rig, **poses},
+            source=f"{self.calibrated.source}; refined from the survey",
+            covariance=Covariance(parameters=self.parameters, matrix=self.covariance),
+        )
+
+    def deformed(self, modes: SoftModes, point_ids: Indices, sizes: Array, left: Array) -> Self:
+        """The survey after measurements from outside have said how its soft modes lie.
+
+        Args:
+            modes: of the block.
+            point_ids: (P,) of the modes' points, ascending.
+            sizes: (K,) of every mode, in its sigmas.
+            left: (K, K) covariance of these.
+        """
+        state, step = self.state, modes.stations @ sizes
+        rows = np.searchsorted(point_ids, self.point_ids)
+        rig, covariance = state.rig, self.covariance
+        if self.parameters:
+            rig = moved(rig, self.parameters, modes.calibration @ sizes)
+            gain = np.eye(len(sizes)) - left
+            covariance = covariance - modes.calibration @ gain @ modes.calibration.T
+        return replace(
+            self,
+            covariance=covariance,
+            state=RigState(
+                rig=rig,
+                turns=Rotation.from_rotvec(step[:, :3]).as_matrix() @ state.turns,
+                centres=state.centres + step[:, 3:],
+                points=state.points + modes.points[rows] @ sizes,
+            ),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """What `port.json` says."""
+        known = Covariance(parameters=self.parameters, matrix=self.covariance)
+        return {
+            "parameters": list(self.parameters),
+            "before": self.before.tolist(),
+            "after": self.after.tolist(),
+            "prior_sigmas": self.prior_sigmas.tolist(),
+            "sigmas": list(known.sigmas.values()),
+            "correlation": known.correlation.tolist(),
+            "sigma_px": self.sigma_px,
+            "observations": self.observations,
+            "stations": len(self.state.centres),
+        }
+
+
+@progress.step("adjust stations, points and rig")
+def fit_survey(
+    mapped: Mapped, seen: Observations, rig: Rig, *, port: bool, pose: bool
+) -> SurveyFit:
+    """Adjust a finished model on exact rays.
+
+    Args:
+        mapped: exact model on the rig, in metres; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: as calibrated or designed.
+        port: free distance and normal of the ports and the water's index.
+        pose: free the poses of the cameras on the rig. Without both the rig is held.
+
+    Raises:
+        ReconstructionError: the survey does not determine what is requested.
+    """
+    names = list(seen.cameras)
+    frames = frames_of(mapped.model)
+    pixels, ids = choose_pixels(mapped, seen, names, frames)
+    free = _prior(rig, names, port=port, pose=pose) if port or pose else Prior.around(rig, {})
+    problem = _SurveyProblem(pixels, start_state(mapped, rig, names, frames, ids), free)
+    found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
+    if not found.is_settled:
+        warn(f"the last adjustment did not settle in {_STEPS} steps: trust it with care")
+    equations, guess = found.equations, found.guess
+    covariance = known = inverse_of(equations.information)
+    fields = problem.fields
+    if not fields:  # held: what errors of the calibration do, all the same
+        fields = calibrated_parameters(rig, names)
+        if rig.covariance is not None:
+            known = rig.covariance.marginal(fields).matrix
+        linear = exact_observations(guess.state, pixels, fields)
+        equations = problem.reduced(replace(guess, linear=linear), found.noise)
+    sigma_px, variance = found.noise.tolist()
+    weights = cauchy_weights(guess.linear.miss, sigma_px)
+    return SurveyFit(
+        calibrated=rig,
+        state=guess.state,
+        point_ids=ids,
+        parameters=problem.fields,
+        before=np.array([value(problem.start.state.rig, name) for name in problem.fields]),
+        prior_sigmas=np.sqrt(np.diag(inverse_of(problem.information))),
+        covariance=covariance,
+        calibration=_motions(equations, guess.state.points, known) if fields else None,
+        sigma_px=float(np.sqrt(variance / weights.mean())),
+        observations=len(pixels.station),
+    )
+
+
+def _motions(equations: PointEquations, places: Array, covariance: Array) -> Motions:
+    """What changes of the shared parameters do to stations and points."""
+    stations = equations.response
+    units = np.eye(len(covariance), len(covariance) + 1)
+    points = [
+        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
+        for g, unit in enumerate(units)
+    ]
+    return Motions(
+        stations=stations, places=places, points=np.stack(points, axis=-1), covariance=covariance
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Guess:
+    """One guess of all unknowns, with what is seen from there."""
+
+    state: RigState
+    linear: LinearObservations
+    lost: int
+    """Observations that no ray explains: they do not count."""
+
+
+class _SurveyProblem:
+    """Stations, points and rig of a survey as `minimise` adjusts them."""
+
+    def __init__(self, pixels: Pixels, state: RigState, prior: Prior) -> None:
+        self.pixels, self.prior, self.fields = pixels, prior, prior.parameters
+        self.information = prior.information.copy()
+        _hold_baseline(self.information, self.fields, state.rig)
+        self.left = self._spare(state) / (2 * len(pixels.station))
+        seen = np.bincount(pixels.station, minlength=len(state.centres))
+        self.held = seen < LEAST_POINTS
+        self.held[0] = True
+        self.start = self._seen(state)
+
+    def _spare(self, state: RigState) -> int:
+        observations, points = len(self.pixels.station), self.pixels.points
+        stations, shared = len(state.centres), len(self.information)
+        spare = 2 * observations - 3 * points - POSE * stations
+        if spare < 10 * shared:
+            raise ReconstructionError(
+                f"{observations} observations of {points} points from {stations} stations do not "
+                f"determine {shared} parameters of the rig: leave refine_port and refine_rig off"
+            )
+        return spare
+
+    def _seen(self, state: RigState) -> _Guess:
+        linear = exact_observations(state, self.pixels, self.fields)
+        lost = int((~linear.by_point[:, 0].any(axis=1)).sum())
+        return _Guess(state=state, linear=linear, lost=lost)
+
+    def noise(self, guess: _Guess) -> Array:
+        """Sigma of a keypoint's coordinate for the weights, and variance that scales them."""
+        miss = guess.linear.miss
+        sigma = sigma_of(miss, guess.linear.seen_by, len(guess.state.centres))
+        return np.array([sigma, variance_of(miss, cauchy_weights(miss, sigma), self.left)])
+
+    def cost(self, guess: _Guess, noise: Array) -> float:
+        """Half of Cauchy's loss and prior."""
+        if guess.lost > self.start.lost:
+            return math.inf
+        sigma, variance = noise
+        off = self.prior.misfit(guess.state.rig)
+        pixels = cauchy_cost(guess.linear.miss, sigma) / variance
+        return 0.5 * float(pixels + off @ self.information @ off)
+
+    def linearised(self, guess: _Guess, noise: Array) -> PointEquations:
+        """Normal equations with the points eliminated."""
+        found = self.reduced(guess, noise)
+        found.shared[:-1, :-1] += self.information
+        found.shared[:-1, -1] += self.information @ self.prior.misfit(guess.state.rig)
+        return found
+
+    def reduced(self, guess: _Guess, noise: Array) -> PointEquations:
+        """The same without what is known before the pictures."""
+        sigma, variance = noise
+        weights = cauchy_weights(guess.linear.miss, sigma) / variance
+        found = reduce_points(guess.linear.weighted(weights), len(guess.state.centres))
+        found.free[self.held] = False
+        return found
+
+    def moved(self, guess: _Guess, equations: PointEquations, step: BlockStep) -> _Guess:
+        """The guess after a step."""
+        state = guess.state
+        return self._seen(
+            RigState(
+                rig=moved(state.rig, self.fields, step.shared),
+                turns=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ state.turns,
+                centres=state.centres + step.poses[:, 3:],
+                points=state.points + equations.point_steps(step),
+            )
+        )
+
+    def at_bound(self, guess: _Guess) -> Flags:
+        """Parameters that have their least value."""
+        return at_bound(guess.state.rig, self.fields)
+
+
+def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
+    """What is known before the pictures of what may move."""
+    known = calibrated_parameters(rig, names)
+    wide: dict[str, float] = {}
+    if port:
+        for name in names:
+            camera = rig.cameras[name]
+            if camera.refracts:
+                wide |= {f"{name}.{field}": sigma for field, sigma in camera.port.spreads.items()}
+    if pose:
+        wide |= {
+            name: _RIG_SIGMAS[name.split(".")[1]]
+            for name in pose_names(rig)
+            if name.split(".")[0] in names
+        }
+    wide = {name: sigma for name, sigma in wide.items() if name not in known}
+    loose = Prior.around(rig, wide)
+    return Prior.of_rig(rig, known).and_also(loose) if known else loose
+
+
+def _hold_baseline(information: Array, fields: Sequence[str], rig: Rig) -> None:
+    """Keep the length of a baseline that no calibration measured, in place."""
+    for name, pose in rig.cam_from_rig.items():
+        shift = [f"{name}.{axis}" for axis in TURN_AND_SHIFT[3:]]
+        if set(shift) <= set(fields) and shift[0] not in rig.sigmas:
+            at = [fields.index(field) for field in shift]
+            along = pose.translation / np.linalg.norm(pose.translation)
+            information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
+
+
+def frees_poses(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
+    """Whether the settings, or the calibration, leave the poses of cameras to the survey.
+
+    A calibration that states its covariance does, unless that is turned off: the two together know
+    more than either.
+    """
+    if settings.refine_rig == "auto":
+        moving = [n for n in pose_names(rig) if n.split(".")[0] in names]
+        return bool(moving) and set(moving) <= set(rig.sigmas)
+    return settings.refine_rig == "on"
+
+
+def on_pinholes(
+    mapped: Mapped, seen: Observations, fit: SurveyFit, warps: Mapping[str, PinholeWarp]
+) -> Mapped:
+    """The adjusted survey as a model of pinholes, with its keypoints where these see them.
+
+    Args:
+        mapped: the model that was adjusted.
+        seen: its keypoints.
+        fit: the adjusted survey.
+        warps: of the cameras of its rig.
+    """
+    model = pycolmap.Reconstruction(mapped.model)
+    names = list(seen.cameras)
+    pinholes = {name: colmap_pinhole(warps[name].pinhole) for name in names}
+    seen = replace(seen, warps=warps, cameras=pinholes)
+    pinhole_from_rig: dict[str, RigidTransform] = {
+        name: warps[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
+    }
+    rig_from_reference = pinhole_from_rig[names[0]].inv()
+    for number, name in enumerate(names, 1):
+        camera = model.cameras[number]
+        camera.width, camera.height = warps[name].pinhole.size_px
+        camera.params = pinholes[name].params
+        if number > 1:
+            for rig in model.rigs.values():
+                rig.set_sensor_from_rig(
+                    camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference)
+                )
+    stations = RigidTransform.from_components(
+        fit.state.centres, Rotation.from_matrix(fit.state.turns)
+    )
+    pinhole_from_cam = warps[names[0]].pinhole_from_cam
+    for frame, station in zip(frames_of(model).tolist(), stations, strict=True):
+        model.frames[frame].rig_from_world = rigid3d(pinhole_from_cam * station.inv())
+    for point, xyz in zip(fit.point_ids.tolist(), fit.state.points, strict=True):
+        model.points3D[point].xyz = xyz
+    for number, image in model.images.items():
+        for point, xy in zip(image.points2D, seen.pixels[number - 1], strict=True):
+            point.xy = xy
+    notes = mapped.notes
+    if fit.parameters:
+        notes = (*notes, "rig refined from the survey's own pictures")
+    found = replace(mapped, model=model, warps=warps, baseline=model_baseline(model), notes=notes)
+    keypoints = Keypoints(found, seen)
+    if len(fit.point_ids) < len(model.points3D):  # the others lie where the old rig had them
+        keypoints.correct(model, 1.0)
+        move_points(model, fit.sigma_px)
+    keypoints.correct(model, 1.0)
+    model.update_point_3d_errors()
+    return found
