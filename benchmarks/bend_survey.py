@@ -1,0 +1,348 @@
+"""A stereo survey along a simulated flight, whose truth is known: tracks of points, no pictures.
+
+The vehicle simulator flies an example and its sensors log what they log. Points on that example's
+sea floor are seen by the cameras of a true rig, which differs from the calibrated one by an error
+drawn from the calibration's covariance.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.api.survey import Survey
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.executor import local_executor
+from alice_survey.base.frames import (
+    Array,
+    Datum,
+    attitude_from_rotation,
+    interpolate_poses,
+)
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.trajectory import Trajectory, read_columns, read_track
+from alice_survey.seafloor.terrain import Terrain, survey_terrain
+from alice_survey.survey import run
+from camera_calib.freedom import moved
+from camera_calib.rig import Covariance, Rig, read_rig
+from missions.logs.navigation_csv import NavigationLog, read_navigation
+from missions.values.plan_file import read_plan
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.working_range import WorkingDistances
+from tests.reconstruct.scenes import Scene
+from tests.reconstruct.true_models import near_truth, warped_scene
+
+NOISE_PX = 0.02
+"""Of one coordinate: 13,000 observations with it are worth 330,000 with 0.1 px."""
+OBSERVATIONS = 13_000
+_MARGIN_M = 1.5
+"""Around the track, where points lie."""
+_FAR = 1.6
+"""Altitudes from a camera beyond which nothing is in its picture."""
+_RIG, _POINTS, _NOISE, _LOG = range(4)
+"""Streams of random numbers of one seed."""
+_DEPTH_CONSTANT_M, _DEPTH_SLOW_M, _DEPTH_SLOW_S, _DEPTH_WHITE_M = 0.05, 0.006, 600.0, 0.0016
+_FIX_M, _STRETCH, _WALK_M, _LEVEL_WHITE_M = 0.03, 0.003, 0.001, 0.002
+"""Of a drawn log: the fix it starts from, stretch, metres in a second's root, and white noise."""
+_TILT_DEG, _HEADING_DEG, _ATTITUDE_WHITE_DEG = 0.01, 0.3, 0.014
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlownTrack:
+    """A flight: where pictures were taken, and what the log has."""
+
+    config: SurveyConfig
+    datum: Datum
+    corners_ne: Array
+    """(N, 2) of the area that the vehicle may be in."""
+    taken_s: Array
+    """(S,) times of the stations."""
+    truth: Trajectory
+    log: NavigationLog
+
+    def at(self, time_s: Array) -> RigidTransform:
+        """(N,) true poses of the body."""
+        return interpolate_poses(self.truth.time_s, self.truth.ned_from_body, time_s)
+
+    @property
+    def ned_from_body(self) -> RigidTransform:
+        """(S,) true poses of the stations."""
+        return self.at(self.taken_s)
+
+    @property
+    def floor(self) -> Terrain:
+        """The sea floor below."""
+        return _floor(self.config, self.corners_ne.tobytes())
+
+
+@lru_cache(maxsize=1)
+def _floor(config: SurveyConfig, corners: bytes) -> Terrain:
+    return survey_terrain(
+        config.seafloor,
+        np.frombuffer(corners).reshape(-1, 2),
+        margin_m=config.plan.altitude_m,
+        depth_m=config.area.seafloor_depth_m,
+        seed=config.seed,
+    )
+
+
+def fly(folder: Path, example: str, seed: int) -> FlownTrack:
+    """Plan and fly an example with another seed, unless the folder holds that flight."""
+    workspace = _workspace(folder, example, seed)
+    run(["plan", "fly"], workspace, None, executor=local_executor(1))
+    plan, flight = read_plan(workspace / "plan" / "plan.json"), workspace / "flight"
+    return FlownTrack(
+        config=Survey(workspace).config,
+        datum=plan.datum,
+        corners_ne=np.array(plan.area.allowed_corners_ne, dtype=np.float64).reshape(-1, 2),
+        taken_s=read_columns(flight / "triggers.csv", ("time_s",))["time_s"],
+        truth=read_track(flight / "truth" / "track.csv"),
+        log=read_navigation(flight / "navigation.csv", UTC),
+    )
+
+
+def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> Rig:
+    """The rig of an example, calibrated from pictures of a board in a pool.
+
+    Args:
+        folder: keeps the pictures and the calibration.
+        example: whose cameras and board.
+        pool_scale: how many pixels of the sensor make one of the pool's pictures.
+        scale: the same for the rig returned.
+    """
+    workspace = _workspace(folder, example, None, f"-pool-{pool_scale}")
+    run(["pool", "calibrate"], workspace, None, pool_scale, local_executor(1))
+    rig = read_rig(workspace / "calibration" / "rig.json")
+    assert rig.covariance is not None
+    by = scale // pool_scale
+    names = rig.covariance.parameters
+    unit = np.array([1.0 / by if name.endswith("_px") else 1.0 for name in names])
+    matrix = rig.covariance.matrix * np.outer(unit, unit)
+    return replace(
+        rig,
+        cameras={name: camera.reduced(by) for name, camera in rig.cameras.items()},
+        covariance=Covariance(parameters=names, matrix=matrix),
+    )
+
+
+def _workspace(folder: Path, example: str, seed: int | None, suffix: str = "") -> Path:
+    workspace = folder / f"{example}{suffix}{'' if seed is None else f'-{seed}'}"
+    settings = workspace / "survey.toml"
+    if not settings.is_file():
+        survey = Survey.new(workspace, example=example)
+        if seed is not None:
+            text, own = settings.read_text(), f"seed = {survey.config.seed}\n"
+            settings.write_text(text.replace(own, f"seed = {seed}\n", 1))
+    return workspace
+
+
+def wrong_rig(rig: Rig, times: float, seed: int) -> Rig:
+    """A rig off another by a draw from its covariance, so many times as large."""
+    assert rig.covariance is not None
+    rng = np.random.default_rng([seed, _RIG])
+    scale = np.sqrt(np.diag(rig.covariance.matrix))
+    factor = np.linalg.cholesky(rig.covariance.correlation)
+    step = times * scale * (factor @ rng.normal(size=len(scale)))
+    return moved(rig, rig.covariance.parameters, step)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """What is wrong with a log that it does not state."""
+
+    clock_s: float = 0.0
+    """The log's clock minus that of the cameras."""
+    heading_deg: float = 0.0
+    """Added to the headings; positions stay."""
+    depth_m: float = 0.0
+    """By which depth has drifted at the end."""
+    stretch: float = 0.0
+    """Of horizontal positions about the first one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Readings:
+    """What a log has at the stations."""
+
+    ned: Array
+    """(S, 3) positions of the body, metres."""
+    angles_deg: Array
+    """(S, 3) roll, pitch, heading."""
+    sigmas: Array
+    """(S, 4) of horizontal position and depth, metres, and of tilt and heading, degrees."""
+
+    def with_fault(self, fault: Fault) -> "Readings":
+        """The same with all of a fault but the clock's."""
+        share = np.linspace(0.0, 1.0, len(self.ned))
+        ned, angles = self.ned.copy(), self.angles_deg.copy()
+        ned[:, :2] += fault.stretch * (ned[:, :2] - ned[0, :2])
+        ned[:, 2] += fault.depth_m * share
+        angles[:, 2] += fault.heading_deg
+        return replace(self, ned=ned, angles_deg=angles)
+
+
+def logged(track: FlownTrack, clock_s: float, _: int) -> Readings:
+    """The log of the simulated flight."""
+    columns = track.log.at(track.taken_s + clock_s)
+
+    def rows(*names: str) -> Array:
+        return np.column_stack([columns[name] for name in names])
+
+    return Readings(
+        ned=track.datum.ned_from_geodetic(rows("latitude_deg", "longitude_deg", "depth_m")),
+        angles_deg=rows("roll_deg", "pitch_deg", "heading_deg"),
+        sigmas=rows("sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg",
+                    "sigma_heading_deg"),
+    )  # fmt: skip
+
+
+def drawn(track: FlownTrack, clock_s: float, seed: int) -> Readings:
+    """A log with errors of the same instruments as the simulated one, drawn for each seed.
+
+    Depth has a constant, a slow and a white error, as a pressure sensor's; north and east are
+    reckoned from a fix by a Doppler log with a wrong scale, a wrong heading and noise that adds up;
+    attitude has a constant and a white error.
+    """
+    rng = np.random.default_rng([seed, _LOG])
+    time_s = track.taken_s + clock_s
+    bodies, count = track.at(time_s), len(time_s)
+    place = bodies.translation
+    depth_off = rng.normal(0, _DEPTH_CONSTANT_M) + rng.normal(0, _DEPTH_WHITE_M, count)
+    depth_off += _DEPTH_SLOW_M * _gauss_markov(rng, time_s, _DEPTH_SLOW_S)
+    away = place[:, :2] - place[0, :2]
+    turn_rad = np.deg2rad(rng.normal(0, _HEADING_DEG))
+    walk = rng.normal(size=(count, 2)) * np.sqrt(np.diff(time_s, prepend=time_s[0]))[:, None]
+    level_off = (
+        rng.normal(0, _FIX_M, 2)
+        + rng.normal(0, _STRETCH) * away
+        + turn_rad * np.column_stack([-away[:, 1], away[:, 0]])
+        + _WALK_M * np.cumsum(walk, axis=0)
+        + rng.normal(0, _LEVEL_WHITE_M, (count, 2))
+    )
+    constant = np.array([*rng.normal(0, _TILT_DEG, 2), np.rad2deg(turn_rad)])
+    return Readings(
+        ned=place + np.column_stack([level_off, depth_off]),
+        angles_deg=np.rad2deg(attitude_from_rotation(bodies.rotation))
+        + constant
+        + rng.normal(0, _ATTITUDE_WHITE_DEG, (count, 3)),
+        sigmas=np.tile(
+            [np.hypot(_FIX_M, _STRETCH * np.ptp(away)), _DEPTH_CONSTANT_M,
+             np.hypot(_TILT_DEG, _ATTITUDE_WHITE_DEG), _HEADING_DEG],
+            (count, 1),
+        ),
+    )  # fmt: skip
+
+
+Logbook = Callable[[FlownTrack, float, int], Readings]
+"""From a flight, the clock's error in seconds and a seed."""
+LOGS: dict[str, Logbook] = {"flown": logged, "drawn": drawn}
+
+
+def _gauss_markov(rng: np.random.Generator, time_s: Array, tau_s: float) -> Array:
+    """(N,) of unit variance."""
+    values = rng.normal(size=len(time_s))
+    kept = np.exp(-np.diff(time_s) / tau_s)
+    for i, keep in enumerate(kept, 1):
+        values[i] = keep * values[i - 1] + np.sqrt(1.0 - keep**2) * values[i]
+    return values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Started:
+    """A survey whose model lies near the truth, as its last adjustment finds it."""
+
+    scene: Scene
+    """On the calibrated rig; pixels are those of the true one."""
+    seen: Observations
+    mapped: Mapped
+    distances: WorkingDistances
+    datum: Datum
+
+
+def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> Started:
+    """Fly a true rig along a track; start the model on the rig that is believed.
+
+    Args:
+        track: the flight.
+        rig: as calibrated.
+        true: that takes the pictures.
+        read: navigation.
+        seed: of points, noise and start.
+    """
+    poses = track.ned_from_body
+    bodies = list(poses)
+    points = _points(track, seed)
+    tree, far_m = cKDTree(points), _FAR * track.config.plan.altitude_m
+    where: list[RigidTransform] = []
+    seen: list[tuple[Array, Array]] = []
+    depths = []
+    for body in bodies:
+        for name, camera in true.cameras.items():
+            pose = body * true.body_from_cam(name)
+            near = np.sort(np.array(tree.query_ball_point(pose.translation, far_m), dtype=int))
+            local = pose.inv().apply(points[near])
+            at = camera.project(local)
+            inside = np.all((at > 1) & (at < [camera.width_px - 1, camera.height_px - 1]), axis=1)
+            where.append(pose)
+            seen.append((near[inside], at[inside]))
+            depths.append(local[inside, 2])
+    views = np.bincount(np.concatenate([ids for ids, _ in seen]), minlength=len(points))
+    enough = int(np.searchsorted(np.cumsum(np.where(views > 1, views, 0)), OBSERVATIONS)) + 1
+    rng = np.random.default_rng([seed, _NOISE])
+    ids = [of[of < enough] for of, _ in seen]
+    pixels = [
+        at[of < enough] + rng.normal(0, NOISE_PX, (int((of < enough).sum()), 2)) for of, at in seen
+    ]
+    scene = Scene(
+        rig=rig,
+        records=_records(track, list(rig.cameras), read),
+        ned_from_cam=where,
+        points_ned=points[:enough],
+        pixels=pixels,
+        ids=ids,
+        pairs=[],
+    )
+    near_m, far_m = np.percentile(np.concatenate(depths), [1, 99]).tolist()
+    observations, warps = warped_scene(scene, near_m, far_m)
+    return Started(
+        scene=scene,
+        seen=observations,
+        mapped=near_truth(scene, observations, warps, rng),
+        distances=WorkingDistances(near_m=near_m, far_m=far_m, source="truth"),
+        datum=track.datum,
+    )
+
+
+def _points(track: FlownTrack, seed: int) -> Array:
+    """Points all over the sea floor below a track, in random order."""
+    rng = np.random.default_rng([seed, _POINTS])
+    place = track.ned_from_body.translation[:, :2]
+    low, high = place.min(axis=0) - _MARGIN_M, place.max(axis=0) + _MARGIN_M
+    level = rng.uniform(low, high, (OBSERVATIONS, 2))
+    near, _ = cKDTree(place).query(level)
+    level = level[near < 2 * _MARGIN_M]
+    return np.column_stack([level, track.floor.depth_at(level)])
+
+
+def _records(track: FlownTrack, cameras: Sequence[str], read: Readings) -> list[ImageRecord]:
+    places = track.datum.geodetic_from_ned(read.ned)
+    return [
+        ImageRecord(
+            image=f"{camera}/{station:06d}.png", camera=camera, station=station,
+            time_s=float(time_s), latitude_deg=float(place[0]), longitude_deg=float(place[1]),
+            depth_m=float(place[2]), roll_deg=float(angles[0]), pitch_deg=float(angles[1]),
+            heading_deg=float(angles[2] % 360.0), altitude_m=track.config.plan.altitude_m,
+            sigma_horizontal_m=float(sigma[0]), sigma_depth_m=float(sigma[1]),
+            sigma_attitude_deg=float(sigma[2]), sigma_heading_deg=float(sigma[3]),
+        )
+        for station, (time_s, place, angles, sigma) in enumerate(
+            zip(track.taken_s, places, read.angles_deg, read.sigmas, strict=True)
+        )
+        for camera in cameras
+    ]  # fmt: skip
