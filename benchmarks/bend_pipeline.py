@@ -5,24 +5,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array, Datum
+from alice_survey.base.records import RangeRecord
 from camera_calib.rig import Rig
-from reconstruct.mapping.acceptance import judge_model
-from reconstruct.mapping.arrays import frames_of
+from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.rig_refinement import RefinedSurvey, frees_rig, refine_rig
-from reconstruct.mapping.uncertainty import read_uncertainty, save_uncertainty
 from reconstruct.mapping.working_range import WorkingDistances
+from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.navigation_equations import PLACE
 from reconstruct.placing.run import body_from_pinhole
-from reconstruct.placing.track import placed_covariances, shape_covariances
+from reconstruct.placing.track import picture_modes, pose_covariances, track_rows
+from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform
 
 
@@ -61,29 +62,15 @@ def adjusted(
     Raises:
         ReconstructionError: a station is lost, or navigation does not place the model.
     """
-    settings = ReconstructConfig()
-    adjust = NavigationAdjuster(seen.images, rig, mapped.warps, datum)
-    poses = {name: rig.cam_from_rig[name] for name in seen.cameras}
-    free = frees_rig(settings, rig, list(seen.cameras))
-    mapped, _ = refract(mapped, seen, folder, adjust, poses, settle=not free)
-    if free:
-        found = refine_rig(mapped, seen, rig, distances, adjust, datum, folder, settings)
-        if isinstance(found, RefinedSurvey):
-            mapped, seen, rig, adjust = found.mapped, found.seen, found.rig, found.adjust
-        else:
-            mapped, _ = refract(mapped, seen, folder, adjust, poses)
-    save_uncertainty(folder, mapped, seen, rig, adjust.sigmas)
-    return placed(mapped, seen, rig, datum, folder)
-
-
-def placed(mapped: Mapped, seen: Observations, rig: Rig, datum: Datum, folder: Path) -> Adjusted:
-    """Place a finished model whose `covariance.npz` is in the folder.
-
-    Raises:
-        ReconstructionError: a station is lost, or navigation does not place the model.
-    """
-    doming, _ = judge_model(mapped, seen.images, rig, datum)
-    model = mapped.model
+    mapped, _ = refract(
+        mapped, seen, folder, {name: rig.cam_from_rig[name] for name in seen.cameras}
+    )
+    found = adjust_survey(
+        mapped, seen.images, rig, RangeRecord(**vars(distances)), ReconstructConfig()
+    )
+    if found.rig is None or found.shape is None:
+        raise ReconstructionError("the shape of the model is not known")
+    model = found.mapped.model
     numbers = sorted(n for n, image in model.images.items() if image.has_pose)
     records = [seen.images[n - 1] for n in numbers]
     pinholes = [as_transform(model.images[n].cam_from_world()).inv() for n in numbers]
@@ -91,37 +78,74 @@ def placed(mapped: Mapped, seen: Observations, rig: Rig, datum: Datum, folder: P
     fit = fit_navigation(
         records,
         pinholes,
-        body_from_pinhole(rig, mapped.warps),
+        body_from_pinhole(found.rig, found.mapped.warps),
         datum,
         level(points, np.array([pinhole.translation for pinhole in pinholes])),
         known_scale=1.0,
+        modes=picture_modes(found.shape, records, pinholes),
     )
     if fit is None:
         raise ReconstructionError("navigation does not place the model")
-    place, own = fit.ned_from_model, mapped.warps[rig.reference].pinhole_from_cam
-    kept = [k for k, record in enumerate(records) if record.camera == rig.reference]
-    in_model = RigidTransform.concatenate([pinholes[k] * own for k in kept])
-    poses = RigidTransform.from_components(
-        place.apply(in_model.translation), place.rotation * in_model.rotation
+    place, left = fit.ned_from_model, fit.joint[PLACE:, PLACE:]
+    after = found.deformed(fit.modes, left)
+    model = after.mapped.model
+    model.transform(_as_sim3(place))
+    frame = WorldFrame(name="ned", datum=datum, scaled=True, vertical_datum="", notes=())
+    of_name = {record.image: record for record in seen.images}
+    rows = [
+        row
+        for row in track_rows(model, of_name, after.mapped.warps, frame, {})
+        if row.camera == rig.reference
+    ]
+    if len(rows) < len({record.station for record in seen.images}):
+        raise ReconstructionError(f"only {len(rows)} stations are left")
+    poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
+    stations = [int(np.flatnonzero(found.shape.stations == row.station)[0]) for row in rows]
+    moved = found.shape.moved(place.scale, place.rotation)
+    down = moved.modes.stations[stations, 5]
+    spreads = _sag_weights(poses.translation) @ down
+    scaling = _scale_weights(poses.translation) @ moved.modes.stations[stations, 3:].reshape(
+        -1, len(left)
     )
-    stations = np.array([records[k].station for k in kept], dtype=np.int64)
-    if len(stations) < len({record.station for record in seen.images}):
-        raise ReconstructionError(f"only {len(frames_of(model))} stations are left")
-    path = folder / "covariance.npz"
-    shape = np.full((len(stations), 6, 6), np.nan)
-    if path.is_file():
-        every = np.ones(len(stations), dtype=np.bool_)
-        shape = shape_covariances(poses, stations, every, read_uncertainty(path), place)
-    bends = [doming.along, doming.across]
     depth = fit.correlation["depth"]
     return Adjusted(
         ned_from_cam=poses,
-        covariances=shape + placed_covariances(poses, fit.middle_ned, fit.covariance),
-        shape=shape,
-        bend_sigmas_m=np.array([np.nan if b is None else b.sag_sigma_m for b in bends]),
-        scale_sigma=fit.sigma_scale or np.nan,
+        covariances=pose_covariances(rows, fit, found.shape, place),
+        shape=_positions_first(
+            found.shape.knowing(left).moved(place.scale, place.rotation).frame_cov[stations]
+        ),
+        bend_sigmas_m=np.sqrt(np.einsum("ik,kl,il->i", spreads, left, spreads)),
+        scale_sigma=float(np.sqrt(scaling @ left @ scaling)),
         correlation=(
             f"{depth.factor:.2g} of stated, {depth.tau:.3g} {fit.time_unit}, white "
             f"{depth.white:.2g}, constant {depth.constant:.2g}"
         ),
     )
+
+
+def _positions_first(covariances: Array) -> Array:
+    order = [3, 4, 5, 0, 1, 2]
+    found: Array = covariances[:, order][:, :, order]
+    return found
+
+
+def _sag_weights(places: Array) -> Array:
+    """(2, S) that take height errors to the sags along and across (see `bend.sags_of`)."""
+    level_ = places[:, :2] - places[:, :2].mean(axis=0)
+    u, v = (level_ @ np.linalg.svd(level_, full_matrices=False)[2].T).T
+    design = np.column_stack([np.ones_like(u), u, v, u * u, v * v, u * v])
+    weights = np.linalg.pinv(design)[3:5]
+    sags: Array = weights * (np.array([np.ptp(u), np.ptp(v)])[:, None] ** 2 / 4.0)
+    return sags
+
+
+def _scale_weights(places: Array) -> Array:
+    """(3 S,) that take errors of places to that of the scale."""
+    arms = places - places.mean(axis=0)
+    weights: Array = (arms / (arms**2).sum()).ravel()
+    return weights
+
+
+def _as_sim3(place: Similarity) -> pycolmap.Sim3d:
+    rotation = pycolmap.Rotation3d(place.rotation.as_quat())
+    return pycolmap.Sim3d(place.scale, rotation, place.translation)
