@@ -245,7 +245,8 @@ def _soft_modes(
 
     def moved(weighed: Array) -> tuple[Array, Array, Array]:
         """Covariance times (F, 6): of stations in a fixed rig, in all, and of the rig."""
-        kick = weigh * (weighed - weigh * gauge.motions @ gauge.motion_in(weighed / weigh))
+        whole = gauge.motions @ gauge.motion_in(weighed / weigh)
+        kick = weigh * (weighed - weigh * whole)
         own = equations.covariance_times(kick[..., None])[..., 0]
         if calibration is None:
             return own, own, np.zeros(0)
