@@ -42,6 +42,11 @@ from tests.reconstruct.true_models import near_truth, warped_scene
 NOISE_PX = 0.02
 """Of one coordinate: 13,000 observations with it are worth 330,000 with 0.1 px."""
 OBSERVATIONS = 13_000
+_FAR_PORT = """[camera]
+port_distance_m = 0.1
+glass_thickness_m = 0.02
+port_tilt_deg = [2, 0]
+"""
 _MATCHED = 0.5
 """Share of the pictures that show a point in which it is matched: the demo's tracks have 4.9 views
 where 8.2 pictures show a point."""
@@ -98,7 +103,7 @@ def _floor(config: SurveyConfig, corners: bytes) -> Terrain:
 
 def fly(folder: Path, example: str, seed: int) -> FlownTrack:
     """Plan and fly an example with another seed, unless the folder holds that flight."""
-    workspace = _workspace(folder, example, seed)
+    workspace = _workspace(folder, str(seed), example, seed, "")
     run(["plan", "fly"], workspace, None, executor=local_executor(1))
     plan, flight = read_plan(workspace / "plan" / "plan.json"), workspace / "flight"
     return FlownTrack(
@@ -111,7 +116,9 @@ def fly(folder: Path, example: str, seed: int) -> FlownTrack:
     )
 
 
-def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> Rig:
+def calibrated_rig(
+    folder: Path, example: str, pool_scale: int, scale: int, *, far_port: bool = False
+) -> Rig:
     """The rig of an example, calibrated from pictures of a board in a pool.
 
     Args:
@@ -119,8 +126,10 @@ def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> R
         example: whose cameras and board.
         pool_scale: how many pixels of the sensor make one of the pool's pictures.
         scale: the same for the rig returned.
+        far_port: the ports are 100 mm away and tilted by 2 degrees.
     """
-    workspace = _workspace(folder, example, None, f"-pool-{pool_scale}")
+    port, settings = ("-far-port", _FAR_PORT) if far_port else ("", "")
+    workspace = _workspace(folder, f"pool-{pool_scale}{port}", example, None, settings)
     run(["pool", "calibrate"], workspace, None, pool_scale, local_executor(1))
     rig = read_rig(workspace / "calibration" / "rig.json")
     assert rig.covariance is not None
@@ -135,14 +144,16 @@ def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> R
     )
 
 
-def _workspace(folder: Path, example: str, seed: int | None, suffix: str = "") -> Path:
-    workspace = folder / f"{example}{suffix}{'' if seed is None else f'-{seed}'}"
+def _workspace(folder: Path, name: str, example: str, seed: int | None, extra: str) -> Path:
+    """A workspace with an example's settings, another seed and more settings."""
+    workspace = folder / f"{example}-{name}"
     settings = workspace / "survey.toml"
     if not settings.is_file():
         survey = Survey.new(workspace, example=example)
+        text, own = settings.read_text(), f"seed = {survey.config.seed}\n"
         if seed is not None:
-            text, own = settings.read_text(), f"seed = {survey.config.seed}\n"
-            settings.write_text(text.replace(own, f"seed = {seed}\n", 1))
+            text = text.replace(own, f"seed = {seed}\n", 1)
+        settings.write_text(f"{text}\n{extra}")
     return workspace
 
 
@@ -168,6 +179,8 @@ class Fault:
     """By which depth has drifted at the end."""
     stretch: float = 0.0
     """Of horizontal positions about the first one."""
+    sigmas: float = 1.0
+    """Factor on what the log states."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -188,7 +201,7 @@ class Readings:
         ned[:, :2] += fault.stretch * (ned[:, :2] - ned[0, :2])
         ned[:, 2] += fault.depth_m * share
         angles[:, 2] += fault.heading_deg
-        return replace(self, ned=ned, angles_deg=angles)
+        return Readings(ned=ned, angles_deg=angles, sigmas=fault.sigmas * self.sigmas)
 
 
 def logged(track: FlownTrack, clock_s: float, _: int) -> Readings:
