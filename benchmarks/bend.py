@@ -1,7 +1,8 @@
 """How bent, how far off and how honest a model of a long survey is: tracks of a known truth.
 
     python -m benchmarks.bend --work FOLDER [--seeds 3] [--flights 3] [--log flown drawn]
-        [--only TEXT ...] [--pool-scale 4] [--adjust MODULE:FUNCTION] [--quick] [--json FILE]
+        [--only TEXT ...] [--pool-scale 4] [--far-port] [--adjust MODULE:FUNCTION]
+        [--quick] [--json FILE]
 
 Every seed draws the error of a calibration from its covariance, points on the sea floor, noise of
 pixels and, with `--log drawn`, that of navigation; the flights are those of the example `caesarea`
@@ -67,6 +68,8 @@ CASES = (
     Case(name="heading off by 3 deg", fault=Fault(heading_deg=3.0)),
     Case(name="depth drifts by 0.2 m", fault=Fault(depth_m=0.2)),
     Case(name="positions stretched by 0.5 %", fault=Fault(stretch=0.005)),
+    Case(name="sigmas stated 3 times too large", fault=Fault(sigmas=3.0)),
+    Case(name="sigmas stated 3 times too small", fault=Fault(sigmas=1.0 / 3.0)),
 )
 
 
@@ -101,7 +104,9 @@ def main() -> None:
     print(f"{heading(about)}\n", flush=True)
     example = _QUICK_EXAMPLE if options.quick else _EXAMPLE
     options.work.mkdir(parents=True, exist_ok=True)
-    rig = calibrated_rig(options.work, example, options.pool_scale, _SCALE)
+    rig = calibrated_rig(
+        options.work, example, options.pool_scale, _SCALE, far_port=options.far_port
+    )
     flights = [
         fly(options.work, example, _FIRST_SEED + k)
         for k in range(min(options.flights, options.seeds))
@@ -273,6 +278,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--pool-scale", type=int, default=4, help="pixels of the sensor in one of the pool's"
     )
+    parser.add_argument("--far-port", action="store_true", help="ports at 100 mm, 2 deg tilted")
     parser.add_argument("--adjust", metavar="MODULE:FUNCTION", help="instead of the pipeline's")
     add_options(parser, quick="one survey of the demo, calibration as stated and 3 times worse")
     options = parser.parse_args()

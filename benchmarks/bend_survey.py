@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
+from scipy.stats.qmc import Halton
 
 from alice_survey.api.survey import Survey
 from alice_survey.base.config import SurveyConfig
@@ -41,6 +42,14 @@ from tests.reconstruct.true_models import near_truth, warped_scene
 NOISE_PX = 0.02
 """Of one coordinate: 13,000 observations with it are worth 330,000 with 0.1 px."""
 OBSERVATIONS = 13_000
+_FAR_PORT = """[camera]
+port_distance_m = 0.1
+glass_thickness_m = 0.02
+port_tilt_deg = [2, 0]
+"""
+_MATCHED = 0.5
+"""Share of the pictures that show a point in which it is matched: the demo's tracks have 4.9 views
+where 8.2 pictures show a point."""
 _MARGIN_M = 1.5
 """Around the track, where points lie."""
 _FAR = 1.6
@@ -94,7 +103,7 @@ def _floor(config: SurveyConfig, corners: bytes) -> Terrain:
 
 def fly(folder: Path, example: str, seed: int) -> FlownTrack:
     """Plan and fly an example with another seed, unless the folder holds that flight."""
-    workspace = _workspace(folder, example, seed)
+    workspace = _workspace(folder, str(seed), example, seed, "")
     run(["plan", "fly"], workspace, None, executor=local_executor(1))
     plan, flight = read_plan(workspace / "plan" / "plan.json"), workspace / "flight"
     return FlownTrack(
@@ -107,7 +116,9 @@ def fly(folder: Path, example: str, seed: int) -> FlownTrack:
     )
 
 
-def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> Rig:
+def calibrated_rig(
+    folder: Path, example: str, pool_scale: int, scale: int, *, far_port: bool = False
+) -> Rig:
     """The rig of an example, calibrated from pictures of a board in a pool.
 
     Args:
@@ -115,8 +126,10 @@ def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> R
         example: whose cameras and board.
         pool_scale: how many pixels of the sensor make one of the pool's pictures.
         scale: the same for the rig returned.
+        far_port: the ports are 100 mm away and tilted by 2 degrees.
     """
-    workspace = _workspace(folder, example, None, f"-pool-{pool_scale}")
+    port, settings = ("-far-port", _FAR_PORT) if far_port else ("", "")
+    workspace = _workspace(folder, f"pool-{pool_scale}{port}", example, None, settings)
     run(["pool", "calibrate"], workspace, None, pool_scale, local_executor(1))
     rig = read_rig(workspace / "calibration" / "rig.json")
     assert rig.covariance is not None
@@ -131,14 +144,16 @@ def calibrated_rig(folder: Path, example: str, pool_scale: int, scale: int) -> R
     )
 
 
-def _workspace(folder: Path, example: str, seed: int | None, suffix: str = "") -> Path:
-    workspace = folder / f"{example}{suffix}{'' if seed is None else f'-{seed}'}"
+def _workspace(folder: Path, name: str, example: str, seed: int | None, extra: str) -> Path:
+    """A workspace with an example's settings, another seed and more settings."""
+    workspace = folder / f"{example}-{name}"
     settings = workspace / "survey.toml"
     if not settings.is_file():
         survey = Survey.new(workspace, example=example)
+        text, own = settings.read_text(), f"seed = {survey.config.seed}\n"
         if seed is not None:
-            text, own = settings.read_text(), f"seed = {survey.config.seed}\n"
-            settings.write_text(text.replace(own, f"seed = {seed}\n", 1))
+            text = text.replace(own, f"seed = {seed}\n", 1)
+        settings.write_text(f"{text}\n{extra}")
     return workspace
 
 
@@ -164,6 +179,8 @@ class Fault:
     """By which depth has drifted at the end."""
     stretch: float = 0.0
     """Of horizontal positions about the first one."""
+    sigmas: float = 1.0
+    """Factor on what the log states."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,7 +201,7 @@ class Readings:
         ned[:, :2] += fault.stretch * (ned[:, :2] - ned[0, :2])
         ned[:, 2] += fault.depth_m * share
         angles[:, 2] += fault.heading_deg
-        return replace(self, ned=ned, angles_deg=angles)
+        return Readings(ned=ned, angles_deg=angles, sigmas=fault.sigmas * self.sigmas)
 
 
 def logged(track: FlownTrack, clock_s: float, _: int) -> Readings:
@@ -278,6 +295,7 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
     poses = track.ned_from_body
     bodies = list(poses)
     points = _points(track, seed)
+    rng = np.random.default_rng([seed, _NOISE])
     tree, far_m = cKDTree(points), _FAR * track.config.plan.altitude_m
     where: list[RigidTransform] = []
     seen: list[tuple[Array, Array]] = []
@@ -289,12 +307,12 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
             local = pose.inv().apply(points[near])
             at = camera.project(local)
             inside = np.all((at > 1) & (at < [camera.width_px - 1, camera.height_px - 1]), axis=1)
+            inside &= rng.uniform(size=len(near)) < _MATCHED
             where.append(pose)
             seen.append((near[inside], at[inside]))
             depths.append(local[inside, 2])
     views = np.bincount(np.concatenate([ids for ids, _ in seen]), minlength=len(points))
     enough = int(np.searchsorted(np.cumsum(np.where(views > 1, views, 0)), OBSERVATIONS)) + 1
-    rng = np.random.default_rng([seed, _NOISE])
     ids = [of[of < enough] for of, _ in seen]
     pixels = [
         at[of < enough] + rng.normal(0, NOISE_PX, (int((of < enough).sum()), 2)) for of, at in seen
@@ -320,11 +338,11 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
 
 
 def _points(track: FlownTrack, seed: int) -> Array:
-    """Points all over the sea floor below a track, in random order."""
-    rng = np.random.default_rng([seed, _POINTS])
+    """Points on the sea floor below a track; the first ones, however many, are spread evenly."""
     place = track.ned_from_body.translation[:, :2]
     low, high = place.min(axis=0) - _MARGIN_M, place.max(axis=0) + _MARGIN_M
-    level = rng.uniform(low, high, (OBSERVATIONS, 2))
+    spread = Halton(2, rng=np.random.default_rng([seed, _POINTS])).random(OBSERVATIONS)
+    level = low + spread * (high - low)
     near, _ = cKDTree(place).query(level)
     level = level[near < 2 * _MARGIN_M]
     return np.column_stack([level, track.floor.depth_at(level)])

@@ -127,6 +127,7 @@ PARTS = (
     Part(name="vehicle", module="vehicle"),
     Part(name="features", module="features", arguments=_features, needs=_need_features),
     Part(name="refraction", module="refraction"),
+    Part(name="bend", module="bend", arguments=lambda _, work: ("--work", str(work))),
     Part(
         name="reconstruct-peers",
         module="reconstruct",

@@ -10,9 +10,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks import table
+from benchmarks.bend import sags_of
 from benchmarks.figures import Figure, Findings, Goal, hand_over
 from benchmarks.measured import Cost
 from benchmarks.parts import PARTS, Part, Settings, chosen
@@ -33,8 +36,8 @@ def test_every_benchmark_that_hands_figures_over_is_a_part() -> None:
     found = sorted(file.stem for file in files if "add_options(parser" in file.read_text())
 
     assert found == MODULES
-    assert {"camera", "planner", "vehicle", "features", "refraction", "reconstruct", "mosaic",
-            "real_pictures"} == {*MODULES}  # fmt: skip
+    assert {"camera", "planner", "vehicle", "features", "refraction", "bend", "reconstruct",
+            "mosaic", "real_pictures"} == {*MODULES}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -286,6 +289,14 @@ def test_one_part_runs_and_one_is_left_out(tmp_path: Path) -> None:
     assert all(row["ratio"] < 1 for row in cameras if row["peer"] == "OPENCV")
     assert "OPENCV" in (out / "logs" / "refraction-1.log").read_text()
     assert (out / "table.md").is_file()
+
+
+def test_sags_are_those_of_a_bent_and_tilted_block_whichever_way_it_lies() -> None:
+    u, v = np.meshgrid(np.linspace(-15.0, 15.0, 31), np.linspace(-5.0, 5.0, 9))
+    heights = 0.012 * (u / 15.0) ** 2 - 0.003 * (v / 5.0) ** 2 + 0.002 * u - 0.01 * v + 0.4
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.6])
+    places = turn.apply(np.column_stack([u.ravel(), v.ravel(), np.full(u.size, 7.0)]))
+    np.testing.assert_allclose(sags_of(places, heights.ravel()), (0.012, -0.003), atol=1e-12)
 
 
 def test_a_part_that_does_not_exist_is_an_error(tmp_path: Path) -> None:
