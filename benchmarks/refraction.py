@@ -19,14 +19,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
-from reconstruct.mapping.priors import adjust_freely
 
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from reconstruct.mapping.bundle import all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.refraction import refract
+from reconstruct.mapping.refraction import adjust_freely, refract
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.placing.alignment import align_rigid
 from tests.oracles_refraction import adjust_through_ports

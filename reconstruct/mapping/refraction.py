@@ -201,7 +201,7 @@ def refract(
         if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
             settled = True
             break
-        mapped = _adjusted(replace(mapped, model=model, notes=notes))
+        mapped = adjust_freely(replace(mapped, model=model, notes=notes))
         model = pycolmap.Reconstruction(mapped.model)
         if len(moves) == 1:
             removed, added = judge(model, scale)
@@ -221,7 +221,7 @@ def refract(
     return replace(mapped, model=model), found
 
 
-def _adjusted(mapped: Mapped) -> Mapped:
+def adjust_freely(mapped: Mapped) -> Mapped:
     """Adjust all poses and points.
 
     A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.

@@ -92,12 +92,13 @@ def test_the_worst_comes_first(tmp_path: Path) -> None:
 def test_every_verdict_that_is_not_good_says_what_to_do(tmp_path: Path) -> None:
     workspace = tiny_workspace(
         tmp_path,
-        sparse={"registered": 1, "scale_source": "scale from the calibrated rig"},
-        mapping={
-            "refraction": {"settled": False},
+        sparse={
+            "registered": 1,
+            "scale_source": "scale from the calibrated rig",
             "acceptance": {"notes": ["stations lie elsewhere"]},
             "doming": {"along": None, "across": None, "scale": None, "notes": ["it is bent"]},
         },
+        mapping={"refraction": {"settled": False}},
     )
     _, found = judged(workspace)
     asked = [verdict for verdict in found if verdict.level != "good"]

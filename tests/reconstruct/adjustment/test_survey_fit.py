@@ -1,6 +1,5 @@
 """What a survey says of its own rig, against the truth."""
 
-import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -9,38 +8,30 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from reconstruct.adjustment.rig_refinement import (
-    NavigationFixes,
-    RefinedSurvey,
-    RigFit,
-    fit_rig,
-    frees_rig,
-    on_rig,
-    refine_rig,
-)
-from reconstruct.mapping.priors import NavigationAdjuster
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
-from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from alice_survey.base.records import RangeRecord
 from camera_calib.freedom import POSE, value
-from camera_calib.rig import Covariance, Rig, read_rig
-from reconstruct.mapping.arrays import observed
+from camera_calib.rig import Covariance, Rig
+from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
+from reconstruct.adjustment.exact_observations import start_state
+from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
+from reconstruct.mapping.arrays import frames_of, observed
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid
-from reconstruct.views.model_files import as_transform
 from tests.cameras import changed
-from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
 NOISE_PX = 0.3
 TURN_SIGMA = 3e-4
 PORT = ReconstructConfig(refine_port=True, refine_rig="off")
 RIG = ReconstructConfig(refine_rig="on")
+DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 
 
 @cache
@@ -83,7 +74,7 @@ def right_turned(rig: Rig, turn_rad: float, sigmas: list[float]) -> Rig:
     )
 
 
-def errors_in_sigmas(fit: RigFit, true: Rig) -> np.ndarray:
+def errors_in_sigmas(fit: SurveyFit, true: Rig) -> np.ndarray:
     misses = fit.after - [value(true, name) for name in fit.parameters]
     return misses / np.sqrt(np.diag(fit.covariance))
 
@@ -94,7 +85,7 @@ def test_a_wrong_port_comes_back_within_its_sigmas(tmp_path: Path) -> None:
         scene = noisy(seed)
         wrong = nearer(scene.rig, 0.003)
         mapped, seen = modelled(scene, wrong, tmp_path)
-        fit = fit_rig(mapped, seen, wrong, port=True, pose=False)
+        fit = fit_survey(mapped, seen, wrong, port=True, pose=False)
         assert fit.sigma_px == pytest.approx(NOISE_PX, rel=0.08)
         draws.append(errors_in_sigmas(fit, scene.rig))
     assert np.abs(draws).max() < 4.0
@@ -116,7 +107,7 @@ def test_without_noise_port_water_and_rig_are_found_exactly(tmp_path: Path) -> N
         },
     )
     mapped, seen = modelled(clean(), wrong, tmp_path)
-    fit = fit_rig(mapped, seen, wrong, port=True, pose=False)
+    fit = fit_survey(mapped, seen, wrong, port=True, pose=False)
     for name in fit.parameters:
         # The wide prior still pulls a little; it is worth a tiny part of the sigma.
         sigma = fit.rig.sigmas[name]
@@ -134,7 +125,7 @@ def test_a_turned_camera_is_turned_back_and_the_baseline_stays(tmp_path: Path) -
     )
     wrong = replace(scene.rig, cam_from_rig={**scene.rig.cam_from_rig, "right": turned})
     mapped, seen = modelled(scene, wrong, tmp_path)
-    fit = fit_rig(mapped, seen, wrong, port=False, pose=True)
+    fit = fit_survey(mapped, seen, wrong, port=False, pose=True)
     assert np.abs(errors_in_sigmas(fit, scene.rig)[[0, 1, 2, 4, 5]]).max() < 4.0
     found = fit.rig.cam_from_rig["right"].rotation * pose.rotation.inv()
     assert found.magnitude() < 0.3 * turned.rotation.magnitude()
@@ -153,7 +144,7 @@ def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> N
         covariance=Covariance(parameters=names, matrix=covariance),
     )
     mapped, seen = modelled(scene, wrong, tmp_path)
-    fit = fit_rig(mapped, seen, wrong, port=False, pose=True)
+    fit = fit_survey(mapped, seen, wrong, port=False, pose=True)
     assert set(names) <= set(fit.parameters)
     np.testing.assert_allclose(
         [fit.prior_sigmas[fit.parameters.index(n)] for n in names], np.sqrt(np.diag(covariance))
@@ -165,162 +156,117 @@ def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> N
     assert np.abs(errors_in_sigmas(fit, scene.rig)[shared]).max() < 4.0
 
 
-def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
-    """Lines flown both ways show where navigation's origin sits, but not how deep."""
-    scene = noisy(5)
-    mapped, seen = modelled(scene, scene.rig, tmp_path)
-    rng = np.random.default_rng(2)
-    ned_from_body = [
-        pose * scene.rig.body_from_cam("left").inv() for pose in scene.ned_from_cam[::2]
-    ]
-    fixes = NavigationFixes(
-        positions=np.array([p.translation for p in ned_from_body]) + rng.normal(0, 0.01, (10, 3)),
-        sigmas=np.full((10, 3), 0.01),
-    )
-    true = scene.rig.body_from_rig
-    moved = RigidTransform.from_components(
-        true.translation + np.array([0.03, -0.02, 0]), true.rotation
-    )
-    fit = fit_rig(
-        mapped, seen, replace(scene.rig, body_from_rig=moved), port=False, pose=True, fixes=fixes
-    )
-    sigmas = np.sqrt(np.diag(fit.covariance))[-3:]
-    truth = true.inv().translation
-    assert np.all(np.abs(fit.after[-3:] - truth) < 4 * sigmas)
-    assert np.all(sigmas[:2] < 0.015)
-    assert sigmas[2] > 0.02
-    np.testing.assert_allclose(fit.rig.body_from_rig.inv().translation, fit.after[-3:], atol=1e-12)
+def points_rms(mapped: Mapped, scene: Scene) -> float:
+    """Of the points, wherever the model lies."""
+    _, _, points, true = pupils_and_points(mapped, scene)
+    away = align_rigid(points, true).apply(points) - true
+    return float(np.sqrt((away**2).sum(axis=1).mean()))
 
 
 def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     scene = noisy(6)
     wrong = nearer(scene.rig, 0.01)
-    mapped, seen = modelled(scene, wrong, tmp_path)
-    adjust = NavigationAdjuster(scene.records, wrong, mapped.warps, DATUM)
-    mapped = adjust(mapped)
-    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
-    found = refine_rig(mapped, seen, wrong, distances, adjust, DATUM, tmp_path, PORT)
-    assert isinstance(found, RefinedSurvey)
-    refined = found.mapped
-    assert found.convergence.settled
-    assert found.adjust.sigmas is not None
+    mapped, _ = modelled(scene, wrong, tmp_path)
+    found = adjust_survey(mapped, scene.records, wrong, DISTANCES, PORT)
+    assert found.exact is not None and found.rig is not None and found.shape is not None
+    fit, refined = found.exact.fit, found.mapped
     assert found.rig.covariance is not None
-    for keypoints, before in zip(found.seen.pixels, seen.pixels, strict=True):
-        assert 0.01 < np.abs(keypoints - before).max() < 3.0
     assert refined.baseline == pytest.approx(model_baseline(refined.model), rel=1e-9)
-    written = read_rig(tmp_path / "rig.json")
-    said = json.loads((tmp_path / "port.json").read_text())
+    said = fit.to_json()
     assert said["parameters"][0] == "left.port_distance_m"
-    assert written.cameras["left"].port.port_distance_m == pytest.approx(said["after"][0])
-    left = refined.warps["left"]
-    assert left.camera == written.cameras["left"]
+    assert found.rig.cameras["left"].port.port_distance_m == pytest.approx(said["after"][0])
+    assert refined.warps["left"].camera == found.rig.cameras["left"]
     assert np.diag(said["correlation"]) == pytest.approx(1.0)
-    _, _, points, true_points = pupils_and_points(refined, scene)
-    away = align_rigid(points, true_points).apply(points) - true_points
-    assert np.sqrt((away**2).sum(axis=1).mean()) < 3e-3
+    assert points_rms(refined, scene) < 3e-3
     assert refined.model.compute_mean_reprojection_error() < 0.45
+
+
+def test_keypoints_as_taken_come_back_from_the_model(tmp_path: Path) -> None:
+    scene = noisy(6)
+    mapped, seen = modelled(scene, scene.rig, tmp_path)
+    found = adjust_survey(mapped, scene.records, scene.rig, DISTANCES, ReconstructConfig())
+    assert found.exact is not None
+    at = observed(mapped.model)
+    for n, number in enumerate(at.pictures.tolist()):
+        rows = at.keypoint[at.of(n)]
+        again = found.exact.seen.taken[number - 1][rows]
+        np.testing.assert_allclose(again, seen.taken[number - 1][rows], atol=1e-3)
 
 
 def test_points_that_took_no_part_move_along(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A refinement takes some of a large survey's points, and no observation is lost by that."""
+    """An adjustment takes some of a large survey's points, and the others follow."""
     rng = np.random.default_rng(8)
     pixels = [p + rng.normal(0, 0.05, p.shape) for p in clean().pixels]
     scene = replace(clean(), pixels=pixels)
     wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
-    mapped, seen = modelled(scene, wrong, tmp_path)
-    adjust = NavigationAdjuster(scene.records, wrong, mapped.warps, None)
-    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
-    models = []
+    mapped, _ = modelled(scene, wrong, tmp_path)
+    errors = []
     for most in (200_000, mapped.model.compute_num_observations() // 4):
         monkeypatch.setattr("reconstruct.adjustment.exact_observations._MOST_OBSERVATIONS", most)
-        found = refine_rig(mapped, seen, wrong, distances, adjust, None, tmp_path, RIG)
-        assert isinstance(found, RefinedSurvey)
-        before = mapped.model.compute_num_observations()
-        assert found.convergence.removed < 0.01 * before
-        models.append(found.mapped.model)
-    all_points, some = (observed(model) for model in models)
-    assert len(some.point) == pytest.approx(len(all_points.point), rel=0.002)
+        found = adjust_survey(mapped, scene.records, wrong, DISTANCES, RIG)
+        assert found.exact is not None
+        errors.append(points_rms(found.mapped, scene))
+        px = found.mapped.model.compute_mean_reprojection_error()
+        assert 0.03 < px < 0.09
+    assert len(found.exact.fit.point_ids) < 0.3 * len(mapped.model.points3D)
+    assert errors[0] < 0.5 * points_rms(mapped, scene)
+    assert errors[1] < 3.0 * errors[0]  # from a quarter of the observations
 
 
 def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path) -> None:
     scene = noisy(6)
     sigmas = [*[TURN_SIGMA] * 3, 1e-5, 1e-4, 1e-4]
     wrong = right_turned(scene.rig, 1.5 * TURN_SIGMA, sigmas)
-    mapped, seen = modelled(scene, wrong, tmp_path)
-    adjust = NavigationAdjuster(scene.records, wrong, mapped.warps, None)
-    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
+    mapped, _ = modelled(scene, wrong, tmp_path)
 
-    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> RefinedSurvey | str:
-        return refine_rig(
-            model, seen, rig, distances, adjust, None, tmp_path, ReconstructConfig(**settings)
-        )
+    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> AdjustedSurvey:
+        return adjust_survey(model, scene.records, rig, DISTANCES, ReconstructConfig(**settings))
 
-    found = refined(wrong)
-    assert isinstance(found, RefinedSurvey)
-    before, after = (
-        np.sqrt((align_rigid(p, t).apply(p) - t) ** 2).mean()
-        for p, t in (pupils_and_points(m, scene)[2:] for m in (mapped, found.mapped))
-    )
-    assert after < 0.5 * before
+    assert points_rms(refined(wrong).mapped, scene) < 0.5 * points_rms(mapped, scene)
+    held = refined(wrong, refine_rig="off")
+    assert held.rig == wrong and held.shape is not None
+    assert held.shape.modes.calibration.shape[0] == 0, "then no mode moves the rig"
     both, unknown = ["left", "right"], replace(wrong, covariance=None)
-    assert frees_rig(ReconstructConfig(), wrong, both)
-    assert not frees_rig(ReconstructConfig(refine_rig="off"), wrong, both)
-    assert not frees_rig(ReconstructConfig(), unknown, both)
-    assert not frees_rig(ReconstructConfig(), wrong, ["left"])
-    assert frees_rig(ReconstructConfig(refine_rig="on"), unknown, both)
+    assert frees_poses(ReconstructConfig(), wrong, both)
+    assert not frees_poses(ReconstructConfig(refine_rig="off"), wrong, both)
+    assert not frees_poses(ReconstructConfig(), unknown, both)
+    assert not frees_poses(ReconstructConfig(), wrong, ["left"])
+    assert frees_poses(ReconstructConfig(refine_rig="on"), unknown, both)
     few = replace(mapped, model=pycolmap.Reconstruction(mapped.model))
     for point in sorted(few.model.points3D)[12:]:
         few.model.delete_point3D(point)
-    said = refined(wrong, few)
-    assert isinstance(said, str)
-    assert "12 points" in said
+    assert any("12 points" in note for note in refined(wrong, few).mapped.notes)
     with pytest.raises(ReconstructionError, match="12 points"):
         refined(wrong, few, refine_rig="on")
 
 
 def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
-    """New warps of an unchanged rig: nothing moves."""
+    """New pinholes of an unchanged rig: nothing moves."""
     scene = noisy(7)
     mapped, seen = modelled(scene, scene.rig, tmp_path)
-    frames = sorted(mapped.model.frames)
-    ids = observed(mapped.model).point_ids
-    fit = RigFit(
-        rig=scene.rig,
-        parameters=(),
-        before=np.zeros(0),
-        after=np.zeros(0),
-        prior_sigmas=np.zeros(0),
-        covariance=np.zeros((0, 0)),
-        sigma_px=NOISE_PX,
-        observations=0,
-        stations=tuple(
-            as_transform(mapped.model.frames[f].rig_from_world).inv()
-            * mapped.warps["left"].pinhole_from_cam
-            for f in frames
-        ),
-        points=np.array([mapped.model.points3D[int(i)].xyz for i in ids]),
-        point_ids=ids,
-    )
-    warps: dict[str, PinholeWarp] = {
-        name: best_warp(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()
-    }
-    same, warped = on_rig(mapped, seen, fit, warps)
-    for before, after in zip(seen.pixels, warped.pixels, strict=True):
-        np.testing.assert_allclose(after, before, atol=1e-6)
+    fit = fit_survey(mapped, seen, scene.rig, port=False, pose=False)
+    frames, names = frames_of(mapped.model), list(seen.cameras)
+    same = replace(fit, state=start_state(mapped, scene.rig, names, frames, fit.point_ids))
+    found = on_pinholes(mapped, seen, same, mapped.warps)
     for number, image in mapped.model.images.items():
         np.testing.assert_allclose(
-            same.model.images[number].cam_from_world().matrix(),
+            found.model.images[number].cam_from_world().matrix(),
             image.cam_from_world().matrix(),
             atol=1e-12,
         )
+        at = image.get_observation_point2D_idxs()
+        before, after = (
+            np.array([one.points2D[k].xy for k in at])
+            for one in (image, found.model.images[number])
+        )
+        np.testing.assert_allclose(after, before, atol=1e-4)
 
 
 def test_one_camera_is_refused(tmp_path: Path) -> None:
     scene = noisy(0)
-    mapped, seen = modelled(scene, scene.rig, tmp_path)
-    adjust = NavigationAdjuster(scene.records, scene.rig, mapped.warps, None)
+    mapped, _ = modelled(scene, scene.rig, tmp_path)
     alone = replace(mapped, scaled=False)
-    with pytest.raises(ReconstructionError):
-        refine_rig(alone, seen, scene.rig, None, adjust, None, tmp_path, PORT)
+    with pytest.raises(ReconstructionError, match="two cameras"):
+        adjust_survey(alone, scene.records, scene.rig, DISTANCES, PORT)

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.block_solver import BlockStep
+from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.normal_equations import (
@@ -16,16 +17,16 @@ from reconstruct.adjustment.normal_equations import (
     LinearObservations,
     reduce_points,
 )
+from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
-    CalibrationPart,
-    calibration_part,
+    Motions,
     estimate,
     pinhole_observations,
     read_uncertainty,
-    save_uncertainty,
     write_uncertainty,
 )
 from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
@@ -55,7 +56,7 @@ def test_errors_are_as_large_as_stated(tmp_path: Path) -> None:
     frames, points = [], []
     for seed in range(12):
         scene, mapped = drawn(seed, tmp_path)
-        found = estimate(mapped, scene.records, None)
+        found = estimate(mapped, scene.records)
         misses, point_misses = laid_onto(
             mapped.model, found, true_stations(scene, mapped), scene.points_ned, _depth(mapped)
         )
@@ -96,23 +97,9 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved.ravel(), wanted, atol=1e-9)
 
 
-def test_given_positions_do_not_place_the_shape_but_firm_it(tmp_path: Path) -> None:
-    """Exact positions leave stations only turns, which move all of them; vague ones do nothing."""
-    scene, mapped = drawn(1, tmp_path)
-    free = estimate(mapped, scene.records, None)
-    vague = estimate(mapped, scene.records, np.full((len(scene.records), 3), 2.0))
-    np.testing.assert_allclose(
-        _sigmas(vague.frame_cov), _sigmas(free.frame_cov), rtol=2e-3, atol=1e-9
-    )
-    firm = estimate(mapped, scene.records, np.full((len(scene.records), 3), 1e-6))
-    stiff, loose = _sigmas(firm.frame_cov)[:, 3:], _sigmas(free.frame_cov)[:, 3:]
-    assert np.median(stiff) < 0.3 * np.median(loose)
-    assert np.all(_sigmas(firm.point_cov) < 1.001 * _sigmas(free.point_cov) + 1e-4)
-
-
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     scene, mapped = drawn(2, tmp_path)
-    found = estimate(mapped, scene.records, None)
+    found = estimate(mapped, scene.records)
     for name in ("a.npz", "b.npz"):
         write_uncertainty(tmp_path / name, found)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
@@ -123,6 +110,9 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.point_noise, found.point_noise, rtol=1e-6)
     assert back.images == tuple(f"left/{s:06d}.png" for s in range(10))
     assert back.sigma_px == found.sigma_px
+    np.testing.assert_array_equal(back.modes.stations, found.modes.stations)
+    np.testing.assert_allclose(back.modes.points, found.modes.points, rtol=1e-6)
+    assert back.modes.calibration.shape == (0, found.modes.stations.shape[2])
     for cov in (*found.frame_cov, *found.point_cov):
         np.testing.assert_allclose(cov, cov.T, atol=1e-9 * np.abs(cov).max())
         assert np.linalg.eigvalsh(cov)[0] > -1e-12
@@ -138,19 +128,18 @@ def test_a_station_that_sees_next_to_nothing_has_no_covariance(tmp_path: Path) -
     left = {p for n in (9, 10) for p in _points_of(mapped, n)}
     for point in left:
         mapped.model.delete_point3D(point)
-    found = estimate(mapped, scene.records, None)
+    found = estimate(mapped, scene.records)
     assert np.isnan(found.frame_cov[4]).all()
     rest = np.delete(found.frame_cov, 4, axis=0)
     assert np.isfinite(rest).all()
 
 
-def test_too_small_a_model_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_small_a_model_is_reported(tmp_path: Path) -> None:
     scene, mapped = drawn(4, tmp_path)
     for point in sorted(mapped.model.points3D)[3:]:
         mapped.model.delete_point3D(point)
-    save_uncertainty(tmp_path, mapped, warped_scene(scene)[0], scene.rig)
-    assert " 3 points" in capsys.readouterr().err
-    assert not (tmp_path / "covariance.npz").exists()
+    with pytest.raises(ReconstructionError, match=" 3 points"):
+        estimate(mapped, scene.records)
 
 
 def _points_of(mapped: Mapped, number: int) -> list[int]:
@@ -236,6 +225,11 @@ def points_with(rig: Rig, folder: Path, seed: int = 0) -> tuple[Mapped, Array]:
     return mapped, observed(mapped.model).points
 
 
+def part_of(mapped: Mapped, seen: Observations, rig: Rig) -> Motions | None:
+    """What errors of a rig that is held do."""
+    return fit_survey(mapped, seen, rig, port=False, pose=False).calibration
+
+
 def shape_of(points: Array, true: Array) -> Array:
     return align_rigid(points, true).apply(points) - true
 
@@ -243,7 +237,7 @@ def shape_of(points: Array, true: Array) -> Array:
 @pytest.mark.parametrize("name", SIGMAS)
 def test_a_wrong_parameter_moves_the_points_as_predicted(name: str, tmp_path: Path) -> None:
     mapped, true = points_with(noisy().rig, tmp_path)
-    part = calibration_part(mapped, warped_scene(noisy())[0], noisy().rig)
+    part = part_of(mapped, warped_scene(noisy())[0], noisy().rig)
     assert part is not None
     step = SIGMAS[name]
     _, found = points_with(off(noisy().rig, {name: step}), tmp_path)
@@ -261,8 +255,8 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
         rig = off(noisy().rig, steps)
         mapped, _ = points_with(rig, tmp_path, seed)
         seen = warped_scene(replace(noisy(seed), rig=rig))[0]
-        part = calibration_part(mapped, seen, rig)
-        found = estimate(mapped, seen.images, None, part)
+        part = part_of(mapped, seen, rig)
+        found = estimate(mapped, seen.images, part)
         away = laid_onto(
             mapped.model,
             found,
@@ -272,7 +266,7 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
         )
         stations.append(away[0] / _sigmas(found.frame_cov))
         points.append(away[1] / _sigmas(found.point_cov))
-        without = estimate(mapped, seen.images, None)
+        without = estimate(mapped, seen.images)
         too_sure.append(away[1] / _sigmas(without.point_cov))
     for ratios in (stations, points):
         assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -284,8 +278,7 @@ def test_a_motion_of_the_whole_block_is_no_change_of_shape() -> None:
     centres, points = rng.normal(0, 2, (7, 3)), rng.normal(0, 2, (30, 3))
     gauge = Gauge(centres, 2.0, scale_free=False)
     motion = rng.normal(0, 1, (6, 2))
-    part = CalibrationPart(
-        frames=np.arange(7),
+    part = Motions(
         stations=gauge.motions @ motion,
         places=points,
         points=gauge.of_points(points) @ motion,
@@ -298,7 +291,7 @@ def test_a_motion_of_the_whole_block_is_no_change_of_shape() -> None:
 def test_a_rig_without_covariance_adds_nothing(tmp_path: Path) -> None:
     mapped, _ = points_with(noisy().rig, tmp_path)
     unknown = replace(noisy().rig, covariance=None)
-    assert calibration_part(mapped, warped_scene(noisy())[0], unknown) is None
+    assert part_of(mapped, warped_scene(noisy())[0], unknown) is None
 
 
 def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:
@@ -308,7 +301,7 @@ def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:
         p.point3D_id for n in lonely for p in mapped.model.images[n].get_observation_points2D()
     }:
         mapped.model.delete_point3D(point)
-    part = calibration_part(mapped, warped_scene(noisy())[0], noisy().rig)
+    part = part_of(mapped, warped_scene(noisy())[0], noisy().rig)
     assert part is not None
     assert np.isfinite(part.stations).all()
     assert np.all(part.stations[4] == 0)

@@ -3,18 +3,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import heard
-from alice_survey.base.records import MappingRecord, RegistrationRecord, SimilarityRecord
-from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
 from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 from tests.oracles_dense import write_workspace as write
 
 SCENE = Scene(depth_of=flat, paint=position_code)
-SCALE, TURN = 2.0, Rotation.from_euler("xyz", [100, 20, -40], degrees=True)
 
 
 def small_model() -> SparseModel:
@@ -23,37 +20,34 @@ def small_model() -> SparseModel:
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Points whose heights poses shift by 3 mm, known in a gauge that is turned and half as big."""
+    """Points whose heights poses shift by 3 mm."""
     folder = write(tmp_path_factory.mktemp("poses"), small_model(), SCENE)
-    (folder / "mapping").mkdir()
     ids = np.arange(1, 1 + len(read_model(folder / "sparse").points_world))
     noise = np.zeros((len(ids), 3, 3))
     noise[:, 2, 2] = np.random.default_rng(1).uniform(0.001, 0.01, len(ids)) ** 2
     world = noise.copy()
     world[:, 0, 0] += 1.0  # what is unsure along north must not count
     world[:, 2, 2] += 0.003**2
-    turn = TURN.inv().as_matrix()
     found = Uncertainty(
         frames=np.arange(4),
         stations=np.arange(4),
         images=("a", "b", "c", "d"),
         frame_cov=np.zeros((4, 6, 6)),
         point_ids=ids,
-        point_cov=turn @ world @ turn.T / SCALE**2,
-        point_noise=turn @ noise @ turn.T / SCALE**2,
+        point_cov=world,
+        point_noise=noise,
         sigma_px=0.2,
+        modes=SoftModes(
+            stations=np.zeros((4, 6, 0)),
+            points=np.zeros((len(ids), 3, 0)),
+            calibration=np.zeros((0, 0)),
+        ),
     )
-    write_uncertainty(folder / "mapping" / "covariance.npz", found)
-    MappingRecord(gauge="this model").write(folder / "mapping" / "mapping.json")
-    placed = SimilarityRecord(scale=SCALE, quaternion_xyzw=tuple(TURN.as_quat().tolist()))
-    RegistrationRecord(
-        registered=4, total=4, points=len(ids), mean_reprojection_px=0.1, mean_track_length=2.0,
-        scale_source=None, gauge="this model", world_from_mapping=placed,
-    ).write(folder / "sparse" / "registration.json")  # fmt: skip
+    write_uncertainty(folder / "sparse" / "covariance.npz", found)
     return folder
 
 
-def test_what_pixels_do_is_taken_out_and_the_gauge_does_not_matter(workspace: Path):
+def test_what_pixels_do_is_taken_out(workspace: Path):
     model = read_model(workspace / "sparse")
     part = find_pose_part(workspace, model)
     assert part is not None
@@ -69,12 +63,6 @@ def test_a_covariance_of_another_model_is_not_taken(workspace: Path):
     with heard() as warnings:
         assert find_pose_part(workspace, fewer) is None
     assert len(warnings) == 1
-    path = workspace / "mapping" / "mapping.json"
-    MappingRecord(gauge="another model").write(path)
-    with heard() as warnings:
-        assert find_pose_part(workspace, model) is None
-    assert len(warnings) == 1
-    MappingRecord(gauge="this model").write(path)
 
 
 def test_nodes_take_the_median_of_the_points_around_and_cells_lie_between():

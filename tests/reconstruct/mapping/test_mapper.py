@@ -7,7 +7,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 import pytest
-from reconstruct.mapping.priors import adjust_freely, pinhole_positions, refine_with_positions
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
@@ -25,13 +24,12 @@ from reconstruct.mapping.mapper import (
     scale_model,
     second_from_first,
 )
-from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.mapping.self_calibration import map_self_calibrated
 from reconstruct.placing.acceptance import measure_doming
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.rig_survey import four_cameras
-from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.scenes import Scene, make_scene
 
 
 def seen_by_pinholes(scene: Scene) -> Observations:
@@ -291,53 +289,6 @@ def test_pictures_that_share_nothing_give_one_clear_line(tmp_path: Path) -> None
         map_calibrated(replace(seen, pairs=[]), scene.rig.cam_from_rig, tmp_path, 1)
 
 
-@cache
-def strip() -> tuple[Scene, Mapped]:
-    scene = make_scene(lines=1, stations=30, points=12000, noise_px=0.3)
-    return scene, mapped_scene(scene)
-
-
-def test_pinholes_follow_from_navigation() -> None:
-    scene, mapped = strip()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
-    true = np.stack(
-        [
-            (pose * mapped.warps[r.camera].pinhole_from_cam.inv()).translation
-            for pose, r in zip(scene.ned_from_cam, scene.records, strict=True)
-        ]
-    )
-    # attitude noise of 0.1 degrees on a lever arm of 0.55 m
-    assert np.linalg.norm(positions - true, axis=1).max() < 5e-3
-    assert np.all(sigmas[:, 0] > 0.3)
-    assert np.all(sigmas < 0.32)
-
-
-@pytest.mark.parametrize("jump_m", [0.0, 8.0])
-def test_positions_straighten_a_long_line_but_leave_its_scale(jump_m: float) -> None:
-    scene, mapped = strip()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
-    stated = positions + np.array([0.4, -0.3, 0.05])
-    stated[6:8] += [jump_m, 0.0, 0.0]  # one station whose position is wrong
-    stated = stated.mean(axis=0) + 1.02 * (stated - stated.mean(axis=0))  # 2 % too long
-    refined = refine_with_positions(mapped, scene.records, stated, sigmas)
-    assert refined is not mapped
-    assert model_baseline(refined.model) == pytest.approx(0.1, rel=1e-9)
-    assert camera_rms(refined, scene) < 0.8 * camera_rms(mapped, scene)
-    found, true = pupils(refined, scene)
-    assert abs(align_similarity(found, true).scale - 1.0) < 2e-3
-
-
-def test_positions_that_contradict_the_pictures_are_not_used() -> None:
-    scene, mapped = strip()
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
-    wrong = positions + np.repeat(np.random.default_rng(1).normal(0, 2.0, (30, 3)), 2, axis=0)
-    refined = refine_with_positions(mapped, scene.records, wrong, sigmas * 1e-3)
-    assert camera_rms(refined, scene) < 2 * camera_rms(mapped, scene)
-    assert model_baseline(refined.model) == pytest.approx(0.1, rel=1e-9)
-    few = np.where(np.arange(60)[:, None] < 6, positions, np.nan)
-    assert refine_with_positions(mapped, scene.records, few, sigmas) is mapped
-
-
 def part(model: pycolmap.Reconstruction, keep: set[int]) -> pycolmap.Reconstruction:
     """A model of some frames only."""
     found = pycolmap.Reconstruction(model)
@@ -381,18 +332,3 @@ def test_models_that_share_stations_become_one(
     assert "6 pictures" in notes[0] and "left/000006.png" in notes[0]
     assert notes[0] in capsys.readouterr().err
     assert report_left_out([first]) == report_left_out([]) == []
-
-
-def test_vague_positions_do_not_spoil_a_model_of_precise_pixels() -> None:
-    """COLMAP takes pixels to have unit sigma: of 0.05 px they would count 400 times too little."""
-    scene = make_scene(lines=2, stations=5, points=6000, noise_px=0.05, seed=8)
-    mapped = adjust_freely(mapped_scene(scene))
-    assert 0.8 * 0.05 < pixel_sigma(mapped.model) < 1.4 * 0.05
-    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.warps, DATUM)
-    station = np.array([r.station for r in scene.records])
-    noise = np.random.default_rng(1).normal(0, 0.1, (station.max() + 1, 3))[station]
-    vague = np.full_like(sigmas, 0.1)
-    refined = refine_with_positions(mapped, scene.records, positions + noise, vague)
-    assert refined is not mapped
-    free = camera_rms(mapped, scene)
-    assert 0.5 * free < camera_rms(refined, scene) < 1.3 * free

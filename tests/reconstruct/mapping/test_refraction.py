@@ -7,18 +7,17 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from reconstruct.mapping.priors import NavigationAdjuster, adjust_freely
 
 from alice_survey.base.frames import Array
 from camera_calib.ports.dome import DomePort
-from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.refraction import SETTLED_PX, Convergence, adjust_freely, refract
 from reconstruct.mapping.working_range import WorkingDistances, warp_record
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift
 from tests.cameras import changed
 from tests.oracles_refraction import adjust_through_ports
-from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
 PORTS = [(0.02, 0.0), (0.02, 2.0), (0.05, 0.0), (0.05, 2.0)]
@@ -191,19 +190,6 @@ def test_with_matches_lost_observations_come_back(tmp_path: Path) -> None:
     )
     assert found.added == pytest.approx(lost, abs=0.1 * lost)
     assert not list(tmp_path.iterdir()), "scratch is cleared"
-
-
-def test_navigation_takes_part_and_the_rig_keeps_the_scale(tmp_path: Path) -> None:
-    scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
-    adjust = NavigationAdjuster(scene.records, scene.rig, start[0].warps, DATUM)
-    assert adjust.sigmas is None
-    mapped, found = refract(start[0], start[1], tmp_path, adjust)
-    assert found.settled
-    assert adjust.sigmas is not None
-    assert model_baseline(mapped.model) == pytest.approx(start[0].baseline, rel=1e-9)
-    _, _, points, true_points = pupils_and_points(mapped, scene)
-    assert rigid_rms(points, true_points) < 3e-3
-    assert np.abs((points - true_points).mean(axis=0)).max() < 0.5, "the model is in NED"
 
 
 def test_a_model_without_scale_takes_it_from_the_working_range(tmp_path: Path) -> None:

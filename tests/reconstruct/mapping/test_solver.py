@@ -2,11 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pycolmap
-from reconstruct.mapping.priors import adjust_freely
 from scipy.spatial.transform import RigidTransform
 
 from reconstruct.mapping.global_mapper import adjust
 from reconstruct.mapping.mapper import Mapped, _options
+from reconstruct.mapping.refraction import adjust_freely
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.views.model_files import as_transform, rigid3d
 from tests.reconstruct.scenes import Scene, make_scene

@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from reconstruct.mapping.priors import pinhole_positions
 from scipy.spatial.transform import Rotation
 
 from reconstruct.mapping.arrays import observed
@@ -19,6 +18,7 @@ from reconstruct.placing.acceptance import (
     measure_doming,
     misses,
     navigation_rotations,
+    pinhole_positions,
     scale_trend,
 )
 from tests.reconstruct.mapping.test_mapper import block, block_mapped

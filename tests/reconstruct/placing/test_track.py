@@ -1,6 +1,7 @@
 """Tracks say how surely each picture's pose is known, in every format."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,17 +12,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
-from reconstruct.adjustment.uncertainty import Uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.georeference import PlacementFit
 from reconstruct.placing.navigation_equations import attitude_axes
 from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
     attitude_sigmas_deg,
-    placed_covariances,
+    pose_covariances,
     read_track_poses,
-    shape_covariances,
     track_sigmas,
     write_covariances,
     write_track_csv,
@@ -63,6 +64,35 @@ def assert_close(found: Array, drawn: Array) -> None:
     )
 
 
+HERE = Similarity(scale=1.0, rotation=Rotation.identity(), translation=np.zeros(3))
+
+
+def rows_of(poses: RigidTransform, station: int = 0) -> list[TrackRow]:
+    """Pictures of one station, the first being that of the reference camera."""
+    return [
+        TrackRow(
+            image="ab"[k] if k < 2 else str(k), station=station, camera="left", time_s=0.0,
+            world_from_cam=pose, points=1, reprojection_px=0.1, world_from_body=pose.rotation,
+        )
+        for k, pose in enumerate(poses)
+    ]  # fmt: skip
+
+
+def placed(middle: Array, covariance: Array) -> PlacementFit:
+    """A place of this covariance."""
+    return PlacementFit(
+        ned_from_model=HERE, used=1, left_out={}, rms_m=np.zeros(3), free_scale=1.0,
+        free_scale_sigma=0.0, middle_ned=middle, covariance=covariance, correlation={},
+        time_unit="s", mount_sigma_deg=0.0, modes=np.zeros(0), joint=covariance, nuisances={},
+    )  # fmt: skip
+
+
+def no_modes() -> SoftModes:
+    return SoftModes(
+        stations=np.zeros((1, 6, 0)), points=np.zeros((0, 3, 0)), calibration=np.zeros((0, 0))
+    )
+
+
 def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None:
     poses, middle = random_poses(4), np.array([1.0, -2.0, 0.5])
     covariance = random_covariance(7, 1, 1e-3)
@@ -72,7 +102,7 @@ def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None
         rotation = Rotation.from_rotvec(turn)
         places = middle + np.exp(grow) * rotation.apply(poses.translation - middle) + shift
         moved.append(RigidTransform.from_components(places, rotation * poses.rotation))
-    found = placed_covariances(poses, middle, covariance)
+    found = pose_covariances(rows_of(poses), placed(middle, covariance), None, HERE)
     assert_close(found, scatter(poses, moved))
 
 
@@ -103,12 +133,46 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
         frames=np.array([1]), stations=np.array([7]), images=("a",),
         frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
         point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
+        modes=no_modes(),
     )  # fmt: skip
-    first = np.array([True, False])
-    assert_close(
-        shape_covariances(true, np.array([7, 7]), first, known, place), scatter(true, moved)
-    )
-    assert np.isnan(shape_covariances(true, np.array([8, 8]), first, known, place)).all()
+    assert_close(pose_covariances(rows_of(true, 7), None, known, place), scatter(true, moved))
+    assert np.isnan(pose_covariances(rows_of(true, 8), None, known, place)).all()
+
+
+def test_place_and_soft_modes_err_together() -> None:
+    """A mode that bends two stations, half known, and correlated with where the whole lies."""
+    rng = np.random.default_rng(7)
+    poses, middle = random_poses(2, 3), np.array([0.5, -1.0, 2.0])
+    modes = SoftModes(
+        stations=rng.normal(0, 1e-3, (2, 6, 2)), points=np.zeros((0, 3, 2)),
+        calibration=np.zeros((0, 2)),
+    )  # fmt: skip
+    rest = random_covariance(6, 4, 5e-4)
+    spread = modes.stations @ modes.stations.swapaxes(1, 2)
+    known = Uncertainty(
+        frames=np.arange(2), stations=np.arange(2), images=("0", "1"),
+        frame_cov=spread + rest, point_ids=np.zeros(0, np.int64), point_cov=np.zeros((0, 3, 3)),
+        point_noise=np.zeros((0, 3, 3)), sigma_px=0.3, modes=modes,
+    )  # fmt: skip
+    size = np.diag([1e-3] * 7 + [0.6] * 2)
+    joint = size @ random_covariance(9, 8, 1.0) @ size
+    place = Similarity(scale=1.5, rotation=Rotation.random(rng=rng), translation=np.zeros(3))
+    turn = place.rotation.as_matrix()
+    fit = replace(placed(middle, joint[:7, :7]), modes=np.zeros(2), joint=joint)
+    moved = []
+    for draw, local in zip(
+        rng.multivariate_normal(np.zeros(9), joint, 4000),
+        rng.multivariate_normal(np.zeros(6), rest, (4000, 2)),
+        strict=True,
+    ):
+        step = modes.stations @ draw[7:] + local
+        rotation = Rotation.from_rotvec(draw[:3])
+        places = middle + np.exp(draw[6]) * rotation.apply(poses.translation - middle) + draw[3:6]
+        places = places + 1.5 * step[:, 3:] @ turn.T
+        turned = Rotation.from_rotvec(step[:, :3] @ turn.T) * rotation * poses.rotation
+        moved.append(RigidTransform.from_components(places, turned))
+    rows = [replace(row, station=k, image=str(k)) for k, row in enumerate(rows_of(poses))]
+    assert_close(pose_covariances(rows, fit, known, place), scatter(poses, moved))
 
 
 @pytest.mark.parametrize("angles_deg", [(0, 0, 0), (5, -8, 120), (20, 30, -170)])
