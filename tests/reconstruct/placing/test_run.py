@@ -84,7 +84,7 @@ def test_points_are_seen_where_the_model_says(drone: Path) -> None:
 
 
 def test_the_place_is_written_as_it_moved_the_mapping(drone: Path) -> None:
-    """Points of `mapping/` through the similarity of `registration.json` are those of `sparse/`."""
+    """Points of `mapping/` through the similarity are those of `sparse/`, but for soft modes."""
     move = RegistrationRecord.read(drone / "sparse" / "registration.json").world_from_mapping
     mapped = pycolmap.Reconstruction(drone / "mapping" / "model").points3D
     points = np.array([mapped[i].xyz for i in sorted(mapped)])
@@ -92,7 +92,7 @@ def test_the_place_is_written_as_it_moved_the_mapping(drone: Path) -> None:
     np.testing.assert_allclose(
         move.scale * turned + move.translation,
         read_model(drone / "sparse").points_world,
-        atol=1e-6,
+        atol=1e-5 * np.ptp(turned),
     )
     assert abs(move.scale - 1.0) > 0.1
 
