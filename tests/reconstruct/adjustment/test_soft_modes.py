@@ -128,7 +128,7 @@ def strip(jump_m: float, seed: int, noise_m: float = 0.004) -> Scene:
         stated = 1.02 * body.translation * [1, 1, 0] + body.translation * [0, 0, 1]
         stated = stated + noise[record.station] + [0.4, -0.3, 0.05]
         if record.station == 6:
-            stated = stated + [jump_m, 0.0, 0.0]
+            stated = stated + np.array([jump_m, 0.0, 0.0])
         place = DATUM.geodetic_from_ned(stated[None])[0]
         records.append(
             replace(record, latitude_deg=place[0], longitude_deg=place[1], depth_m=place[2])
