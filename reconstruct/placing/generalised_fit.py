@@ -97,6 +97,7 @@ def estimate(
     extra: Extra,
     *,
     frame_bounds: Mapping[int, float],
+    widened: Mapping[str, float] | None = None,
     correlation: Mapping[str, Correlation] | None = None,
 ) -> Estimate:
     """Solve for the parameters, the correlation of errors and the readings to leave out.
@@ -110,12 +111,14 @@ def estimate(
         extra: further equations.
         frame_bounds: sigmas of the nuisances of navigation's own frame (turn, stretch) if its
             position errors lasted throughout; they shrink as those average out.
+        widened: groups whose stated sigmas are too small by this factor or more.
         correlation: of errors, where that is known: then no reading is left out either, and the
             covariance is that of this one alone.
     """
     problem = _PlacementProblem(
-        time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds
-    )
+        time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds,
+        widened=widened or {},
+    )  # fmt: skip
     used = used & np.isfinite(found.misfit)
     if correlation is not None:
         parameters, spread = problem.total(used, correlation).solve()
@@ -134,6 +137,13 @@ def estimate(
         used = kept
     change, covariance = _averaged(problem, used, correlation)
     return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
+
+
+def frame_sigma(bound: float, time: Array, how: Correlation) -> float:
+    """Sigma of a turn or stretch of navigation's own frame, from that of errors that last."""
+    share = correlated_share(time, how.tau, how.white)
+    share = how.constant + (1.0 - how.constant) * share
+    return max(bound * how.factor * float(np.sqrt(share)), 1e-9)
 
 
 def without_gross_errors(misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -189,6 +199,7 @@ class _PlacementProblem:
     free: NDArray[np.int64]
     extra: Extra
     frame_bounds: Mapping[int, float]
+    widened: Mapping[str, float]
     cache: dict[Any, _Normal] = field(default_factory=dict)
 
     def group(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
@@ -263,11 +274,9 @@ class _PlacementProblem:
         matrix, vector = jacobian.T @ jacobian, jacobian.T @ misfit
         if "horizontal" in correlation:
             how = correlation["horizontal"]
-            share = correlated_share(self.time, how.tau, how.white)
-            share = how.constant + (1.0 - how.constant) * share
             for parameter, bound in self.frame_bounds.items():
                 at = np.flatnonzero(self.free == parameter)
-                matrix[at, at] += 1.0 / max(bound * how.factor * np.sqrt(share), 1e-9) ** 2
+                matrix[at, at] += frame_sigma(bound, self.time, how) ** -2
         return _Normal(
             matrix=matrix, vector=vector, square=float(misfit @ misfit), log_det=0.0, rows=0
         )
@@ -351,6 +360,7 @@ def _factor(
     problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Correlation], group: str
 ) -> float:
     """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
+    least = problem.widened.get(group, 1.0)
     change, covariance = problem.total(used, now).solve()
     own = problem.group(group, used, now[group])
     square = own.square + 2.0 * float(own.vector @ change) + float(change @ own.matrix @ change)
@@ -358,7 +368,8 @@ def _factor(
     if freedom < 1.0:
         return now[group].factor
     ratio = square / freedom * now[group].factor ** 2
-    return float(np.sqrt(ratio)) if ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom) else 1.0
+    significant = ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom)
+    return max(float(np.sqrt(ratio)) if significant else 1.0, least)
 
 
 def _without_contradicted(

@@ -16,6 +16,7 @@ from reconstruct.placing.generalised_fit import (
     Estimate,
     Extra,
     estimate,
+    frame_sigma,
     no_extra,
     without_gross_errors,
 )
@@ -42,7 +43,7 @@ _TRIMS = 5
 _ROBUST_STEPS = 30
 _ROBUST_SIGMAS = 2.0
 """Sigmas beyond which the first placement lets a misfit pull only in proportion."""
-_STEPS = 6
+_STEPS = 8
 _SETTLED_SIGMAS = 0.01
 _LEAST_BOUND = 1e-9
 _SHRUNK = 1e-6
@@ -51,7 +52,7 @@ _LEVER_SIGMA_M = 0.02
 """Of the measured place of a camera on its vehicle, along each axis."""
 _CLOCK_SIGMA_S = 0.2
 """Of the clock of cameras against that of navigation."""
-_FOUND_SIGMAS = 4.0
+_CONTRADICTION_SIGMAS = 3.0
 """A nuisance this far from what is expected of it is reported."""
 _STRETCH = 0.005
 """Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
@@ -169,6 +170,10 @@ _NUISANCES = {
     "lever_down_m": (LEVER.start + 2, 1.0),
     "clock_s": (CLOCK, 1.0),
 }
+_EXPECTED = {
+    "lever_forward_m": _LEVER_SIGMA_M, "lever_right_m": _LEVER_SIGMA_M,
+    "lever_down_m": _LEVER_SIGMA_M, "clock_s": _CLOCK_SIGMA_S,
+}  # fmt: skip
 _METHOD = (
     "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
     "stated sigmas, correlation times and white shares by restricted maximum likelihood"
@@ -333,6 +338,7 @@ class _NavigationTask:
         if epochs.timed and len(epochs.time) > 1:
             solved_for.append(CLOCK)
         settling = [*free, *modes]
+        widened: dict[str, float] = {}
         for _ in range(_STEPS):
             middle = self._middle(place)
             bent = epochs.deformed(sizes)
@@ -344,13 +350,18 @@ class _NavigationTask:
                 solved_for,
                 self._extra(place, middle, sizes),
                 frame_bounds=bounds,
+                widened=widened,
             )
             place = _moved(place, got.change, middle)
             sizes = sizes + got.change[PARAMETERS:]
             nuisances = got.change[:PARAMETERS]
             sigma = np.sqrt(np.diag(got.covariance))[settling]
             if np.all(np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma):
-                break
+                off = self._turned(nuisances[TURN], bounds, got.correlation)
+                if widened or off < _CONTRADICTION_SIGMAS:
+                    break
+                widened = {"heading": off}
+                bounds[TURN] *= off
         middle = self._middle(place)
         scaled = got
         if SCALE not in free:
@@ -394,6 +405,12 @@ class _NavigationTask:
             for name, (at, unit) in _NUISANCES.items()
             if at in free
         }
+        for name, expected in _EXPECTED.items():
+            if name in named and abs(named[name][0]) > _CONTRADICTION_SIGMAS * expected:
+                warn(
+                    f"navigation fits the pictures with {name} = {named[name][0]:+.3g}, where "
+                    f"{expected:g} is likely: correct it, for the place is as unsure as that"
+                )
         return PlacementFit(
             ned_from_model=place,
             used=int(got.used[:, 0].sum()),
@@ -410,6 +427,22 @@ class _NavigationTask:
             joint=got.covariance[np.ix_(joint, joint)],
             nuisances=named,
         )
+
+    def _turned(
+        self, turn: float, bounds: Mapping[int, float], correlation: Mapping[str, Correlation]
+    ) -> float:
+        """How many sigmas navigation's frame is turned against its own headings; 0 if unknown."""
+        if not ({"horizontal", "heading"} <= set(correlation) and bounds.get(TURN, 0.0) > 0):
+            return 0.0
+        expected = frame_sigma(bounds[TURN], self.epochs.time, correlation["horizontal"])
+        off = abs(turn) / expected
+        if off > _CONTRADICTION_SIGMAS:
+            warn(
+                f"headings of the navigation and its positions disagree, {np.rad2deg(turn):+.1f} "
+                f"deg where {np.rad2deg(expected):.1f} deg is likely: both count as that unsure; "
+                "check the compass and the camera's mount (body_from_rig)"
+            )
+        return float(off)
 
     def _middle(self, place: Similarity) -> Array:
         middle: Array = place.apply(self.epochs.centres).mean(axis=0)

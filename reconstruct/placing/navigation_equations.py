@@ -219,7 +219,7 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     ned_from_body = attitudes.as_matrix()
     jacobian[:, 3:, MOUNT] = angles_from_ned @ ned_from_body
     jacobian[:, :3, LEVER] = ned_from_body
-    jacobian[:, :3, CLOCK], jacobian[:, 3:, CLOCK] = _rates(epochs, positions, stated)
+    jacobian[:, :3, CLOCK] = _velocities(epochs, positions)
     turn = place.rotation.as_matrix()
     turned = turn @ epochs.modes[:, 3:]
     moved = place.scale * turn @ epochs.modes[:, :3]
@@ -239,34 +239,24 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     )
 
 
-def _rates(epochs: Epochs, positions: Array, angles: Array) -> tuple[Array, Array]:
-    """Velocities of the pictures' bodies (N, 3), m/s, and rates of their angles (N, 3), rad/s.
+def _velocities(epochs: Epochs, positions: Array) -> Array:
+    """Velocities of the pictures' bodies, (N, 3) m/s; 0 where times or neighbours are unknown.
 
-    Differences to the neighbour in time that is nearer; 0 where times are unknown or no neighbour
-    is near, as where a line ends.
+    The mean of the differences to both neighbours in time, where these are near: lines end. An
+    attitude changes too fast for its rates to be known from one station to the next.
     """
-    if not epochs.timed:
-        return np.zeros_like(positions), np.zeros_like(angles)
-    # One picture stands for its moment.
-    _, first = np.unique(epochs.moment, return_index=True)
-    time = epochs.time
-    step = np.diff(time)
-    usual = float(np.median(step[step > 0])) if np.any(step > 0) else 1.0
-    good = (step > 0) & (step < _NEAR_STEPS * usual)
-    safe = np.where(good, step, 1.0)[:, None]
-    found = []
-    for values, whole in ((positions[first], np.inf), (angles[first], 2.0 * np.pi)):
-        change = np.diff(values, axis=0)
-        if np.isfinite(whole):
-            change = (change + whole / 2.0) % whole - whole / 2.0
-        rate = np.where(good[:, None], change / safe, np.nan)
-        both = np.stack([np.vstack([rate, np.full((1, 3), np.nan)]),
-                         np.vstack([np.full((1, 3), np.nan), rate])])  # fmt: skip
-        known = np.isfinite(both).any(axis=(0, 2))
-        mean = np.zeros_like(values)
-        mean[known] = np.nanmean(both[:, known], axis=0)
-        found.append(mean[epochs.moment])
-    return found[0], found[1]
+    found = np.zeros((len(epochs.time), 3))
+    if epochs.timed and len(found) > 1:
+        _, first = np.unique(epochs.moment, return_index=True)  # a picture of every moment
+        step = np.diff(epochs.time)
+        near = (step > 0) & (step < _NEAR_STEPS * np.median(step))
+        between = np.where(near, np.diff(positions[first], axis=0).T / np.where(near, step, 1), 0).T
+        known = np.zeros(len(found))
+        for part in (slice(None, -1), slice(1, None)):
+            found[part] += between
+            known[part] += near
+        found /= np.maximum(known, 1)[:, None]
+    return found[epochs.moment]
 
 
 def attitude_axes(ned_from_body: Rotation) -> Array:
