@@ -4,11 +4,8 @@ Both are reported, not repaired: a station far off navigation may be a jump of n
 as a wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent
 model.
 
-Near-parallel views bend a model like a dome while every reprojection error stays small (James &
-Robson 2014, "Mitigating systematic error in topographic models derived from UAV and ground-based
-image networks"). A pressure sensor does not bend, so that the curvature of a paraboloid fitted to
-camera heights minus navigation's heights measures it; and a stereo rig carries its own yardstick to
-every station.
+How bent a model is navigation shows (`reconstruct.placing.bend`); and a stereo rig carries its own
+yardstick to every station.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,6 +28,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import named
+from reconstruct.placing.bend import LEAST_STATIONS, Bend, quadratic
 from reconstruct.views.model_files import as_transform
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
@@ -41,38 +39,9 @@ _LEAST_STATIONS = 5
 _ROUNDS = 20
 _MEDIAN_SIGMAS = 1.5382
 """Median length of a vector of three independent unit normal numbers."""
-_LEAST_OF_PARABOLOID = 8
-"""A paraboloid has six coefficients."""
-_THIN = 0.1
-"""Width over length of a block below which it has no curvature across."""
 _SIGMAS = 3.0
 _FIT_ROUNDS = 10
 _LEAST_STEREO_POINTS = 20
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bend:
-    """Curvature of a block along one of its axes."""
-
-    curvature_per_m: float
-    """Second derivative of the model's height error: positive where ends are too high."""
-    sigma_per_m: float
-    length_m: float
-    """Length of the block along the axis."""
-
-    @property
-    def sag_m(self) -> float:
-        """How far the middle is off against the ends: `curvature * length^2 / 8`."""
-        return self.curvature_per_m * self.length_m**2 / 8.0
-
-    @property
-    def sag_sigma_m(self) -> float:
-        """Standard deviation of the sag."""
-        return self.sigma_per_m * self.length_m**2 / 8.0
-
-    def significant(self, pixel_m: float) -> bool:
-        """Whether it is beyond its noise and larger than a ground pixel."""
-        return abs(self.sag_m) > max(_SIGMAS * self.sag_sigma_m, pixel_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,84 +97,34 @@ class Doming:
         return [
             f"the model is bent {name} the block: {1e3 * bend.sag_m:+.1f} +/- "
             f"{1e3 * bend.sag_sigma_m:.1f} mm over {bend.length_m:.1f} m against navigation's "
-            "depth; fly cross lines, or give navigation a smaller sigma_depth_m if it deserves it"
+            "depth and attitude, which the calibration does not allow for: calibrate again, or fly "
+            "cross lines"
             for name, bend in (("along", self.along), ("across", self.across))
             if bend is not None and bend.significant(self.pixel_m)
         ]
 
 
 def measure_doming(
-    model: pycolmap.Reconstruction,
-    positions: Array,
-    sigmas: Array,
-    rotations: Mapping[int, Rotation],
+    model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation], bends: Sequence[Bend]
 ) -> Doming:
-    """Measure how bent a model is, and warn where that is significant.
+    """Bring together how bent a model is, and warn where that is significant.
 
     Args:
-        model: in metres; picture i of N has the id i + 1.
-        positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
-            unknown.
-        sigmas: (N, 3); the same for these.
+        model: in metres; picture i has the id i + 1.
         rotations: `ned_from_pinhole` by picture's index, as navigation has it.
+        bends: along and across, as navigation shows them.
     """
     seen = observed(model)
-    pixel = ground_pixel(model, seen)
-    down = down_of(model, rotations)
-    reference = first_pictures(model)
-    numbers = np.array(sorted(reference.values()), dtype=np.int64)
-    centres = np.array([model.images[n].projection_center() for n in numbers.tolist()])
-    known = np.flatnonzero(np.isfinite((positions + sigmas)[numbers - 1]).all(axis=1))
-    rows = numbers[known] - 1
-    along, across = bend_of(
-        centres.reshape(-1, 3)[known], positions[rows, 2], sigmas[rows, 2], down
-    )
+    along, across = (*bends, None, None)[:2]
     found = Doming(
         along=along,
         across=across,
-        scale=scale_trend(model, seen, reference, down),
-        pixel_m=pixel,
+        scale=scale_trend(model, seen, first_pictures(model), down_of(model, rotations)),
+        pixel_m=ground_pixel(model, seen),
     )
     for note in found.notes():
         warn(note)
     return found
-
-
-def bend_of(
-    centres: Array, depths_m: Array, sigmas_m: Array, down: Array
-) -> tuple[Bend | None, Bend | None]:
-    """Curvature of camera heights minus navigation's heights, along and across the block.
-
-    A quadratic in the block's principal axes is fitted robustly (Cauchy's weights); sigmas are
-    those of the depths or, where larger, of the fit's residuals. Errors of depth are taken as
-    independent between stations.
-
-    Args:
-        centres: (N, 3) of one camera per station in the model's frame, metres.
-        depths_m: (N,) as navigation has them.
-        sigmas_m: (N,) of those.
-        down: (3,) unit vector in the model's frame.
-
-    Returns:
-        Along and across; None where stations are too few or lie in one line.
-    """
-    if len(centres) < _LEAST_OF_PARABOLOID:
-        return None, None
-    design, sizes = _quadratic(centres, down)
-    heights = depths_m - centres @ down  # of the model, above where navigation has it
-    if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
-        return None, None
-    fitted, covariance = _robust_fit(design, heights, sigmas_m)
-    bends = [
-        Bend(
-            curvature_per_m=float(fitted[k]),
-            sigma_per_m=float(np.sqrt(covariance[k, k])),
-            length_m=float(size),
-        )
-        for k, size in zip((2, 4), sizes, strict=True)
-        if k < len(fitted)
-    ]
-    return bends[0], bends[1] if len(bends) > 1 else None
 
 
 def scale_trend(
@@ -227,11 +146,11 @@ def scale_trend(
         for frame in sorted(reference)
         if (given := _station_scale(model, seen, frame)) is not None
     ]
-    if len(local) < _LEAST_OF_PARABOLOID:
+    if len(local) < LEAST_STATIONS:
         return None
     centres = np.array([row[0] for row in local])
     scale, sigma = np.array([row[1:] for row in local]).T
-    design, _ = _quadratic(centres, down)
+    design = _quadratic(centres, down)
     if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
         return None
     fitted, covariance = _robust_fit(design, scale, sigma)
@@ -310,21 +229,11 @@ def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
     return float(np.median(rows)) if rows else float("nan")
 
 
-def _quadratic(centres: Array, down: Array) -> tuple[Array, Array]:
-    """Columns 1, u, u^2 / 2 and, of a wide block, v, v^2 / 2, u v; and its extents, (2,).
-
-    Here u and v are horizontal places about their middle in principal axes.
-    """
-    flat = centres - centres.mean(axis=0)
-    flat = flat - np.outer(flat @ down, down)
-    axes = np.linalg.svd(flat, full_matrices=False)[2][:2]
-    plane = flat @ axes.T
-    sizes = np.ptp(plane, axis=0)
-    u, v = plane.T
-    columns = [np.ones(len(u)), u, u**2 / 2]
-    if sizes[1] > _THIN * sizes[0]:
-        columns += [v, v**2 / 2, u * v]
-    return np.column_stack(columns), sizes
+def _quadratic(centres: Array, down: Array) -> Array:
+    """Columns of a paraboloid over places (N, 3) in the plane across `down`."""
+    side = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])
+    side /= np.linalg.norm(side)
+    return quadratic(centres @ np.column_stack([side, np.cross(down, side)]))[0]
 
 
 def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:
@@ -446,7 +355,11 @@ class Acceptance:
 
 @progress.step("judge the model")
 def judge_model(
-    mapped: Mapped, records: Sequence[ImageRecord], rig: Rig, datum: Datum | None
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig,
+    datum: Datum | None,
+    bends: Sequence[Bend] = (),
 ) -> tuple[Doming, Acceptance]:
     """How bent a model on a known rig is, and whether it is credible, by all that is known of it.
 
@@ -455,12 +368,13 @@ def judge_model(
         records: pictures.
         rig: on which it was mapped.
         datum: of navigation's positions; None without.
+        bends: along and across, as navigation shows them.
     """
     positions = sigmas = np.full((len(records), 3), np.nan)
     if datum is not None:
         positions, sigmas = pinhole_positions(records, rig, mapped.warps, datum)
     rotations = navigation_rotations(records, rig, mapped.warps)
-    doming = measure_doming(mapped.model, positions, sigmas, rotations)
+    doming = measure_doming(mapped.model, rotations, bends)
     # What adjustments made of the rig, before its size was put back.
     rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
     accepted = check_mapping(mapped.model, records, positions, sigmas, rig_error, doming.scale)

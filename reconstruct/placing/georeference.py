@@ -1,7 +1,7 @@
 """Where a model lies in the world: fitted to navigation, or levelled where there is none."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
 from reconstruct.placing.generalised_fit import (
     Correlation,
     Estimate,
@@ -54,6 +55,8 @@ _CLOCK_SIGMA_S = 0.2
 """Of the clock of cameras against that of navigation."""
 _CONTRADICTION_SIGMAS = 3.0
 """A nuisance this far from what is expected of it is reported."""
+_VAGUE_PER_M = 10.0
+"""Curvature that any model has less of by far."""
 _STRETCH = 0.005
 """Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
 `vehicle.navigation.sensors`)."""
@@ -87,6 +90,9 @@ class PlacementFit:
     """(K,) sizes of the model's soft modes, in their sigmas."""
     joint: Array
     """(7 + K, 7 + K) covariance of the placement and the modes."""
+    bends: tuple[Bend, ...]
+    """How bent the model is still, along the block and, where it is wide, across; none where
+    stations are too few."""
     nuisances: Mapping[str, tuple[float, float]]
     """What was found of the errors of the lever arm (m), the clock (s) and navigation's own frame
     (turn in degrees, stretch), and their sigmas."""
@@ -425,7 +431,43 @@ class _NavigationTask:
             mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
             modes=sizes,
             joint=got.covariance[np.ix_(joint, joint)],
+            bends=self._bends(place, middle, sizes, got, [p for p in free if p < PARAMETERS]),
             nuisances=named,
+        )
+
+    def _bends(
+        self, place: Similarity, middle: Array, sizes: Array, got: Estimate, stiff: Sequence[int]
+    ) -> tuple[Bend, ...]:
+        """How bent the placed model is by navigation alone, whatever its modes allow."""
+        epochs = self.epochs.deformed(sizes)
+        if got.used[:, 2].sum() < LEAST_STATIONS:
+            return ()
+        places = place.apply(epochs.centres)
+        modes = bend_modes(places, place)
+        count = modes.shape[2]
+        found = equations(replace(epochs, modes=_VAGUE_PER_M * modes), place, middle)
+        bent = estimate(
+            epochs.time,
+            found,
+            got.used,
+            [*stiff, *range(PARAMETERS, PARAMETERS + count)],
+            replace(self, control=None)._extra(place, middle, np.zeros(count)),
+            frame_bounds=self._frame_bounds(),
+            correlation=got.correlation,
+        )
+        values = _VAGUE_PER_M * bent.change[PARAMETERS:]
+        sigmas = _VAGUE_PER_M * np.sqrt(np.diag(bent.covariance)[PARAMETERS:])
+        design, lengths, _ = quadratic(places[:, :2])
+        moved = place.scale * place.rotation.apply((self.epochs.modes @ sizes)[:, :3])[:, 2]
+        straightened = np.linalg.lstsq(design, moved, rcond=None)[0][2::2]
+        return tuple(
+            Bend(
+                curvature_per_m=float(values[k]),
+                sigma_per_m=float(sigmas[k]),
+                length_m=float(lengths[k]),
+                straightened_per_m=float(straightened[k]),
+            )
+            for k in range(min(count, 2))
         )
 
     def _turned(

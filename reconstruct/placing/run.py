@@ -194,7 +194,8 @@ def run_sparse(
         ControlRecord.save(folder / "control.json", score)
     doming = accepted = None
     if rig is not None and adjusted.mapped.scaled:
-        doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum)
+        bends = () if placed.fit is None else placed.fit.bends
+        doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum, bends)
     _registration(model, mapping, placed, rows, doming, accepted).write(
         folder / "registration.json"
     )
@@ -348,6 +349,8 @@ def _fit(
     fit, modes = None, None
     if task.shape is not None:
         modes = picture_modes(task.shape, task.records, task.pinholes)
+        if task.shape.modes.calibration.size:  # the rig's scale is one of them
+            sigma = 0.0
     if task.datum is not None:
         if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
             warn(

@@ -1,0 +1,121 @@
+"""A bend of the model is told from errors of navigation, however these last."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.placing.bend import Bend
+from reconstruct.placing.georeference import fit_navigation, level
+from tests.reconstruct.placing.test_sigmas import (
+    BODY_FROM_CAM,
+    DATUM,
+    SIGMA,
+    flight,
+    flown,
+    records_of,
+)
+
+
+def bends_of(
+    body: RigidTransform, records: list[ImageRecord], along: float, across: float, seed: int = 0
+) -> tuple[Bend, ...]:
+    """Of a model in a frame of its own whose heights err by these curvatures north and east."""
+    rng = np.random.default_rng(seed)
+    cameras = body * BODY_FROM_CAM["cam"]
+    n, e = (cameras.translation - cameras.translation.mean(axis=0))[:, :2].T
+    down = -0.5 * (along * n**2 + across * e**2)
+    zero = np.zeros_like(down)
+    turns = Rotation.from_rotvec(np.column_stack([-across * e, along * n, zero]))
+    bent = RigidTransform.from_components(
+        cameras.translation + np.column_stack([zero, zero, down]), turns * cameras.rotation
+    )
+    own = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    poses = [own.inv() * pose for pose in bent]
+    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
+    centres = np.stack([pose.translation for pose in poses])
+    levelled = level(own.inv().apply(floor), centres)
+    fit = fit_navigation(records, poses, BODY_FROM_CAM, DATUM, levelled, known_scale=1.0)
+    assert fit is not None
+    return fit.bends
+
+
+@pytest.mark.parametrize("tau_s", [1.0, 4000.0])
+def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
+    body = flight(8, 40)
+    for seed in range(3):
+        found = bends_of(body, flown(body, [3, seed], tau_s), 4e-3, -6e-3, seed)
+        along, across = found
+        assert along.curvature_per_m == pytest.approx(4e-3, abs=3.5 * along.sigma_per_m)
+        assert across.curvature_per_m == pytest.approx(-6e-3, abs=3.5 * across.sigma_per_m)
+        assert along.sigma_per_m < 1e-3
+        assert along.length_m == pytest.approx(19.5, rel=0.06)
+        assert along.sag_m == pytest.approx(along.curvature_per_m * along.length_m**2 / 8)
+        assert along.significant(1e-3)
+
+
+def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
+    body, pulls, called = flight(6, 20), [], 0
+    for seed in range(30):
+        tau_s = [1.0, 60.0, 4000.0][seed % 3]
+        for bend in bends_of(body, flown(body, [8, seed], tau_s), 0.0, 0.0, seed):
+            pulls.append(bend.curvature_per_m / bend.sigma_per_m)
+            called += bend.significant(1e-4)
+    assert len(pulls) == 60
+    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+    assert called <= 2
+
+
+def test_sigmas_that_are_stated_too_small_do_not_make_a_bend() -> None:
+    body = flight(6, 20)
+    honest = bends_of(body, flown(body, 3, 1.0), 0.0, 0.0)
+    boasted = bends_of(body, flown(body, 3, 1.0, factor=20.0), 0.0, 0.0)
+    for sure, unsure in zip(honest, boasted, strict=True):
+        assert unsure.sigma_per_m > 8.0 * sure.sigma_per_m
+        assert not unsure.significant(1e-4)
+
+
+def test_jumps_of_the_depth_sensor_do_not_make_a_bend() -> None:
+    body = flight(6, 20)
+    records = flown(body, 4, 1.0)
+    for k in (0, 19, 20, 39):
+        records[k] = replace(records[k], depth_m=records[k].depth_m + 1.5)
+    for bend in bends_of(body, records, 0.0, 0.0):
+        assert abs(bend.curvature_per_m) < 4.0 * bend.sigma_per_m
+        assert not bend.significant(1e-3)
+
+
+def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:
+    body = flight(1, 20)
+    (along,) = bends_of(body, flown(body, 5, 1.0), 3e-3, 0.0)
+    assert along.curvature_per_m == pytest.approx(3e-3, abs=4 * along.sigma_per_m)
+    short = flight(1, 6)
+    assert bends_of(short, flown(short, 5, 1.0), 0.0, 0.0) == ()
+
+
+@pytest.mark.parametrize(("sag_mm", "least", "most"), [(0.0, 0.0, 0.1), (8.0, 0.9, 1.0)])
+def test_a_bend_of_eight_millimetres_over_thirty_metres_is_seen(
+    sag_mm: float, least: float, most: float
+) -> None:
+    """Depths of a pressure sensor: 5 cm that last, 6 mm that drift in ten minutes, 2 mm white."""
+    body, seen = flight(10, 61), 0
+    north = np.ptp(body.translation[:, 0])
+    for seed in range(10):
+        rng = np.random.default_rng([12, seed])
+        errors = SIGMA * lasting(rng, len(body))
+        found = bends_of(body, records_of(body, errors, SIGMA), 8e-3 * sag_mm / north**2, 0.0, seed)
+        seen += found[0].significant(5e-3)
+    assert least <= seen / 10 <= most
+
+
+def lasting(rng: np.random.Generator, count: int) -> Array:
+    """(count, 6) errors in sigmas: constant, slow and white parts of every channel."""
+    slow = rng.normal(size=(count, 6))
+    kept = np.exp(-2.5 / 600.0)
+    for i in range(1, count):
+        slow[i] = kept * slow[i - 1] + np.sqrt(1 - kept**2) * slow[i]
+    part = np.array([1.0, 0.12, 0.04])
+    return part[0] * rng.normal(size=6) + part[1] * slow + part[2] * rng.normal(size=(count, 6))
