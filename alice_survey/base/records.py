@@ -143,6 +143,8 @@ class BendRecord(JsonRecord):
     length_m: float
     sag_m: float
     sag_sigma_m: float
+    straightened_per_m: float = 0.0
+    """Curvature that navigation took out of the model before."""
 
 
 class ScaleOfPairs(JsonRecord):

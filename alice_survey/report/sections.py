@@ -273,10 +273,11 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         ("reprojection error, mean", f"{digits(found.mean_reprojection_px)} px"),
         ("scale", found.scale_source or "unknown"),
     ]
-    placed = figures.registration
-    doming = (None if placed is None else placed.doming) or DomingRecord()
+    doming = found.doming or DomingRecord()
     for way, bend in doming.bends.items():
         rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
+        taken_out = bend.straightened_per_m * bend.length_m**2 / 8.0
+        rows.append((f"sag {way} the lines that navigation took out", length(taken_out)))
     scale = doming.scale
     if scale is not None:
         own = parts_with_sigma(scale.mean - 1.0, scale.mean_sigma)

@@ -57,8 +57,9 @@ _MODES = 32
 """Soft modes at most: of a block of lines the tenth is known a hundred times as well as the first.
 """
 _MODES_TOLERANCE = 1e-4
-_LEAST_MODE = 1e-5
-"""Variance of a mode over that of the softest below which it is left to the pictures."""
+_LEAST_MODE = 1e-13
+"""Variance of a mode over that of the softest that rounding leaves: a model of two parts that hardly
+hang together has a mode of kilometres, and others of millimetres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -499,7 +499,7 @@ class _NavigationTask:
         """
         if not self.epochs.has_attitude:
             return {}
-        plan = self.epochs.measured_ned[:, :2]
+        plan = self.epochs.measured_ned[self.epochs.known[self.epochs.moment, 0], :2]
         radius = float(np.sqrt(plan.var(axis=0).sum()))
         sigma = float(np.median(self.epochs.sigma[:, 0]))
         bound = sigma / radius if radius > sigma else 1.0
@@ -572,10 +572,12 @@ def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
 
 def _start(epochs: Epochs, levelled: Similarity, known_scale: float | None) -> Similarity | None:
     """A first placement: from attitudes, else from the levelled model and the positions' plan."""
-    measured, count = epochs.measured_ned, len(epochs.time)
+    at = epochs.known[epochs.moment, 0]
+    count = int(epochs.known[:, 0].sum())
+    measured = epochs.measured_ned[at]
     spread = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
     need = float(np.median(epochs.sigma[:, 0]))
-    flat = levelled.apply(epochs.centres)
+    flat = levelled.apply(epochs.centres)[at]
     has = epochs.known[epochs.moment, 3]
     if not has.any() or known_scale is None:
         least = 2 if has.any() else 3
@@ -595,5 +597,7 @@ def _start(epochs: Epochs, levelled: Similarity, known_scale: float | None) -> S
         rotation = Rotation.from_rotvec([0.0, 0.0, np.angle(turn)]) * levelled.rotation
     scale = abs(turn) if known_scale is None else known_scale
     start = Similarity(scale=scale, rotation=rotation, translation=np.zeros(3))
-    shift = np.median(measured - epochs.positions(start), axis=0)
+    off = epochs.measured_ned - epochs.positions(start)
+    off[~epochs.known[epochs.moment][:, :3]] = np.nan
+    shift = np.nanmedian(off, axis=0)
     return Similarity(scale=scale, rotation=rotation, translation=shift)

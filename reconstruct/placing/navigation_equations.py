@@ -19,7 +19,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.mapping.arrays import cross_matrices
-from reconstruct.matching.pairs import positions_ned
 from reconstruct.placing.alignment import Similarity
 
 PARAMETERS = 16
@@ -101,9 +100,9 @@ def read_epochs(
     Pictures of one station share one reading of navigation, which must not count twice. Without
     `body_from_cam` positions are those of the cameras, and what attitudes mean for them is unknown.
     """
-    chosen = [i for i, r in enumerate(records) if r.has_position]
-    if not chosen:
+    if not any(r.has_position for r in records):
         return None
+    chosen = [i for i, r in enumerate(records) if np.any(np.isfinite(_told(r)))]
     timed = all(np.isfinite(records[i].time_s) for i in chosen)
     chosen.sort(
         key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image)
@@ -112,12 +111,13 @@ def read_epochs(
     stations = list(dict.fromkeys(r.station for r in rows))
     number = {station: k for k, station in enumerate(stations)}
     first = [next(r for r in rows if r.station == station) for station in stations]
-    attitudes = np.array([[r.roll_deg, r.pitch_deg, r.heading_deg] for r in rows])
-    has = np.isfinite(attitudes).all(axis=1) & (body_from_cam is not None)
     moment = np.array([number[r.station] for r in rows])
-    known = np.ones((len(stations), 6), dtype=bool)
-    known[:, 3:] = False
-    known[moment[has], 3:] = True
+    told = np.array([_told(r) for r in rows])
+    if body_from_cam is None:
+        told[:, 3:] = np.nan
+    known = np.zeros((len(stations), 6), dtype=bool)
+    np.logical_or.at(known, moment, np.isfinite(told))
+    has = np.isfinite(told[:, 3:]).all(axis=1)
     unknown = RigidTransform.identity()
     levers = [unknown if body_from_cam is None else body_from_cam[r.camera] for r in rows]
     time = [r.time_s for r in first] if timed else [float(s) for s in stations]
@@ -133,12 +133,31 @@ def read_epochs(
             ]
         ),
         levers=np.stack([-lever.translation for lever in levers]),
-        measured_ned=positions_ned(rows, datum),
-        ned_from_body=rotation_from_attitude(*np.deg2rad(np.where(has[:, None], attitudes, 0)).T),
+        measured_ned=_positions(told, rows, datum),
+        ned_from_body=rotation_from_attitude(*np.deg2rad(np.where(has[:, None], told[:, 3:], 0)).T),
         sigma=_sigmas(first),
         known=known,
         modes=np.zeros((len(chosen), 6, 0)) if modes is None else modes[chosen],
     )
+
+
+def _told(record: ImageRecord) -> Array:
+    """(6,) what each channel of navigation says of a picture; NaN where it says nothing.
+
+    Latitude and longitude help together only, and so do the angles of an attitude.
+    """
+    level = record.latitude_deg + record.longitude_deg
+    attitude = np.array([record.roll_deg, record.pitch_deg, record.heading_deg])
+    attitude = attitude + 0.0 * attitude.sum()
+    return np.array([level, level, record.depth_m, *attitude])
+
+
+def _positions(told: Array, rows: Sequence[ImageRecord], datum: Datum) -> Array:
+    """(N, 3) positions in NED; what is not told of one is that of the middle of all."""
+    places = np.array([[r.latitude_deg, r.longitude_deg, r.depth_m] for r in rows])
+    places[~np.isfinite(told[:, :2]).all(axis=1), :2] = np.nan
+    middle = np.nanmean(places, axis=0)
+    return datum.ned_from_geodetic(np.where(np.isfinite(places), places, middle))
 
 
 def without_navigation(

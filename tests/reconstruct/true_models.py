@@ -133,7 +133,9 @@ def true_stations(scene: Scene, mapped: Mapped) -> list[RigidTransform]:
 
 
 def model_baseline_of(pinhole_from_rig: Mapping[str, RigidTransform]) -> float:
-    """Distance between the two pinholes."""
+    """Distance between the two pinholes; NaN for one alone."""
+    if len(pinhole_from_rig) < 2:
+        return float("nan")
     first, second = pinhole_from_rig.values()
     return float(np.linalg.norm((second * first.inv()).translation))
 

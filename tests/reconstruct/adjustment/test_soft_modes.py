@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform
 
@@ -17,10 +18,15 @@ from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
 from reconstruct.adjustment.exact_observations import choose_pixels, exact_observations
 from reconstruct.adjustment.normal_equations import Gauge
 from reconstruct.mapping.arrays import cross_matrices, frames_of
-from reconstruct.mapping.refraction import refract
+from reconstruct.mapping.refraction import adjust_freely, refract
 from reconstruct.mapping.robust import cauchy_weights
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.navigation_equations import PLACE
+from reconstruct.placing.run import body_from_pinhole
+from reconstruct.placing.track import picture_modes
+from reconstruct.views.model_files import as_transform
 from tests.oracles_refraction import dense_normal_equations
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, warped_scene
@@ -182,3 +188,74 @@ def test_navigation_that_contradicts_the_pictures_does_not_spoil_them(tmp_path: 
     spoiled, scale = rms_and_scale(flown(replace(scene, records=sure), tmp_path), scene)
     assert spoiled < 2.0 * alone
     assert abs(scale) < 2e-3
+
+
+def test_one_camera_takes_scale_and_shape_from_navigation(tmp_path: Path) -> None:
+    """Pictures of the left camera alone, in a unit of 0.37 m: errors are as large as stated."""
+    ratios, bends = [], []
+    for seed in range(6):
+        scene = make_scene(lines=3, stations=9, points=9000, noise_px=0.3, seed=seed)
+        rng = np.random.default_rng([9, seed])
+        rows = [k for k, r in enumerate(scene.records) if r.camera == "left"]
+        records = []
+        for k in rows:
+            body = scene.ned_from_cam[k] * scene.rig.body_from_cam("left").inv()
+            stated = DATUM.geodetic_from_ned(
+                (body.translation + rng.normal(0, [0.03, 0.03, 0.005]))[None]
+            )[0]
+            records.append(
+                replace(scene.records[k], latitude_deg=stated[0], longitude_deg=stated[1],
+                        depth_m=stated[2], sigma_horizontal_m=0.03, sigma_depth_m=0.005)
+            )  # fmt: skip
+        alone = replace(
+            scene, records=records,
+            rig=replace(scene.rig, cameras={"left": scene.rig.cameras["left"]},
+                        cam_from_rig={"left": scene.rig.cam_from_rig["left"]}),
+            ned_from_cam=[scene.ned_from_cam[k] for k in rows],
+            pixels=[scene.pixels[k] for k in rows], ids=[scene.ids[k] for k in rows], pairs=[],
+        )  # fmt: skip
+        scale, sigma, before, after = placed_alone(alone, rng, tmp_path)
+        ratios.append(scale / sigma)
+        bends.append((before, after))
+        assert 1e-4 < sigma < 0.02
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+    before, after = np.sqrt(np.mean(np.square(bends), axis=0))
+    assert after < 0.9 * before
+
+
+def placed_alone(
+    scene: Scene, rng: np.random.Generator, folder: Path
+) -> tuple[float, float, float, float]:
+    """Error and sigma of the scale; median of cameras after a similarity, before and with modes."""
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, rng)
+    mapped = adjust_freely(replace(start, scaled=False, baseline=np.nan))
+    model = pycolmap.Reconstruction(mapped.model)
+    model.transform(pycolmap.Sim3d(1.0 / 0.37, pycolmap.Rotation3d(), np.zeros(3)))
+    found = adjust_survey(
+        replace(mapped, model=model), scene.records, scene.rig, None, ReconstructConfig()
+    )
+    assert found.exact is None and found.shape is not None
+    pinholes = [
+        as_transform(found.mapped.model.images[n].cam_from_world()).inv()
+        for n in sorted(found.mapped.model.images)
+    ]
+    points = np.array([p.xyz for p in found.mapped.model.points3D.values()])
+    fit = fit_navigation(
+        scene.records, pinholes, body_from_pinhole(scene.rig, warps), DATUM,
+        level(points, np.array([p.translation for p in pinholes])), known_scale=None,
+        modes=picture_modes(found.shape, scene.records, pinholes),
+    )  # fmt: skip
+    assert fit is not None
+    after = found.deformed(fit.modes, fit.joint[PLACE:, PLACE:]).mapped.model
+    true = np.array([
+        (pose * warps["left"].pinhole_from_cam.inv()).translation for pose in scene.ned_from_cam
+    ])  # fmt: skip
+    rms, aligned = [], []
+    for one in (found.mapped.model, after):
+        at = np.array([one.images[n].projection_center() for n in sorted(one.images)])
+        aligned.append(align_similarity(at, true))
+        off = aligned[-1].apply(at) - true
+        rms.append(float(np.median(np.linalg.norm(off, axis=1))))
+    error = np.log(fit.ned_from_model.scale / aligned[1].scale)
+    return float(error), fit.sigma_scale, rms[0], rms[1]

@@ -300,3 +300,23 @@ def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     position, tilt, heading = np.split(np.array(ratios), [3, 5], axis=1)
     for part in (position, tilt, heading):
         assert 0.7 < np.sqrt(np.mean(part**2)) < 1.4
+
+
+def test_what_a_log_says_in_part_helps_as_far_as_it_goes() -> None:
+    """Fixes at the ends alone, depths all the way: level and depth are those of all depths."""
+    body, ratios = flight(), []
+    for seed in range(5):
+        records = flown(body, [16, seed], 1.0)
+        parts = [
+            r if k < 3 or k > len(records) - 4 else replace(r, latitude_deg=np.nan)
+            for k, r in enumerate(records)
+        ]
+        whole, _, sigma = place(body, records, seed)
+        fit, error, with_gaps = place(body, parts, seed)
+        few = [r if np.isfinite(r.latitude_deg) else replace(r, depth_m=np.nan) for r in parts]
+        without = place(body, few, seed)[2]
+        assert fit.used == 6 and whole.used == len(body)
+        assert with_gaps[2] == pytest.approx(sigma[2], rel=0.2) and with_gaps[2] < 0.85 * without[2]
+        assert np.all(with_gaps[:2] > 1.5 * sigma[:2])
+        ratios.append(error[:6] / with_gaps[:6])
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
