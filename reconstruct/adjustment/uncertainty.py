@@ -27,6 +27,7 @@ from typing import Any, Self
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -58,8 +59,8 @@ _MODES = 32
 """
 _MODES_TOLERANCE = 1e-4
 _LEAST_MODE = 1e-13
-"""Variance of a mode over that of the softest that rounding leaves: a model of two parts that hardly
-hang together has a mode of kilometres, and others of millimetres."""
+"""Variance of a mode over that of the softest, above rounding: a model of two parts that hardly hang
+together has a mode of kilometres, and others of millimetres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,10 +122,19 @@ class SoftModes:
 
     stations: Array
     """(F, 6, K) turns and motions of the stations, in the model's axes."""
-    points: Array
-    """(P, 3, K) motions of the points."""
+    points: Array | NDArray[np.float32]
+    """(P, 3, K) motions of the points; in single precision, as there are many."""
     calibration: Array
     """(G, K) changes of the parameters of the rig; G is 0 where it is held."""
+
+
+def no_modes(stations: int, points: int) -> SoftModes:
+    """Those of a stiff model."""
+    return SoftModes(
+        stations=np.zeros((stations, POSE, 0)),
+        points=np.zeros((points, 3, 0), np.float32),
+        calibration=np.zeros((0, 0)),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -277,7 +287,8 @@ def _soft_modes(
         whole = gauge.motion_in(step)
         size_of = np.sqrt(values[k])
         shape.append((step - gauge.motions @ whole) / size_of)
-        places.append((place - gauge.of_points(points) @ whole) / size_of)
+        moved_by = (place - gauge.of_points(points) @ whole) / size_of
+        places.append(moved_by.astype(np.float32))
         rigs.append(rig / size_of)
     return SoftModes(
         stations=np.stack(shape, axis=-1),
@@ -287,7 +298,7 @@ def _soft_modes(
 
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
-    """Write `covariance.npz`: fields of `Uncertainty`; points as float32."""
+    """Write `covariance.npz`: fields of `Uncertainty` but the modes; points as float32."""
     np.savez(
         path,
         frames=found.frames,
@@ -298,21 +309,18 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
         point_cov=found.point_cov.astype(np.float32),
         point_noise=found.point_noise.astype(np.float32),
         sigma_px=np.array(found.sigma_px),
-        mode_stations=found.modes.stations,
-        mode_points=found.modes.points.astype(np.float32),
-        mode_calibration=found.modes.calibration,
     )
 
 
 def read_uncertainty(path: Path) -> Uncertainty:
-    """Read `covariance.npz`.
+    """Read `covariance.npz`; its modes have been found and are no longer there.
 
     Raises:
         WorkspaceError: it is missing, or not as it was written.
     """
     data = read_arrays(
         path, "frames", "stations", "images", "cov", "point_ids", "point_cov", "point_noise",
-        "sigma_px", "mode_stations", "mode_points", "mode_calibration",
+        "sigma_px",
     )  # fmt: skip
     with taken_from(path):
         return Uncertainty(
@@ -324,11 +332,7 @@ def read_uncertainty(path: Path) -> Uncertainty:
             point_cov=data["point_cov"].astype(np.float64),
             point_noise=data["point_noise"].astype(np.float64),
             sigma_px=float(data["sigma_px"]),
-            modes=SoftModes(
-                stations=data["mode_stations"].astype(np.float64),
-                points=data["mode_points"].astype(np.float64),
-                calibration=data["mode_calibration"].astype(np.float64),
-            ),
+            modes=no_modes(len(data["frames"]), len(data["point_ids"])),
         )
 
 
@@ -376,7 +380,7 @@ def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indi
     return [chosen[int(f)][1] for f in frames]
 
 
-def _spread(motions: Array, covariance: Array) -> Array:
+def _spread(motions: Array | NDArray[np.float32], covariance: Array) -> Array:
     """Covariances (N, k, k) of what moves by (N, k, G)."""
     spread: Array = motions @ covariance @ motions.swapaxes(1, 2)
     return spread

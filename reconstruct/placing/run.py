@@ -38,7 +38,7 @@ from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
-from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
@@ -412,13 +412,12 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
     if task.shape is None:
         return found
     xyz = np.array([p.xyz for _, p in sorted(task.model.points3D.items())])
-    return replace(found, motion_at=partial(_motions_near, KDTree(xyz), task.shape.modes.points))
+    return replace(found, motion_at=partial(_motions_near, KDTree(xyz), task.shape.modes))
 
 
-def _motions_near(tree: KDTree, motions: Array, places: Array) -> Array:
-    """Motions (N, 3, K) of places (N, 3): those of the nearest points (P, 3, K)."""
-    found: Array = motions[np.asarray(tree.query(places)[1])]
-    return found
+def _motions_near(tree: KDTree, modes: SoftModes, places: Array) -> Array:
+    """Motions (N, 3, K) of places (N, 3): those of the nearest points of the model."""
+    return modes.points[np.asarray(tree.query(places)[1])].astype(np.float64)
 
 
 def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:

@@ -110,9 +110,6 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.point_noise, found.point_noise, rtol=1e-6)
     assert back.images == tuple(f"left/{s:06d}.png" for s in range(10))
     assert back.sigma_px == found.sigma_px
-    np.testing.assert_array_equal(back.modes.stations, found.modes.stations)
-    np.testing.assert_allclose(back.modes.points, found.modes.points, rtol=1e-6)
-    assert back.modes.calibration.shape == (0, found.modes.stations.shape[2])
     for cov in (*found.frame_cov, *found.point_cov):
         np.testing.assert_allclose(cov, cov.T, atol=1e-9 * np.abs(cov).max())
         assert np.linalg.eigvalsh(cov)[0] > -1e-12

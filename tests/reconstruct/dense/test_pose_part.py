@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import heard
-from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
+from reconstruct.adjustment.uncertainty import Uncertainty, no_modes, write_uncertainty
 from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
@@ -37,11 +37,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         point_cov=world,
         point_noise=noise,
         sigma_px=0.2,
-        modes=SoftModes(
-            stations=np.zeros((4, 6, 0)),
-            points=np.zeros((len(ids), 3, 0)),
-            calibration=np.zeros((0, 0)),
-        ),
+        modes=no_modes(4, len(ids)),
     )
     write_uncertainty(folder / "sparse" / "covariance.npz", found)
     return folder

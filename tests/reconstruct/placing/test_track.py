@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
-from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, no_modes
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import PlacementFit
@@ -88,12 +88,6 @@ def placed(middle: Array, covariance: Array) -> PlacementFit:
     )  # fmt: skip
 
 
-def no_modes() -> SoftModes:
-    return SoftModes(
-        stations=np.zeros((1, 6, 0)), points=np.zeros((0, 3, 0)), calibration=np.zeros((0, 0))
-    )
-
-
 def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None:
     poses, middle = random_poses(4), np.array([1.0, -2.0, 0.5])
     covariance = random_covariance(7, 1, 1e-3)
@@ -134,7 +128,7 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
         frames=np.array([1]), stations=np.array([7]), images=("a",),
         frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
         point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
-        modes=no_modes(),
+        modes=no_modes(1, 0),
     )  # fmt: skip
     assert_close(pose_covariances(rows_of(true, 7), None, known, place), scatter(true, moved))
     assert np.isnan(pose_covariances(rows_of(true, 8), None, known, place)).all()
