@@ -59,8 +59,8 @@ _MODES = 32
 """
 _MODES_TOLERANCE = 1e-4
 _LEAST_MODE = 1e-13
-"""Variance of a mode over that of the softest, above rounding: where two parts of a model hardly hang
-together, one mode is kilometres large and others are millimetres."""
+"""Variance of a mode over that of the softest, above rounding: where two parts of a model hardly
+hang together, one mode is kilometres large and others are millimetres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
