@@ -14,7 +14,7 @@ from alice_survey.base.executor import SERIAL
 from camera_calib.calibrate.by_options import calibrated, port_kinds
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.from_pictures import calibrate_pictures
-from camera_calib.calibrate.options import CalibrateOptions
+from camera_calib.calibrate.options import CalibrateOptions, check_settings
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
 from camera_calib.camera import Camera
@@ -114,6 +114,8 @@ def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
 
     assert list(found.rig.cameras) == list(truth.cameras)
     assert len(found.views) == 40 and not found.rejections
+    top_of_picture = found.rig.body_from_rig.rotation.apply([0.0, -1.0, 0.0])
+    np.testing.assert_allclose(top_of_picture, [1.0, 0.0, 0.0], atol=1e-12)  # towards the bow
     assert found.noise_px == pytest.approx(NOISE_PX, rel=0.05)
     errors, sigmas = differences(found.rig, truth), found.rig.sigmas
     over = np.array([errors[key] / sigmas[key] for key in errors])
@@ -131,9 +133,9 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
     dome = DomePort(outer_radius_m=0.07, glass_thickness_m=0.005, dome_x_m=0.001, dome_z_m=0.006)
     ports = {
         "left": FlatPort(port_distance_m=0.03, glass_thickness_m=0.005, n_glass=1.49),
-        "right": FlatPort(port_distance_m=0.015, glass_thickness_m=0.005, n_glass=1.49),
+        "right": FlatPort(port_distance_m=0.015, glass_thickness_m=0.008, n_glass=1.52),
         "bow": dome,
-        "side": replace(dome, dome_x_m=0.0, dome_z_m=-0.003),
+        "side": replace(dome, dome_x_m=0.0, dome_z_m=-0.003, outer_radius_m=0.055),
     }
     lenses = {name: one.lens for name, one in rig.cameras.items()} | {"side": fisheye}
     dry = replace(rig, cameras={n: replace(c, lens=lenses[n]) for n, c in rig.cameras.items()})
@@ -144,8 +146,8 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
         seen_by(dry, poses_before(dry, TARGET, 30, rng), rng), TARGET, None,
     ).rig  # fmt: skip
     under_water = CalibrateOptions(
-        lens=terms, water=True, port="flat,bow=dome,side=dome", dome_radius_mm=70.0,
-        glass_mm=5.0, n_glass=1.49,
+        lens=terms, water=True, port="flat,bow=dome,side=dome", dome_radius_mm="70,side=55",
+        glass_mm="5,right=8", n_glass="1.52,left=1.49",
     )  # fmt: skip
     views = seen_by(wet, poses_before(wet, TARGET, 30, rng), rng)
 
@@ -170,6 +172,21 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
 def test_a_wrong_port_is_named(text: str, fault: str) -> None:
     with pytest.raises(CalibrationError, match=fault):
         port_kinds(CalibrateOptions(port=text, water=True), list(four_cameras().cameras), None)
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [({"glass_mm": "5,bow=thick"}, "'thick' for bow is not a number from 0 to 500"),
+     ({"dome_radius_mm": "80,bow=2"}, "--dome-radius 80,bow=2: '2' for bow is not a number from 5"),
+     ({"n_glass": "stern=1.5"}, "--n-glass stern=1.5: no camera is called stern"),
+     ({"port_distance_mm": "nan"}, "'nan' for left is not a number"),
+     ({"glass_mm": "left=5,right=5,bow=5"}, "--glass, the thickness of the port of side"),
+     ({"port": "flat,bow=dome", "glass_mm": "5"}, "--dome-radius, of the outer surface of bow")],
+)  # fmt: skip
+def test_a_wrong_number_of_a_port_is_named(given: dict[str, str], fault: str) -> None:
+    cameras = tuple(f"{name}=folder" for name in four_cameras().cameras)
+    with pytest.raises(CalibrationError, match=fault):
+        check_settings(CalibrateOptions(cameras=cameras, water=True, **given), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
