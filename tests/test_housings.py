@@ -63,7 +63,7 @@ def check(score: dict[str, Any], length_m: float, width_m: float) -> None:
 def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> list[str]:
     """What is bad in a calibration from the pool's pictures."""
     pool = workspace / "pool" if port else workspace / "pool" / "air"
-    glass = {"glass_mm": 6.0, "n_glass": 1.49} if port in ("flat", "dome", "auto") else {}
+    glass = {"glass_mm": "6", "n_glass": "1.49"} if port in ("flat", "dome", "auto") else {}
     calibrate_pictures(
         CalibrateOptions(
             left=str(pool / "left"), right=str(pool / "right"), target=BOARD, output=output,
@@ -79,7 +79,7 @@ def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_p
     check(surveyed(workspace, DOME, 2.6, 2.2), 2.6, 2.2)
     assert not pool_as(workspace, tmp_path / "air", None)
     start = {"start": tmp_path / "air" / "rig.json"}
-    dome = {"dome_radius_mm": 80.0, **start}
+    dome = {"dome_radius_mm": "80", **start}
     assert not pool_as(workspace, tmp_path / "dome_rig", "dome", **dome)
     assert any("flat port of" in text for text in pool_as(workspace, tmp_path / "flat", "flat"))
     bare = pool_as(workspace, tmp_path / "bare", "none", **start)

@@ -300,19 +300,19 @@ def calibrate(
         ),
     ] = None,
     dome_radius: Annotated[
-        float | None, typer.Option(min=5, max=1000, help="Outer radius of a dome, mm.")
+        str | None, typer.Option(help="Outer radius of a dome, mm, and others: 80,bow=60.")
     ] = None,
     port_distance: Annotated[
-        float | None, typer.Option(min=0, max=500, help="Pupil to glass, first value, mm.")
+        str | None, typer.Option(help="Pupil to glass, first value, mm: 20, or 20,tele=45.")
     ] = None,
     glass: Annotated[
-        float | None, typer.Option(min=0, max=500, help="Thickness of the port, mm.")
+        str | None, typer.Option(help="Thickness of the port, mm: 6, or 6,bow=5.")
     ] = None,
     glass_sigma: Annotated[
         float | None, typer.Option(min=1e-4, help="Find the thickness too; known to this, mm.")
     ] = None,
     n_glass: Annotated[
-        float | None, typer.Option(min=1, max=2, help="Its index; 1.52 if not given.")
+        str | None, typer.Option(help="Its index, 1.52 if not given: 1.49, or 1.52,bow=1.49.")
     ] = None,
     n_glass_sigma: Annotated[
         float | None, typer.Option(min=1e-7, help="Find this index too; known to this.")

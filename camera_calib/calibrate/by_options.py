@@ -11,7 +11,7 @@ from camera_calib.calibrate.housing import (
     focal_ratios,
     likely_port,
 )
-from camera_calib.calibrate.options import AUTO, PORT_KINDS, CalibrateOptions, by_camera
+from camera_calib.calibrate.options import AUTO, PORT_KINDS, CalibrateOptions, kinds_by_camera
 from camera_calib.calibrate.solve import (
     blank_camera,
     calibrate_in_air,
@@ -120,8 +120,9 @@ def _through(
     shape = shape_of(target, settings.target_shape)
     cameras = start_cameras(settings, found.sizes, start, kinds)
     views = _numbered(found, target, cameras, lens, known=start is not None)
+    glass_mm = settings.glass_sigma_mm
     known_to = {
-        "glass_thickness_m": _metres(settings.glass_sigma_mm),
+        "glass_thickness_m": None if glass_mm is None else glass_mm / 1e3,
         "n_glass": settings.n_glass_sigma,
         "n_water": settings.n_water_sigma,
     }
@@ -138,16 +139,12 @@ def _through(
     return calibrate_through_ports(views, points, start, known, lens, sigmas, shape)
 
 
-def _metres(length_mm: float | None) -> float | None:
-    return None if length_mm is None else length_mm / 1e3
-
-
 def lens_names(
     settings: CalibrateOptions, cameras: Collection[str], start: Rig | None
 ) -> dict[str, str]:
     """The lens model of each camera: as named, or the usual one of the start's lens."""
     if settings.lens is not None:
-        return by_camera(settings.lens, cameras, "--lens", LENSES)
+        return kinds_by_camera(settings.lens, cameras, "--lens", LENSES)
     kinds = {} if start is None else {n: one.lens.model for n, one in start.cameras.items()}
     return {name: USUAL_LENS[kinds.get(name, OpenCVLens.model)] for name in cameras}
 
@@ -163,7 +160,7 @@ def port_kinds(
     if not settings.water:
         return dict.fromkeys(cameras, NoPort.shape)
     if settings.port is not None:
-        kinds = by_camera(settings.port, cameras, "--port", PORT_KINDS)
+        kinds = kinds_by_camera(settings.port, cameras, "--port", PORT_KINDS)
         if AUTO in kinds.values() and len(set(kinds.values())) > 1:
             raise CalibrationError(f"--port {settings.port}: auto is for all cameras alike")
         return kinds
@@ -182,31 +179,23 @@ def start_cameras(
 ) -> dict[str, Camera]:
     """Cameras of the start, or blank ones, behind ports of some kinds, or of `port_kinds`."""
     kinds = port_kinds(settings, sizes, start) if kinds is None else kinds
+    given = settings.port_values(sizes)
     if start is None:
         lens = lens_names(settings, sizes, None)
         return {
-            name: blank_camera(size, lens[name], _port(kinds[name], NO_PORT, settings))
+            name: blank_camera(size, lens[name], _port(kinds[name], NO_PORT, given[name]))
             for name, size in sizes.items()
         }
     return {
-        name: replace(camera, port=_port(kinds[name], camera.port, settings))
+        name: replace(camera, port=_port(kinds[name], camera.port, given[name]))
         for name, camera in start.cameras.items()
     }
 
 
-def _port(kind: str, old: PortValues, settings: CalibrateOptions) -> PortValues:
-    """First values of a port of some kind: those of the start, or usual ones, or as named."""
+def _port(kind: str, old: PortValues, given: Mapping[str, float]) -> PortValues:
+    """First values of a port of some kind: those of the start, or usual ones, or as given."""
     port = old if old.shape == kind else PORTS[kind].guess()
-    given = {
-        "glass_thickness_m": _metres(settings.glass_mm),
-        "outer_radius_m": _metres(settings.dome_radius_mm),
-        "n_glass": settings.n_glass,
-        "n_water": settings.n_water,
-        "port_distance_m": _metres(settings.port_distance_mm),
-    }
-    return port.with_parameters(
-        {k: v for k, v in given.items() if v is not None and k in port.parameters}
-    )
+    return port.with_parameters({k: v for k, v in given.items() if k in port.parameters})
 
 
 def matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:

@@ -1,5 +1,6 @@
 """Options of `calibrate`: pictures, target, and prior knowledge of lens, port and water."""
 
+import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,16 +54,16 @@ class CalibrateOptions:
     port: str | None = None
     """Kind of the port, of `optics.PORTS`, and those of single cameras, as `by_camera` reads them;
     auto: the likeliest; None: that of the start, or flat."""
-    dome_radius_mm: float | None = None
-    """Outer radius of a dome."""
-    port_distance_mm: float | None = None
+    dome_radius_mm: str | None = None
+    """Outer radius of a dome; this and the next ones by camera, as `by_camera` reads them."""
+    port_distance_mm: str | None = None
     """First value; it is estimated."""
-    glass_mm: float | None = None
+    glass_mm: str | None = None
     """Thickness of the glass."""
-    glass_sigma_mm: float | None = None
-    """Prior sigma of the thickness, which is then estimated; the indices below in the same way."""
-    n_glass: float | None = None
+    n_glass: str | None = None
     n_glass_sigma: float | None = None
+    glass_sigma_mm: float | None = None
+    """Prior sigma of the thickness, which is then estimated; the indices in the same way."""
     n_water: float | None = None
     n_water_sigma: float | None = None
     carry_to_n: float | None = None
@@ -97,20 +98,48 @@ class CalibrateOptions:
             )
         return given
 
+    def port_values(self, cameras: Collection[str]) -> dict[str, dict[str, float]]:
+        """Parameters of the port of each camera that are given, in metres.
 
-def by_camera(
-    text: str, cameras: Iterable[str], option: str, known: Collection[str]
-) -> dict[str, str]:
-    """One name for all cameras, and others for some: `flat`, or `flat,bow=dome,side=none`.
+        Raises:
+            CalibrationError: one is not a number in its range, or for no camera.
+        """
+        water = {} if self.n_water is None else {"n_water": self.n_water}
+        found: dict[str, dict[str, float]] = {camera: {**water} for camera in cameras}
+        for option, text, parameter, unit, (least, most) in (
+            ("--dome-radius", self.dome_radius_mm, "outer_radius_m", 1e3, (5.0, 1000.0)),
+            ("--port-distance", self.port_distance_mm, "port_distance_m", 1e3, (0.0, 500.0)),
+            ("--glass", self.glass_mm, "glass_thickness_m", 1e3, (0.0, 500.0)),
+            ("--n-glass", self.n_glass, "n_glass", 1.0, (1.0, 2.0)),
+        ):
+            for camera, word in by_camera(text or "", cameras, option).items():
+                try:
+                    value = float(word) if word else least
+                except ValueError:
+                    value = math.nan
+                if not least <= value <= most:
+                    raise CalibrationError(
+                        f"{option} {text}: {word!r} for {camera} is not a number from {least:g} to "
+                        f"{most:g}"
+                    )
+                if word:
+                    found[camera][parameter] = value / unit
+        return found
+
+
+def by_camera(text: str, cameras: Iterable[str], option: str) -> dict[str, str]:
+    """One word for all cameras, and others for some: `flat`, or `flat,bow=dome,side=none`.
 
     Args:
         text: the option.
         cameras: names of all cameras.
         option: its own name, for messages.
-        known: names that may be given.
+
+    Returns:
+        The word of each camera, empty where there is none.
 
     Raises:
-        CalibrationError: a camera has none, or a name is unknown.
+        CalibrationError: a camera is unknown, or two words are for all.
     """
     parts = [part.strip().rpartition("=")[::2] for part in text.split(",")]
     usual = [kind for camera, kind in parts if not camera]
@@ -120,6 +149,18 @@ def by_camera(
     if wrong or len(usual) > 1:
         which = f"no camera is called {', '.join(wrong)}" if wrong else "two are for all cameras"
         raise CalibrationError(f"{option} {text}: {which}; cameras are {', '.join(cameras)}")
+    return chosen
+
+
+def kinds_by_camera(
+    text: str, cameras: Iterable[str], option: str, known: Collection[str]
+) -> dict[str, str]:
+    """What `by_camera` reads, of known names.
+
+    Raises:
+        CalibrationError: a camera has none, or a name is unknown.
+    """
+    chosen = by_camera(text, cameras, option)
     for camera, kind in chosen.items():
         if kind not in known:
             wrong_kind = f"{kind!r} for {camera}" if kind else f"there is none for {camera}"
@@ -160,21 +201,25 @@ def check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
             f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
         )
     names = list(settings.places())
-    kinds = {} if settings.port is None else by_camera(settings.port, names, "--port", PORT_KINDS)
-    domes = (
-        {}
-        if start is None
-        else {n: c.port.shape == DomePort.shape for n, c in start.cameras.items()}
-    )
-    unknown = [n for n, kind in kinds.items() if kind == DomePort.shape and not domes.get(n)]
-    if unknown and settings.dome_radius_mm is None:
-        raise CalibrationError("--port dome needs --dome-radius, of its outer surface in mm")
-    if settings.glass_mm is None and set(kinds.values()) != {NoPort.shape}:
-        thin = start is None or not any(
-            "glass_thickness_m" in c.parameters and c.parameter("glass_thickness_m") > 0.0
-            for c in start.cameras.values()
-        )
-        if thin:
+    given_of = settings.port_values(names)
+    kinds = {}
+    if settings.port is not None:
+        kinds = kinds_by_camera(settings.port, names, "--port", PORT_KINDS)
+    old = {} if start is None else start.cameras
+    domes = {n for n, c in old.items() if c.port.shape == DomePort.shape}
+    thick = {
+        n
+        for n, c in old.items()
+        if "glass_thickness_m" in c.parameters and c.parameter("glass_thickness_m") > 0.0
+    }
+    for name in names:
+        kind, given_here = kinds.get(name), given_of[name]
+        if kind == DomePort.shape and name not in domes and "outer_radius_m" not in given_here:
             raise CalibrationError(
-                "--water needs --glass, the thickness of the port in mm (0 for a thin film)"
+                f"--port dome needs --dome-radius, of the outer surface of {name} in mm"
+            )
+        if kind != NoPort.shape and name not in thick and "glass_thickness_m" not in given_here:
+            raise CalibrationError(
+                f"--water needs --glass, the thickness of the port of {name} in mm (0 for a thin "
+                "film)"
             )

@@ -25,7 +25,6 @@ from camera_calib.formats.registry import (
     of_target,
 )
 from camera_calib.formats.rigs import (
-    UNKNOWN_MOUNT,
     ReadOptions,
     in_air,
     only,
@@ -37,7 +36,7 @@ from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
-from camera_calib.rig import Rig
+from camera_calib.rig import UNKNOWN_MOUNT, Rig
 
 _TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
 MODELS = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")

@@ -9,16 +9,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, camera_name
 from camera_calib.freedom import POSE
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Covariance, Rig
-
-UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
-"""Pose on the vehicle of rigs whose file states none: at the body's origin, looking down."""
+from camera_calib.rig import UNKNOWN_MOUNT, Covariance, Rig
 
 
 @dataclass(frozen=True, kw_only=True)

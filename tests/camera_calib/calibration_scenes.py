@@ -96,6 +96,31 @@ def board_poses(
     return RigidTransform.concatenate(poses)
 
 
+def views_of_some(
+    rig: Rig, points: Array, count: int, rng: np.random.Generator
+) -> list[tuple[RigidTransform, dict[str, Array]]]:
+    """Poses `rig_from_target`, and pixels by camera of those that see it whole: two or more.
+
+    The place aimed at is anywhere in the frame of each camera in turn.
+    """
+    views: list[tuple[RigidTransform, dict[str, Array]]] = []
+    while len(views) < count:
+        name = list(rig.cameras)[len(views) % len(rig.cameras)]
+        camera = rig.cameras[name]
+        turn = Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True)
+        pixel = rng.uniform(0.0, 1.0, 2) * [camera.width_px, camera.height_px]
+        place = camera.at_depth(pixel, rng.uniform(0.45, 1.4)) - turn.apply(points.mean(axis=0))
+        pose = rig.cam_from_rig[name].inv() * RigidTransform.from_components(place, turn)
+        whole = {}
+        for n, one in rig.cameras.items():
+            pixels = one.project((rig.cam_from_rig[n] * pose).apply(points))
+            if np.all((pixels > 15) & (pixels < [one.width_px - 15, one.height_px - 15])):
+                whole[n] = pixels
+        if name in whole and len(whole) >= 2:
+            views.append((pose, whole))
+    return views
+
+
 def views_of(
     rig: Rig,
     poses: RigidTransform,

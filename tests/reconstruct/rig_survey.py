@@ -229,17 +229,21 @@ def command(*arguments: str | Path) -> str:
     return done.stdout + done.stderr
 
 
-def import_survey(pictures: Path, workspace: Path, names: Sequence[str]) -> str:
+def places(folder: Path, names: Sequence[str]) -> list[str]:
+    """Options that name the folders of pictures of some cameras."""
+    return [part for name in names for part in ("--camera", f"{name}={folder / name}")]
+
+
+def import_survey(pictures: Path, rig: Path, workspace: Path, names: Sequence[str]) -> str:
     """Import the pictures of some cameras; what the command printed."""
-    given = [part for name in names for part in ("--camera", f"{name}={pictures / name}")]
-    files = ("--rig", pictures / "rig.json", "--navigation", pictures / "navigation.csv")
-    return command("import-images", *given, *files, "-w", workspace)
+    files = ("--rig", rig, "--navigation", pictures / "navigation.csv")
+    return command("import-images", *places(pictures, names), *files, "-w", workspace)
 
 
 if __name__ == "__main__":
     work, chosen = Path(sys.argv[1]), sys.argv[2:] or list(four_cameras().cameras)
     render_survey(work / "pictures", local_executor())
     made = work / "-".join(chosen)
-    sys.stdout.write(import_survey(work / "pictures", made, chosen))
+    sys.stdout.write(import_survey(work / "pictures", work / "pictures" / "rig.json", made, chosen))
     sys.stdout.write(command("reconstruct", "-w", made))
     sys.stdout.write(f"{score(made)}\n")

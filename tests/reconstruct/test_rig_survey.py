@@ -5,8 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alice_survey.base.artefacts import read_json
 from alice_survey.base.executor import local_executor
 from alice_survey.survey import run
+from camera_calib.rig import Rig, read_rig
+from tests.reconstruct.rig_calibration import calibrated_rig, errors_over_sigmas
 from tests.reconstruct.rig_survey import (
     MOMENTS,
     RigScore,
@@ -25,6 +28,7 @@ def check(found: RigScore, pictures: int) -> None:
     assert found.cameras.registered == found.cameras.total == pictures
     assert 0.005 < found.cameras.rms_m / found.pixel_m < 0.1
     assert abs(found.cameras.scale_error) < 5e-4
+    assert np.rad2deg(found.cameras.truth_from_world.rotation.magnitude()) < 3.0
     surface = found.surface
     assert surface.completeness > 0.97
     assert 0.03 < np.sqrt(np.mean(surface.distance_m**2)) / found.pixel_m < 0.3
@@ -35,19 +39,42 @@ def check(found: RigScore, pictures: int) -> None:
     assert 0.02 < np.sqrt(np.mean(shifts**2)) < 0.3
 
 
+def check_calibration(folder: Path, rig: Rig) -> None:
+    """Errors of what was found in pictures of a board, over its sigmas, and what is reported."""
+    over = np.array(list(errors_over_sigmas(rig).values()))
+    assert len(over) == 12 + 12 + 12 + 11 + 3 * 6
+    assert 0.6 < np.sqrt(np.mean(over**2)) < 1.4
+    assert np.abs(over).max() < 4.0
+    sigmas = rig.sigmas
+    assert all(1e-6 < sigmas[f"{name}.x_m"] < 1e-4 for name in NAMES[1:])
+    for medium in ("air", "water"):
+        report = read_json(folder / medium / "report.json")
+        assert not [v["text"] for v in report["verdicts"] if v["level"] == "bad"]
+        assert set(report["baselines_m"]) == set(NAMES[1:])
+        said = (folder / f"{medium}.txt").read_text()
+        page = (folder / medium / "report.html").read_text()
+        for name in NAMES[1:]:
+            assert f"baseline from wide to {name}" in said
+            assert f"baseline to {name}" in page
+    assert "--camera wide=FOLDER --camera tele=FOLDER" in (folder / "air.txt").read_text()
+
+
 @pytest.mark.slow
-def test_four_cameras_and_three_of_them_map_to_the_same_truth(tmp_path: Path) -> None:
+def test_four_cameras_are_calibrated_and_map_as_with_the_true_rig(tmp_path: Path) -> None:
     """Flat ports, domes, a fisheye, two look obliquely; then without the first, the reference."""
     pictures = tmp_path / "pictures"
     render_survey(pictures, local_executor(), LINES)
-    for names in (NAMES, NAMES[1:]):
-        workspace = tmp_path / "-".join(names)
-        said = import_survey(pictures, workspace, names)
+    found = calibrated_rig(tmp_path, local_executor())
+    check_calibration(tmp_path, read_rig(found))
+    runs = (pictures / "rig.json", NAMES), (found, NAMES), (found, NAMES[1:])
+    for rig, names in runs:
+        workspace = tmp_path / f"{len(names)}_{rig.parent.name}"
+        said = import_survey(pictures, rig, workspace, names)
         assert f" of {', '.join(names[:-1])} and {names[-1]}" in said
         (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
         run(["mapping", "placing", "dense", "mosaic"], workspace, None)
         check(score(workspace, LINES), LINES * MOMENTS * len(names))
-    workspace = tmp_path / "-".join(NAMES)
+    workspace = tmp_path / "4_pictures"
     command("report", "-w", workspace)
     report = (workspace / "report" / "report.html").read_text()
     assert "as imported with the pictures" in report

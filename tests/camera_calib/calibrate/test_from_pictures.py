@@ -154,7 +154,7 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
     calibrate_pictures(replace(air, output=tmp_path / "air"), executor=SERIAL)
     pool = CalibrateOptions(
         **both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
-        glass_mm=10.0, carry_to_n=1.342,
+        glass_mm="10", carry_to_n=1.342,
     )  # fmt: skip
     _, found = calibrate_pictures(replace(pool, output=tmp_path / "pool"), executor=SERIAL)
 
@@ -277,9 +277,9 @@ def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"glass_mm": 10.0}, "--glass"),
+        ({"glass_mm": "10"}, "--glass"),
         ({"water": True}, "--glass"),
-        ({"water": True, "known": "prior", "glass_mm": 10.0}, "--start"),
+        ({"water": True, "known": "prior", "glass_mm": "10"}, "--start"),
         ({"lens": "mirror"}, "mirror"),
         ({"target": "chessboard"}, "chessboard"),
         ({"start": Path("nowhere.json")}, "nowhere.json"),

@@ -67,7 +67,7 @@ def through(port: PortValues) -> Seen:
     ("port", "chosen", "ratio"), [(FLAT, "flat", 1.34), (CENTRED, "none", 1.0), (OFF, "dome", 0.98)]
 )
 def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> None:
-    settings = CalibrateOptions(water=True, port="auto", glass_mm=6.0)
+    settings = CalibrateOptions(water=True, port="auto", glass_mm="6")
     found = calibrated(settings, through(port), Board(), dry())
     assert found.housing.chosen == chosen
     for value in found.housing.focal_ratios.values():
@@ -88,7 +88,7 @@ def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> No
 
 
 def test_a_dome_taken_for_a_flat_port_is_bad() -> None:
-    settings = CalibrateOptions(water=True, glass_mm=6.0)
+    settings = CalibrateOptions(water=True, glass_mm="6")
     try:
         found = calibrated(settings, through(CENTRED), Board(), dry())
     except CalibrationError as error:
@@ -110,7 +110,7 @@ def test_a_dome_off_its_centre_taken_for_none_contradicts_the_calibration_in_air
     found = calibrated(settings, through(OFF), Board(), dry())
     said = [v for v in verdicts(judge(found, None)) if "from its prior" in v.text]
     assert [v.level for v in said] == ["bad"]
-    right = calibrated(replace(settings, port="dome", glass_mm=6.0, dome_radius_mm=80.0),
+    right = calibrated(replace(settings, port="dome", glass_mm="6", dome_radius_mm="80"),
                        through(OFF), Board(), dry())  # fmt: skip
     said = [v for v in verdicts(judge(right, None)) if "from its prior" in v.text]
     assert [v.level for v in said] == ["good"]

@@ -1,0 +1,108 @@
+"""Pictures of a board before the four cameras of `rig_survey`, in air and in water, and what the
+command line finds from them.
+
+`python -m tests.reconstruct.rig_calibration WORK` renders board and survey, calibrates, and maps
+the survey with the rig that was found, by all cameras and without the reference.
+"""
+
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.executor import Executor, local_executor
+from camera_calib.rig import Rig, read_rig
+from camera_calib.targets.target import parse_target
+from tests.camera_calib.calibration_scenes import differences, in_air, views_of_some
+from tests.oracles_targets import picture_light, to_srgb
+from tests.reconstruct.rig_survey import (
+    command,
+    four_cameras,
+    import_survey,
+    places,
+    render_survey,
+    score,
+)
+
+BOARD = parse_target("chessboard 9x6 40mm")
+VIEWS = 40
+_NOISE = 0.006
+"""Of light, where white is 0.7."""
+HOUSINGS = (
+    "--port", "flat,bow=dome,side=dome", "--glass", "6,wide=10,bow=5",
+    "--n-glass", "1.52,tele=1.49", "--dome-radius", "80,bow=60",
+)  # fmt: skip
+"""What the owner of the cameras knows of their ports."""
+
+
+@lru_cache(maxsize=2)
+def _housed(wet: bool) -> Rig:
+    return four_cameras() if wet else in_air(four_cameras())
+
+
+def _take(task: tuple[Path, bool, str, int, RigidTransform]) -> None:
+    """Write the board as rays of pixels meet it: through a port that is not a homography."""
+    folder, wet, name, view, rig_from_board = task
+    path = folder / name / f"{view:03d}.png"
+    if path.exists():
+        return
+    rig = _housed(wet)
+    camera, board_from_cam = rig.cameras[name], (rig.cam_from_rig[name] * rig_from_board).inv()
+
+    def hits(pixels: np.ndarray) -> np.ndarray:
+        """(M, 2) x and y where the rays of pixels meet the board's plane."""
+        points, directions = camera.unproject(pixels)
+        start, ways = board_from_cam.apply(points), board_from_cam.rotation.apply(directions)
+        return start[:, :2] - start[:, 2:] / ways[:, 2:] * ways[:, :2]
+
+    size = camera.width_px, camera.height_px
+    light = picture_light(BOARD, np.eye(3), size, fine=4, warp=hits)
+    rng = np.random.default_rng([view, wet, list(rig.cameras).index(name)])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), to_srgb(light + rng.normal(0.0, _NOISE, light.shape)))
+
+
+def calibrated_rig(folder: Path, executor: Executor) -> Path:
+    """The rig.json of the four cameras, from pictures in air and then in water."""
+    found = folder / "air" / "rig.json"
+    for medium in ("air", "water"):
+        wet = medium == "water"
+        shown = views_of_some(_housed(wet), BOARD.points, VIEWS, np.random.default_rng(31 + wet))
+        tasks = [
+            (folder / "board" / medium, wet, name, view, pose)
+            for view, (pose, seen) in enumerate(shown)
+            for name in seen
+        ]
+        list(executor.map(_take, tasks, label="board"))
+        pictures = places(folder / "board" / medium, list(four_cameras().cameras))
+        known = ["--water", "--start", found, *HOUSINGS] if wet else []
+        known += ["--lens", "opencv5,side=fisheye", "--target", BOARD.description]
+        said = command("calibrate", *pictures, *known, "-o", folder / medium)
+        (folder / f"{medium}.txt").write_text(said)
+        found = folder / medium / "rig.json"
+    return found
+
+
+def errors_over_sigmas(rig: Rig) -> dict[str, float]:
+    """Error over sigma of every parameter that was found."""
+    errors = differences(rig, four_cameras())
+    return {key: errors[key] / sigma for key, sigma in rig.sigmas.items()}
+
+
+if __name__ == "__main__":
+    work = Path(sys.argv[1])
+    path = calibrated_rig(work, local_executor())
+    over = errors_over_sigmas(read_rig(path))
+    sys.stdout.write("".join(f"{key} {value:+.2f}\n" for key, value in over.items()))
+    values = np.abs(list(over.values()))
+    sys.stdout.write(f"error over sigma {np.sqrt(np.mean(values**2)):.2f}, {values.max():.2f}\n")
+    survey, names = work / "pictures", list(four_cameras().cameras)
+    render_survey(survey, local_executor())
+    for chosen in (names, names[1:]):
+        made = work / "-".join(chosen)
+        import_survey(survey, path, made, chosen)
+        command("reconstruct", "-w", made)
+        sys.stdout.write(f"{', '.join(chosen)}: {score(made)}\n")
