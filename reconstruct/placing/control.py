@@ -1,7 +1,7 @@
 """Control of a model: known points and lengths place and scale it, or show how accurate it is."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -122,6 +122,22 @@ class ControlFit:
             misfits.append(np.array([(np.log(place.scale) + grown @ sizes - factor) / sigma]))
             rows.append(jacobian)
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
+
+    def deformed(self, sizes: Array) -> "ControlFit":
+        """The same on the model after its soft modes (K,) have been found."""
+
+        def moved(spot: Spot) -> Spot:
+            return replace(spot, model=spot.model + self._motion(spot, len(sizes)) @ sizes)
+
+        return replace(
+            self,
+            ties=tuple(replace(tie, spot=moved(tie.spot)) for tie in self.ties),
+            bars=tuple(
+                replace(bar, pairs=tuple((moved(a), moved(b)) for a, b in bar.pairs))
+                for bar in self.bars
+            ),
+            motion_at=None,
+        )
 
     def _motion(self, spot: Spot, modes: int) -> Array:
         """(3, K) of a point by the soft modes."""

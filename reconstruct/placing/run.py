@@ -318,6 +318,8 @@ def find_place(task: Placing) -> Placed:
         vertical_datum=vertical,
         notes=tuple(notes),
     )
+    if fit is not None:
+        ties = ties.deformed(fit.modes)
     return Placed(
         world_from_model=place,
         frame=frame,
