@@ -10,8 +10,8 @@ from reconstruct.mapping.robust import loss_scale
 
 _TRUST = 1e12
 """First radius of the trust region: no bound."""
-_TOLERANCE = 1e-4
-"""Relative change of the cost at which an adjustment ends.
+FULLY, ROUGHLY = 1e-4, 1e-2
+"""Relative changes of the cost at which an adjustment ends: where none follows, and others.
 The last steps of a robust loss are many and small: in a block of 25 stations with camera errors of
 0.22 mm, an end 10,000 times tighter takes 75 more of them and moves no camera by 0.007 mm."""
 _EVERY_SIZE = 1_000_000_000
@@ -32,9 +32,7 @@ def direct_solver(options: pycolmap.BundleAdjustmentOptions) -> pycolmap.BundleA
     return options
 
 
-def held_options(
-    sigma_px: float, tolerance: float = _TOLERANCE
-) -> pycolmap.BundleAdjustmentOptions:
+def held_options(sigma_px: float, tolerance: float = FULLY) -> pycolmap.BundleAdjustmentOptions:
     """Options that hold cameras and rig, for keypoints of this sigma and some that are wrong."""
     options = direct_solver(pycolmap.BundleAdjustmentOptions())
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

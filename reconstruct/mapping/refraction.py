@@ -21,7 +21,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.bundle import all_pictures, held_options
+from reconstruct.mapping.bundle import FULLY, ROUGHLY, all_pictures, held_options
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import pixel_sigma
@@ -161,6 +161,8 @@ def refract(
     seen: Observations,
     folder: Path,
     cam_from_rig: Mapping[str, RigidTransform] | None = None,
+    *,
+    settle: bool = True,
 ) -> tuple[Mapped, Convergence]:
     """Make a model exact that was mapped from keypoints warped at one working depth.
 
@@ -173,6 +175,8 @@ def refract(
         seen: keypoints, and the matches from which tracks are completed.
         folder: for scratch files.
         cam_from_rig: poses of the cameras on one rig; None without one.
+        settle: go on until keypoints converge; else end after the first turn, near enough for an
+            adjustment on exact rays.
 
     Returns:
         The exact model, and how the keypoints converged.
@@ -201,10 +205,15 @@ def refract(
         if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
             settled = True
             break
-        mapped = adjust_freely(replace(mapped, model=model, notes=notes))
+        tolerance = FULLY if settle else ROUGHLY
+        mapped = adjust_freely(replace(mapped, model=model, notes=notes), tolerance)
         model = pycolmap.Reconstruction(mapped.model)
         if len(moves) == 1:
             removed, added = judge(model, scale)
+            if not settle:
+                keypoints.correct(model, scale)
+                settled = True
+                break
     model.update_point_3d_errors()
     found = Convergence(
         moved_px=tuple(moves),
@@ -221,7 +230,7 @@ def refract(
     return replace(mapped, model=model), found
 
 
-def adjust_freely(mapped: Mapped) -> Mapped:
+def adjust_freely(mapped: Mapped, tolerance: float = FULLY) -> Mapped:
     """Adjust all poses and points.
 
     A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
@@ -232,7 +241,9 @@ def adjust_freely(mapped: Mapped) -> Mapped:
         config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
     else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(held_options(pixel_sigma(model)), config, model).solve()
+    pycolmap.create_default_bundle_adjuster(
+        held_options(pixel_sigma(model), tolerance), config, model
+    ).solve()
     model.update_point_3d_errors()
     return replace(mapped, model=model)
 

@@ -126,7 +126,7 @@ def _map(
             method=settings.mapper,
             executor=executor,
         )
-        mapped, refracted = refract(mapped, seen, folder, poses)
+        mapped, refracted = refract(mapped, seen, folder, poses, settle=not mapped.scaled)
     else:
         mapped, refracted = map_self_calibrated(seen, exif_focal, folder, seed), None
     _write(folder, inputs, mapped, distances, refracted)
