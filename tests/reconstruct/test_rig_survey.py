@@ -73,7 +73,7 @@ def test_four_cameras_are_calibrated_and_map_as_with_the_true_rig(tmp_path: Path
         assert f" of {', '.join(names[:-1])} and {names[-1]}" in said
         (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
         run(["mapping", "placing", "dense", "mosaic"], workspace, None)
-        # A survey that refines the rig takes biases of its keypoints, thousandths of a pixel, too.
+        # A survey that refines the rig follows residuals of thousandths of a pixel, too.
         check(score(workspace, LINES), LINES * MOMENTS * len(names), 0.2 if rig == found else 0.1)
     workspace = tmp_path / "4_pictures"
     command("report", "-w", workspace)
