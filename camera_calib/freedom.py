@@ -19,7 +19,7 @@ from camera_calib.camera import pose_jacobian
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
-from camera_calib.rig import Rig
+from camera_calib.rig import Covariance, Rig
 
 POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 """Pose parameters of a camera that is not the reference; its rotation first."""
@@ -154,6 +154,41 @@ def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
             )
         poses[name] = pose
     return replace(rig, cameras=cameras, cam_from_rig=poses)
+
+
+def part_of_rig(rig: Rig, names: Sequence[str]) -> Rig:
+    """Some cameras as a rig of their own, the first its reference, with their joint covariance.
+
+    A pose relative to the new reference moves with the camera's own and against the reference's:
+    with R and t of it and t0 of the reference, `r' = r - R r0` and
+    `x' = x - R x0 + (R t0) x (r - R r0)`.
+    """
+    first = rig.cam_from_rig[names[0]]
+    part = replace(
+        rig,
+        cameras={name: rig.cameras[name] for name in names},
+        cam_from_rig={name: rig.cam_from_rig[name] * first.inv() for name in names},
+        body_from_rig=rig.body_from_cam(names[0]),
+    )
+    if rig.covariance is None:
+        return part
+    known = rig.covariance.parameters
+    at = {name: np.eye(len(known))[i] for i, name in enumerate(known)}
+    slopes = {n: at[n] for n in known if n.split(".")[0] in names and n.split(".")[1] not in POSE}
+
+    def pose_rows(name: str) -> Array:
+        return np.array([at.get(f"{name}.{axis}", np.zeros(len(known))) for axis in POSE])
+
+    for name in names[1:]:
+        turn = part.cam_from_rig[name].rotation.as_matrix()
+        own, base = pose_rows(name), pose_rows(names[0])
+        rows = own - np.vstack([turn @ base[:3], turn @ base[3:]])
+        rows[3:] += np.cross(turn @ first.translation, rows[:3], axisb=0, axisc=0)
+        if rows.any():
+            slopes |= {f"{name}.{axis}": row for axis, row in zip(POSE, rows, strict=True)}
+    matrix = np.array(list(slopes.values())).reshape(len(slopes), len(known))
+    covariance = matrix @ rig.covariance.matrix @ matrix.T
+    return replace(part, covariance=Covariance(parameters=tuple(slopes), matrix=covariance))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

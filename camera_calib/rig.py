@@ -19,9 +19,9 @@ from camera_calib.optics import LENSES, PORTS
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}
 _NORM_TOLERANCE = 1e-3
+"""Tolerance of the length of a quaternion in a file that was typed or rounded."""
 UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
 """Pose on the vehicle of rigs of which none is known: at the body's origin, looking down."""
-"""Tolerance of the length of a quaternion in a file that was typed or rounded."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,7 +22,7 @@ from camera_calib.calibrate.solve import (
 from camera_calib.calibrate.start import same_numbering
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import Camera
-from camera_calib.freedom import LENSES, USUAL_LENS, LensNames
+from camera_calib.freedom import LENSES, USUAL_LENS, LensNames, part_of_rig
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.optics import PORTS
 from camera_calib.ports.flat import FlatPort
@@ -211,11 +211,4 @@ def matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
                 f"pictures of {name} have {size[0]} x {size[1]} px, the start's camera "
                 f"{camera.width_px} x {camera.height_px}"
             )
-    names = list(sizes)
-    to_first = start.cam_from_rig[names[0]].inv()
-    return replace(
-        start,
-        cameras={name: start.cameras[name] for name in names},
-        cam_from_rig={name: start.cam_from_rig[name] * to_first for name in names},
-        body_from_rig=start.body_from_cam(names[0]),
-    )
+    return part_of_rig(start, list(sizes))

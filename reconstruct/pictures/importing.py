@@ -24,6 +24,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
 from alice_survey.base.records import PicturesRecord
 from camera_calib.calibrate.picture_sets import pair_pictures
+from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import (
     OPTIONAL,
@@ -211,7 +212,9 @@ def import_images(
         records = sorted(records, key=lambda r: (r.station, r.camera))
         write_manifest(partial / "manifest.csv", records)
         if known_rig is not None:
-            write_rig(partial / "rig.json", known_rig)
+            taken = {entry.camera for entry in entries}
+            names = [name for name in known_rig.cameras if name in taken]
+            write_rig(partial / "rig.json", part_of_rig(known_rig, names))
         PicturesRecord.save(
             partial / "survey.json",
             {"source": "imported", "datum": datum, "vertical_datum": level, "notes": notes},

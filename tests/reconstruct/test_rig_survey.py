@@ -23,10 +23,10 @@ LINES = 2
 NAMES = ("wide", "tele", "bow", "side")
 
 
-def check(found: RigScore, pictures: int) -> None:
+def check(found: RigScore, pictures: int, most_px: float) -> None:
     """Errors in ground pixels; a camera mounted 0.1 deg off puts them off by a whole one."""
     assert found.cameras.registered == found.cameras.total == pictures
-    assert 0.005 < found.cameras.rms_m / found.pixel_m < 0.1
+    assert 0.005 < found.cameras.rms_m / found.pixel_m < most_px
     assert abs(found.cameras.scale_error) < 5e-4
     assert np.rad2deg(found.cameras.truth_from_world.rotation.magnitude()) < 3.0
     surface = found.surface
@@ -73,7 +73,8 @@ def test_four_cameras_are_calibrated_and_map_as_with_the_true_rig(tmp_path: Path
         assert f" of {', '.join(names[:-1])} and {names[-1]}" in said
         (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
         run(["mapping", "placing", "dense", "mosaic"], workspace, None)
-        check(score(workspace, LINES), LINES * MOMENTS * len(names))
+        # A survey that refines the rig follows residuals of thousandths of a pixel, too.
+        check(score(workspace, LINES), LINES * MOMENTS * len(names), 0.2 if rig == found else 0.1)
     workspace = tmp_path / "4_pictures"
     command("report", "-w", workspace)
     report = (workspace / "report" / "report.html").read_text()

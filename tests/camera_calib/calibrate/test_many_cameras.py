@@ -13,11 +13,12 @@ from camera_calib.calibrate.options import CalibrateOptions, check_settings
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import TargetView
 from camera_calib.camera import Camera
+from camera_calib.freedom import POSE, moved, part_of_rig
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Rig
+from camera_calib.rig import Covariance, Rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import differences, views_of_some
 from tests.cameras import rig_of
@@ -87,6 +88,32 @@ def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
     for name in ("right", "bow", "side"):
         assert sigmas[f"{name}.x_m"] < 2e-3
         assert sigmas[f"{name}.rx_rad"] < 1e-3
+
+
+def test_a_part_of_a_rig_has_the_covariance_of_its_own_poses() -> None:
+    """The covariance of one random step of the rig is that of what its part does."""
+    rig, names = four_cameras(), ["bow", "side"]
+    fields = (*(f"{n}.{axis}" for n in ("right", "bow", "side") for axis in POSE), "side.cx_px")
+    step = np.random.default_rng(4).normal(0.0, 1e-5, len(fields))
+    known = Covariance(parameters=fields, matrix=np.outer(step, step))
+
+    part = part_of_rig(replace(rig, covariance=known), names)
+
+    both = part.cam_from_rig["side"] * part.cam_from_rig["bow"].inv()
+    np.testing.assert_allclose(
+        both.as_matrix(), (rig.cam_from_rig["side"] * rig.cam_from_rig["bow"].inv()).as_matrix()
+    )
+    assert part.body_from_cam("side").as_matrix() == pytest.approx(
+        rig.body_from_cam("side").as_matrix()
+    )
+    off = differences(part_of_rig(replace(moved(rig, fields, step), covariance=known), names), part)
+    assert list(off) == ["side.cx_px", *(f"side.{axis}" for axis in POSE)]
+    assert part.covariance is not None
+    np.testing.assert_allclose(
+        part.covariance.matrix, np.outer(list(off.values()), list(off.values())), atol=1e-14
+    )
+    whole = part_of_rig(replace(rig, covariance=known), list(rig.cameras))
+    assert whole.sigmas == pytest.approx(dict(zip(fields, np.abs(step), strict=True)), rel=1e-9)
 
 
 def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> None:
