@@ -15,6 +15,7 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import RangeRecord
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
 from reconstruct.adjustment.uncertainty import Uncertainty, estimate
@@ -95,6 +96,8 @@ def adjust_survey(
             scale or does not determine it.
     """
     exact, notes = None, mapped.notes
+    if rig is not None and list(rig.cameras) != list(mapped.warps):
+        rig = part_of_rig(rig, list(mapped.warps))
     try:
         if rig is not None and distances is not None and mapped.scaled:
             exact = _exact(mapped, records, rig, distances, settings)
