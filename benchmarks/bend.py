@@ -27,7 +27,6 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import AliceError
-from alice_survey.base.frames import Array
 from benchmarks.bend_pipeline import Adjust, Adjusted, adjusted
 from benchmarks.bend_survey import (
     LOGS,
@@ -43,6 +42,7 @@ from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import Rig
 from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.placing.bend import sag_weights
 
 _FIRST_SEED = 11
 """Of the flights: the example's own."""
@@ -162,7 +162,7 @@ def score(found: Adjusted, true: RigidTransform) -> Score:
     at = found.ned_from_cam.translation
     aligned = align_rigid(at, true.translation).apply(at)
     off = aligned - true.translation
-    sags = sags_of(true.translation, -off[:, 2])
+    sags = sag_weights(true.translation[:, :2]) @ -off[:, 2]
     own = np.diagonal(found.shape, axis1=1, axis2=2)[:, :3]
     sigmas = np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
     turns = (found.ned_from_cam.rotation * true.rotation.inv()).as_rotvec()
@@ -170,16 +170,16 @@ def score(found: Adjusted, true: RigidTransform) -> Score:
     ratios = np.sqrt(np.nanmean(ratio**2, axis=0))
     stated = np.sqrt(np.nanmean(own.sum(axis=1)))
     return Score(
-        along=sags[0],
+        along=float(sags[0]),
         along_sigma=found.bend_sigmas_m[0],
-        across=sags[1],
+        across=float(sags[1]),
         across_sigma=found.bend_sigmas_m[1],
         cameras=float(np.sqrt((off**2).sum(axis=1).mean())),
         cameras_sigma=float(stated),
         scale=1.0 / align_similarity(at, true.translation).scale - 1.0,
         scale_sigma=found.scale_sigma,
-        along_ratio=sags[0] / found.bend_sigmas_m[0],
-        across_ratio=sags[1] / found.bend_sigmas_m[1],
+        along_ratio=float(sags[0]) / found.bend_sigmas_m[0],
+        across_ratio=float(sags[1]) / found.bend_sigmas_m[1],
         cameras_ratio=float(np.sqrt(np.nanmean(off**2 / own))),
         north_ratio=float(ratios[0]),
         east_ratio=float(ratios[1]),
@@ -187,23 +187,6 @@ def score(found: Adjusted, true: RigidTransform) -> Score:
         tilt_ratio=float(np.sqrt((ratios[3:5] ** 2).mean())),
         heading_ratio=float(ratios[5]),
     )
-
-
-def sags_of(places: Array, heights: Array) -> tuple[float, float]:
-    """Sags along and across a block of the paraboloid through height errors, metres.
-
-    Args:
-        places: (S, 3) in NED.
-        heights: (S,) errors, positive where the model is too high.
-
-    Returns:
-        How much the ends are too high against the middle.
-    """
-    level = places[:, :2] - places[:, :2].mean(axis=0)
-    u, v = (level @ np.linalg.svd(level, full_matrices=False)[2].T).T
-    design = np.column_stack([np.ones_like(u), u, v, u * u, v * v, u * v])
-    fitted = np.linalg.lstsq(design, heights, rcond=None)[0]
-    return float(fitted[3] * np.ptp(u) ** 2 / 4.0), float(fitted[4] * np.ptp(v) ** 2 / 4.0)
 
 
 def over_seeds(scores: Sequence[Score]) -> Score:

@@ -19,6 +19,7 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.bend import sag_weights
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.placing.navigation_equations import PLACE
 from reconstruct.placing.run import body_from_pinhole
@@ -103,7 +104,7 @@ def adjusted(
     stations = [int(np.flatnonzero(found.shape.stations == row.station)[0]) for row in rows]
     moved = found.shape.moved(place.scale, place.rotation)
     down = moved.modes.stations[stations, 5]
-    spreads = _sag_weights(poses.translation) @ down
+    spreads = sag_weights(poses.translation[:, :2]) @ down
     scaling = _scale_weights(poses.translation) @ moved.modes.stations[stations, 3:].reshape(
         -1, len(left)
     )
@@ -127,16 +128,6 @@ def _positions_first(covariances: Array) -> Array:
     order = [3, 4, 5, 0, 1, 2]
     found: Array = covariances[:, order][:, :, order]
     return found
-
-
-def _sag_weights(places: Array) -> Array:
-    """(2, S) that take height errors to the sags along and across (see `bend.sags_of`)."""
-    level_ = places[:, :2] - places[:, :2].mean(axis=0)
-    u, v = (level_ @ np.linalg.svd(level_, full_matrices=False)[2].T).T
-    design = np.column_stack([np.ones_like(u), u, v, u * u, v * v, u * v])
-    weights = np.linalg.pinv(design)[3:5]
-    sags: Array = weights * (np.array([np.ptp(u), np.ptp(v)])[:, None] ** 2 / 4.0)
-    return sags
 
 
 def _scale_weights(places: Array) -> Array:

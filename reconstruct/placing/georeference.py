@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -36,6 +35,7 @@ from reconstruct.placing.navigation_equations import (
     read_epochs,
     without_navigation,
 )
+from reconstruct.placing.placement_fit import PlacementFit
 
 _LEVEL_SIGMA_DEG = 10.0
 """How far from level the sea floor's mean plane may be, where no attitude was measured."""
@@ -62,112 +62,6 @@ _STRETCH = 0.005
 `vehicle.navigation.sensors`)."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacementFit:
-    """A model placed by navigation, and how well."""
-
-    ned_from_model: Similarity
-    used: int
-    """Stations with a position that took part."""
-    left_out: Mapping[str, int]
-    """For each group of channels, how many readings the rest contradicts."""
-    rms_m: Array
-    """(3,) north, east, down misses of the positions that took part, root mean square; NaN where
-    none did."""
-    free_scale: float
-    """Scale that a similarity would choose: 1 where navigation agrees with the known scale."""
-    free_scale_sigma: float
-    middle_ned: Array
-    """(3,) middle of the camera track, about which the covariance's rotation and scale act."""
-    covariance: Array
-    """(7, 7) covariance of rotation about north, east, down (rad), shift north, east, down of the
-    middle (m), and the logarithm of the scale."""
-    correlation: Mapping[str, Correlation]
-    """For each group, how navigation's errors are correlated."""
-    time_unit: str
-    mount_sigma_deg: float
-    modes: Array
-    """(K,) sizes of the model's soft modes, in their sigmas."""
-    joint: Array
-    """(7 + K, 7 + K) covariance of the placement and the modes."""
-    bends: tuple[Bend, ...]
-    """How bent the model is still, along the block and, where it is wide, across; none where
-    stations are too few."""
-    nuisances: Mapping[str, tuple[float, float]]
-    """What was found of the errors of the lever arm (m), the clock (s) and navigation's own frame
-    (turn in degrees, stretch), and their sigmas."""
-
-    @property
-    def sigma_position_m(self) -> Array:
-        """(3,) sigma of the middle of the track, north, east and down."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[3:6]))
-
-    @property
-    def sigma_tilt_deg(self) -> Array:
-        """(2,) sigma of rotation about north and about east."""
-        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance)[:2])))
-
-    @property
-    def sigma_heading_deg(self) -> float:
-        """Sigma of rotation about down."""
-        return float(np.rad2deg(np.sqrt(self.covariance[2, 2])))
-
-    @property
-    def sigma_scale(self) -> float:
-        """Sigma of the logarithm of the scale, 0 where it is held."""
-        return float(np.sqrt(self.covariance[SCALE, SCALE]))
-
-    def to_json(self) -> dict[str, Any]:
-        """What `georeference.json` says."""
-        tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
-        axis = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
-        north, east, down = self.sigma_position_m.tolist()
-        return {
-            "format": "alice-survey georeference",
-            "version": 1,
-            "method": _METHOD,
-            "stations": self.used,
-            "left_out": dict(self.left_out),
-            **{
-                f"rms_{axis}_m": None if np.isnan(rms_m) else float(rms_m)
-                for axis, rms_m in zip(("north", "east", "depth"), self.rms_m, strict=True)
-            },
-            "sigma_north_m": north,
-            "sigma_east_m": east,
-            "sigma_depth_m": down,
-            "sigma_heading_deg": self.sigma_heading_deg,
-            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))),
-            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
-            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
-            "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
-            "largest_tilt_axis_deg": float(axis),
-            "sigma_scale": self.sigma_scale,
-            "scale_of_navigation": self.free_scale,
-            "scale_of_navigation_sigma": self.free_scale_sigma,
-            "mount_sigma_deg": self.mount_sigma_deg,
-            "nuisances": {
-                name: {"value": found, "sigma": sigma}
-                for name, (found, sigma) in self.nuisances.items()
-            },
-            "soft_modes": self.modes.tolist(),
-            "middle_ned_m": self.middle_ned.tolist(),
-            "covariance": self.covariance.tolist(),
-            "covariance_order": [
-                "rotation_north_rad", "rotation_east_rad", "rotation_down_rad",
-                "north_m", "east_m", "down_m", "log_scale",
-            ],
-            "errors": {
-                group: {
-                    f"correlation_{'s' if self.time_unit == 's' else 'stations'}": how.tau,
-                    "white_share": how.white,
-                    "constant_share": how.constant,
-                    "sigma_factor": how.factor,
-                }
-                for group, how in self.correlation.items()
-            },
-        }  # fmt: skip
-
-
 _NUISANCES = {
     "turn_deg": (TURN, float(np.rad2deg(1.0))),
     "stretch": (STRETCH, 1.0),
@@ -180,10 +74,6 @@ _EXPECTED = {
     "lever_forward_m": _LEVER_SIGMA_M, "lever_right_m": _LEVER_SIGMA_M,
     "lever_down_m": _LEVER_SIGMA_M, "clock_s": _CLOCK_SIGMA_S,
 }  # fmt: skip
-_METHOD = (
-    "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
-    "stated sigmas, correlation times and white shares by restricted maximum likelihood"
-)
 
 
 def level(points: Array, centres: Array) -> Similarity:
@@ -383,9 +273,8 @@ class _NavigationTask:
                 correlation=got.correlation,
             )
         return self._report(
-            place, middle, sizes, nuisances, got, scaled, held=SCALE not in free,
-            free=solved_for,
-        )  # fmt: skip
+            place, middle, sizes, nuisances, got, scaled, free=solved_for, bounds=bounds
+        )
 
     def _report(
         self,
@@ -396,8 +285,8 @@ class _NavigationTask:
         got: Estimate,
         scaled: Estimate,
         *,
-        held: bool,
         free: Sequence[int],
+        bounds: Mapping[int, float],
     ) -> PlacementFit:
         epochs = self.epochs.deformed(sizes)
         kept = got.used[epochs.moment, 0]
@@ -422,21 +311,26 @@ class _NavigationTask:
             used=int(got.used[:, 0].sum()),
             left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
             rms_m=np.sqrt((misses**2).mean(axis=0)) if len(misses) else np.full(3, np.nan),
-            free_scale=float(np.exp(scaled.change[SCALE])) if held else 1.0,
+            free_scale=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
             free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
             middle_ned=middle,
-            covariance=got.covariance[:PLACE, :PLACE],
             correlation=got.correlation,
             time_unit="s" if epochs.timed else "stations",
             mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
             modes=sizes,
             joint=got.covariance[np.ix_(joint, joint)],
-            bends=self._bends(place, middle, sizes, got, [p for p in free if p < PARAMETERS]),
+            bends=self._bends(place, middle, sizes, got, free, bounds),
             nuisances=named,
         )
 
     def _bends(
-        self, place: Similarity, middle: Array, sizes: Array, got: Estimate, stiff: Sequence[int]
+        self,
+        place: Similarity,
+        middle: Array,
+        sizes: Array,
+        got: Estimate,
+        free: Sequence[int],
+        bounds: Mapping[int, float],
     ) -> tuple[Bend, ...]:
         """How bent the placed model is by navigation alone, whatever its modes allow."""
         epochs = self.epochs.deformed(sizes)
@@ -450,9 +344,9 @@ class _NavigationTask:
             epochs.time,
             found,
             got.used,
-            [*stiff, *range(PARAMETERS, PARAMETERS + count)],
+            [*(p for p in free if p < PARAMETERS), *range(PARAMETERS, PARAMETERS + count)],
             replace(self, control=None)._extra(place, middle, np.zeros(count)),
-            frame_bounds=self._frame_bounds(),
+            frame_bounds=bounds,
             correlation=got.correlation,
         )
         values = _VAGUE_PER_M * bent.change[PARAMETERS:]

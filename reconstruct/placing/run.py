@@ -52,9 +52,10 @@ from reconstruct.placing.control_file import (
     read_control,
     read_picks,
 )
-from reconstruct.placing.georeference import PlacementFit, fit_control, fit_navigation, level
+from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.navigation_equations import PLACE
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import (
     TrackRow,
     picture_modes,

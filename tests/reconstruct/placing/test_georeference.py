@@ -9,7 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
+from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.placement_fit import PlacementFit
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.correlated_errors import correlated_share, standard_residuals, whiten
-from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
+from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.placement_fit import PlacementFit
 from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
 DATUM = Datum(32.8236, 34.9553)

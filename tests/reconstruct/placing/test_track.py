@@ -15,8 +15,8 @@ from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotat
 from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, no_modes
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.georeference import PlacementFit
 from reconstruct.placing.navigation_equations import attitude_axes
+from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
@@ -82,7 +82,7 @@ def placed(middle: Array, covariance: Array) -> PlacementFit:
     """A place of this covariance."""
     return PlacementFit(
         ned_from_model=HERE, used=1, left_out={}, rms_m=np.zeros(3), free_scale=1.0,
-        free_scale_sigma=0.0, middle_ned=middle, covariance=covariance, correlation={},
+        free_scale_sigma=0.0, middle_ned=middle, correlation={},
         time_unit="s", mount_sigma_deg=0.0, modes=np.zeros(0), joint=covariance, bends=(),
         nuisances={},
     )  # fmt: skip
