@@ -33,6 +33,7 @@ from reconstruct.adjustment.exact_observations import (
     exact_observations,
     start_state,
 )
+from reconstruct.adjustment.keypoint_bias import bias_covariance
 from reconstruct.adjustment.normal_equations import (
     LEAST_POINTS,
     POSE,
@@ -173,7 +174,7 @@ def fit_survey(
     if not fields:  # held: what errors of the calibration do, all the same
         fields = calibrated_parameters(rig, names)
         if rig.covariance is not None:
-            known = rig.covariance.marginal(fields).matrix
+            known = _calibrated(rig, fields)
         linear = exact_observations(guess.state, pixels, fields)
         equations = problem.reduced(replace(guess, linear=linear), found.noise)
     sigma_px, variance = found.noise.tolist()
@@ -308,7 +309,16 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
         }
     wide = {name: sigma for name, sigma in wide.items() if name not in known}
     loose = Prior.around(rig, wide)
-    return Prior.of_rig(rig, known).and_also(loose) if known else loose
+    if not known:
+        return loose
+    prior = Prior.of_rig(rig, known)
+    return replace(prior, covariance=_calibrated(rig, known)).and_also(loose)
+
+
+def _calibrated(rig: Rig, names: Sequence[str]) -> Array:
+    """What a calibration knows of where keypoints lie, as a covariance of its parameters."""
+    bias = bias_covariance(rig, names)
+    return bias if rig.covariance is None else bias + rig.covariance.marginal(names).matrix
 
 
 def _hold_baseline(information: Array, fields: Sequence[str], rig: Rig) -> None:

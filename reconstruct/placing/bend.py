@@ -67,8 +67,8 @@ def quadratic(places: Array) -> tuple[Array, Array, Array]:
 def sag_weights(places: Array) -> Array:
     """(1 or 2, N) that take heights at places (N, 2) to the sags along and, if wide, across."""
     columns, sizes, _ = quadratic(places)
-    weights: Array = np.linalg.pinv(columns)[2::2]
-    return weights * sizes[: len(weights), None] ** 2 / 8.0
+    curvatures = np.linalg.pinv(columns)[2::2]
+    return np.asarray(curvatures * sizes[: len(curvatures), None] ** 2 / 8.0)
 
 
 def bend_modes(places_ned: Array, place: Similarity) -> Array:

@@ -7,6 +7,7 @@ import pytest
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.executor import local_executor
+from alice_survey.base.records import PortRecord
 from alice_survey.survey import run
 from camera_calib.rig import Rig, read_rig
 from tests.reconstruct.rig_calibration import calibrated_rig, errors_over_sigmas
@@ -73,8 +74,12 @@ def test_four_cameras_are_calibrated_and_map_as_with_the_true_rig(tmp_path: Path
         assert f" of {', '.join(names[:-1])} and {names[-1]}" in said
         (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
         run(["mapping", "placing", "dense", "mosaic"], workspace, None)
-        # A survey that refines the rig follows residuals of thousandths of a pixel, too.
-        check(score(workspace, LINES), LINES * MOMENTS * len(names), 0.2 if rig == found else 0.1)
+        check(score(workspace, LINES), LINES * MOMENTS * len(names), 0.1)
+        if rig == found:
+            port = PortRecord.read(workspace / "sparse" / "port.json")
+            moves = np.subtract(port.after, port.before) / port.prior_sigmas
+            assert 0.1 < np.sqrt(np.mean(moves**2)) < 1.2
+            assert np.abs(moves).max() < 3.5
     workspace = tmp_path / "4_pictures"
     command("report", "-w", workspace)
     report = (workspace / "report" / "report.html").read_text()
