@@ -28,6 +28,7 @@ from reconstruct.mapping.robust import pixel_sigma
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""
+_LAST_STEP_SIGMAS = 0.5
 _SETTLED_SIGMAS = 0.05
 """And so have those that move less than this share of their noise, the farthest of them."""
 _ROUNDS = 6
@@ -214,6 +215,9 @@ def refract(
                 keypoints.correct(model, scale)
                 settled = True
                 break
+    if settle:  # no adjustment follows
+        mapped = adjust_freely(replace(mapped, model=model))
+        model = pycolmap.Reconstruction(mapped.model)
     model.update_point_3d_errors()
     found = Convergence(
         moved_px=tuple(moves),
@@ -230,11 +234,20 @@ def refract(
     return replace(mapped, model=model), found
 
 
-def adjust_freely(mapped: Mapped, tolerance: float = FULLY) -> Mapped:
+def adjust_freely(mapped: Mapped, tolerance: float | None = None) -> Mapped:
     """Adjust all poses and points.
 
     A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
+
+    Args:
+        mapped: to adjust.
+        tolerance: relative change of the cost at which the adjustment ends. If left out, that of a
+            step of all unknowns of half a sigma: one of L sigmas lowers the cost of N observations,
+            about N, by L^2 / 2.
     """
+    if tolerance is None:
+        count = sum(image.num_points3D for image in mapped.model.images.values())
+        tolerance = _LAST_STEP_SIGMAS**2 / (2.0 * max(count, 1))
     model = pycolmap.Reconstruction(mapped.model)
     config = all_pictures(model)
     if np.isfinite(mapped.baseline):
