@@ -50,8 +50,8 @@ class Grid:
     @cached_property
     def middles_ne(self) -> Array:
         """(rows, columns, 2): north and east of the middles of the cells."""
-        cells: Array = np.moveaxis(np.indices(self.shape), 0, -1) + 0.5
-        return self.places_of(cells)
+        row, column = np.indices(self.shape) + 0.5
+        return self.places_of(np.stack([row, column], axis=-1))
 
     def cells_of(self, points_ne: Array) -> Array:
         """Row and column, (..., 2), of places (..., 2); the middle of a cell is at a half."""

@@ -86,10 +86,10 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
             partial / "survey.json"
         )
 
+    _join_plans(workspace, dives)
     run_stage(workspace, stage, work)
     if (dives[0] / "survey.toml").is_file() and not (workspace / "survey.toml").exists():
         shutil.copyfile(dives[0] / "survey.toml", workspace / "survey.toml")
-    _join_plans(workspace, dives)
     counts = [len(records) for records in rows]
     return f"{' and '.join(map(str, counts))} pictures of {len(dives)} dives"
 

@@ -11,13 +11,13 @@ import shapely
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.frames import Array
 from missions.coverage.certificate import certificate
-from missions.coverage.stations import Stations, stations_of_lines, stations_of_plan
+from missions.coverage.stations import Stations, joined, stations_of_lines, stations_of_plan
 from missions.fly.refly import refly_plan
 from missions.values.area import multipolygon
 from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.plan_file import Plan
-from reconstruct.revisit.links import footprints, joined, links, pieces, views_of_floor
+from reconstruct.revisit.links import footprints, links, pieces, views_of_floor
 from reconstruct.revisit.weak import LOOSE_SHARE, Found, WeakPlace
 
 _ENDS = 8

@@ -6,7 +6,6 @@ one track, and to halve it more. What links a group of stations to the others is
 graph; stations are in one piece where no cut between them is below a given number of tracks.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components, maximum_flow
 
-from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.coverage.raster import border_rays_body, footprints_ne
 from missions.coverage.stations import Stations
@@ -30,10 +28,10 @@ def footprints(rig: Rig, stations: Stations) -> NDArray[Any]:
     borders = footprints_ne(
         *border_rays_body(rig), stations.glass_ne, stations.altitude_m, stations.attitude_rad
     )
-    blind = ~np.isfinite(borders).all(axis=(2, 3))
-    shapes = shapely.polygons(np.where(blind[..., None, None], 0.0, borders))
+    blind = np.asarray(~np.isfinite(borders).all(axis=(2, 3)))
+    shapes = np.asarray(shapely.polygons(np.where(blind[..., None, None], 0.0, borders)))
     shapes[blind] = shapely.Polygon()
-    return np.asarray(shapely.union_all(shapely.make_valid(shapes), axis=1))
+    return np.asarray(shapely.union_all(np.asarray(shapely.make_valid(shapes)), axis=1))
 
 
 def views_of_floor(shapes: NDArray[Any], step_m: float) -> sp.csr_array:
@@ -96,28 +94,10 @@ def cut_around(linked: sp.csr_array, group: NDArray[np.bool_]) -> float:
     return float(linked[group][:, ~group].sum())
 
 
-def joined(first: Stations, *others: Stations) -> Stations:
-    """The stations of several dives; lines of each count on, and times are left out."""
-    together = [first]
-    for one in others:
-        after = 1 + max(int(each.line.max(initial=-1)) for each in together)
-        moved = np.where(one.line < 0, -1, one.line + after)
-        together.append(
-            Stations(
-                glass_ne=one.glass_ne, altitude_m=one.altitude_m, attitude_rad=one.attitude_rad,
-                line=moved,
-            )
-        )  # fmt: skip
-    names: Sequence[str] = ("glass_ne", "altitude_m", "attitude_rad", "line")
-    return Stations(
-        **{name: np.concatenate([getattr(one, name) for one in together]) for name in names}
-    )
-
-
 def _firmly_linked(nodes: sp.csr_array, first: int, least: float) -> int | None:
     """A node after the first between which and it no cut is below `least`."""
     whole = sp.csr_array((nodes * _CAPACITY).astype(np.int32))
-    degree: Array = nodes.sum(axis=0)
+    degree = nodes.sum(axis=0)
     for other in range(first + 1, nodes.shape[0]):
         if (
             min(degree[first], degree[other]) >= least

@@ -172,11 +172,26 @@ def find_weak(
         (record.registered, record.total), record.models,
     )  # fmt: skip
     sigmas = _station_sigmas(sparse, pictured.numbers)
+    return replace(found, places=weak_places(found, elevation, shift_ne[0, :2], sigmas))
+
+
+def weak_places(
+    found: Found, elevation: Elevation, shift_ne: Array, sigmas: Array
+) -> tuple[WeakPlace, ...]:
+    """The weak places of a survey, worst first.
+
+    Args:
+        found: the survey as measured.
+        elevation: its surface.
+        shift_ne: (2,) from the surface's origin to the plan's.
+        sigmas: (S,) of the places of good stations in the model's shape, metres; NaN if unknown.
+    """
     places = [
-        *_short_places(found), *_surface_places(found, elevation, shift_ne[0, :2]),
+        *_short_places(found),
+        *_surface_places(found, elevation, shift_ne),
         *_loose_places(found, sigmas),
-    ]  # fmt: skip
-    return replace(found, places=tuple(sorted(places, key=lambda p: -p.severity_m2)))
+    ]
+    return tuple(sorted(places, key=lambda place: -place.severity_m2))
 
 
 def measured(

@@ -14,7 +14,7 @@ from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole, find_holes
-from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
+from missions.coverage.stations import Stations, joined, plan_pattern, stations_of_plan
 from missions.fly.check import check_report
 from missions.fly.refly import refly_plan, to_see
 from missions.plan.strength import survey_costs
@@ -24,7 +24,7 @@ from missions.values.line import Line
 from missions.values.navigation import write_navigation
 from missions.values.plan_file import Plan, read_plan
 from tests.missions.coverage.logs import log_of, write_triggers
-from tests.oracles_coverage import DATUM, area_of, joined, lawnmower, plan_of
+from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 from tests.oracles_route import inside
 
 CONFIG = SurveyConfig()
