@@ -17,8 +17,8 @@ from missions.values.area import multipolygon
 from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.plan_file import Plan
-from reconstruct.revisit.links import footprints, links, pieces, views_of_floor
-from reconstruct.revisit.weak import LOOSE_SHARE, Found, WeakPlace
+from reconstruct.revisit.links import cut_around, footprints, links, pieces, views_of_floor
+from reconstruct.revisit.weak import LOOSE_SHARE, Found, WeakPlace, cells_in
 
 _ENDS = 8
 """Stations of a loose part, and of those near each, between which a tie is tried."""
@@ -129,16 +129,20 @@ def predict(found: Found, again: Plan) -> tuple[Prediction, ...]:
     grid = found.seen.grid
     after = certificate(found.plan.area, found.rig, both, found.pattern, cell_m=grid.cell_m)
     alone = certificate(found.plan.area, found.rig, new, found.pattern, cell_m=grid.cell_m)
-    piece = pieces(_links_after(found, both), found.least_tracks)
+    linked = _links_after(found, both)
+    piece = pieces(linked, found.least_tracks)
     core = np.bincount(piece[: len(old)][found.piece == 0]).argmax()
     found_left = []
     for place in found.places:
         if place.stations:
-            left = float(np.mean(piece[list(place.stations)] != core))
-            words = "tied" if left == 0 else f"{left:.0%} of its stations stay loose"
+            group = np.isin(np.arange(len(both)), place.stations)
+            held = cut_around(linked, group)
+            loose = found.piece[list(place.stations)].any()
+            before = cut_around(found.linked, group[: len(old)])
+            left = float(np.mean(piece[group] != core)) if loose else before / held
+            words = f"held by {held:.0f} tracks instead of {before:.0f}"
         else:
-            here = shapely.contains_xy(place.outline, *np.moveaxis(grid.middles_ne, -1, 0))
-            inside = np.asarray(here) & found.seen.inside
+            inside = cells_in(found.seen, place.outline)
             cured = after if place.cause == "overlap" else alone
             left = float(np.mean(~cured.at_overlap[inside])) if inside.any() else 0.0
             words = f"{1 - left:.0%} at the overlap asked for"

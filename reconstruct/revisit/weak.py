@@ -1,5 +1,6 @@
 """The weak places of a reconstructed survey, measured against what its plan asked for."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 import shapely
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, mapping
 
@@ -154,7 +156,9 @@ def find_weak(
     poses = read_track_poses(sparse / "track.csv")
     tasks = [MeasureTask(images=images, record=record) for record in records]
     judged = judge(list(executor.map(measure_file, tasks, label="picture quality")))
-    flaws = {q.image: q.reasons[0].split(":")[0] for q in judged if q.flagged}
+    # Pale is bare sand as well as haze; another dive may change nothing.
+    faults = {q.image: [reason.split(":")[0] for reason in q.reasons] for q in judged}
+    flaws = {name: words[0] for name, words in faults.items() if words and words[0] != "pale"}
     pictured = sort_stations(records, poses, flaws, taken, rig, plan, elevation, shift_ne[0, :2])
     pattern = plan_pattern(plan, rig)
     seen = certificate(plan.area, rig, pictured.good, pattern, executor=executor)
@@ -333,8 +337,11 @@ def _short_places(found: Found) -> list[WeakPlace]:
     wanted = found.pattern.passes * found.pattern.pictures
     shapes = footprints(found.rig, found.pictured.spoilt)
     places = []
-    short = found.seen.inside & ~found.seen.at_overlap
-    for hole in find_holes(found.seen, most_of_patches(found, short)):
+    seen = found.seen
+    short = seen.inside & ~seen.at_overlap
+    reached = np.minimum(seen.least_pictures / wanted, seen.least_lines / found.pattern.passes)
+    lacking_m2 = (1 - np.minimum(reached, 1.0)) * seen.grid.cell_m**2
+    for hole in find_holes(seen, most_of_patches(found, short)):
         spoilt = Counter(
             fault
             for fault, shape in zip(found.pictured.faults, shapes, strict=True)
@@ -343,18 +350,22 @@ def _short_places(found: Found) -> list[WeakPlace]:
         why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.most_common())
         some = f"{hole.fewest_pictures} of {wanted} pictures of each camera at its thinnest"
         least = "in no good picture" if hole.unseen_m2 == hole.area_m2 else some
-        lacking = 1 - min(hole.fewest_pictures / wanted, 1.0)
-        partly = (hole.area_m2 - hole.unseen_m2) * max(lacking, 1 / wanted) / 2
         places.append(
             WeakPlace(
                 cause="overlap",
                 reason=f"{least}; {why or 'no picture was taken'}",
                 outline=hole.outline,
                 area_m2=hole.area_m2,
-                severity_m2=hole.unseen_m2 + partly,
+                severity_m2=float(lacking_m2[cells_in(seen, hole.outline)].sum()),
             )
         )
     return places
+
+
+def cells_in(seen: Certificate, outline: MultiPolygon) -> NDArray[np.bool_]:
+    """Which cells of a certificate, (rows, columns), have their middle in a part of the area."""
+    within = shapely.contains_xy(outline, *np.moveaxis(seen.grid.middles_ne, -1, 0))
+    return np.asarray(within) & seen.inside
 
 
 def most_of_patches(found: Found, lacking: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -417,9 +428,15 @@ def _loose_places(found: Found, sigmas: Array) -> list[WeakPlace]:
     groups = [
         (found.piece == number, "") for number in range(1, int(found.piece.max(initial=0)) + 1)
     ]
-    unsure = (sigmas > found.sigma_goal_m) & (found.piece == 0)
-    if unsure.any():
-        groups.append((unsure, f"sigma of their places up to {1e3 * sigmas[unsure].max():.1f} mm"))
+    usual_m = float(np.nanmedian(sigmas)) if np.isfinite(sigmas).any() else np.nan
+    limit_m = math.hypot(usual_m, found.sigma_goal_m)
+    unsure = np.flatnonzero((sigmas > limit_m) & (found.piece == 0))
+    parts = connected_components(found.linked[unsure][:, unsure], directed=False)[1]
+    for part in range(int(parts.max(initial=-1)) + 1):
+        group = np.isin(np.arange(len(sigmas)), unsure[parts == part])
+        worst_m = float(sigmas[group].max())
+        why = f"sigma of their places {1e3 * worst_m:.1f} mm, the median is {1e3 * usual_m:.1f}"
+        groups.append((group, why))
     places = []
     for group, why in groups:
         outline = multipolygon(
@@ -428,7 +445,7 @@ def _loose_places(found: Found, sigmas: Array) -> list[WeakPlace]:
         cut = cut_around(found.linked, group)
         short = max(0.0, 1 - cut / found.least_tracks)
         if why:
-            short = float(1 - found.sigma_goal_m / sigmas[group].max())
+            short = 1 - limit_m / float(sigmas[group].max())
         if outline.area:
             usual = f"{found.least_tracks:.0f} is half of what the plan's weakest picture has"
             places.append(

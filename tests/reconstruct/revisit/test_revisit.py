@@ -1,7 +1,9 @@
 """Weak places of surveys whose tracks are drawn on a flat sea floor, and the dive over them."""
 
 import itertools
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +48,12 @@ def tracks(stations: Stations, seed: int = 0, matched: float = 0.5) -> sp.csr_ar
     return sp.csr_array((seen & (rng.random(seen.shape) < matched)).astype(np.float64))
 
 
-def surveyed(good: NDArray[np.bool_], spoilt: NDArray[np.bool_], **others: object) -> Found:
+def surveyed(
+    good: NDArray[np.bool_],
+    spoilt: NDArray[np.bool_],
+    rough: tuple[slice, slice] = np.s_[:0, :0],
+    sigmas: Any = math.nan,
+) -> Found:
     pictured = Pictured(
         good=FLOWN.some(good),
         numbers=np.flatnonzero(good),
@@ -59,10 +66,10 @@ def surveyed(good: NDArray[np.bool_], spoilt: NDArray[np.bool_], **others: objec
         PLAN, RIG, pattern, pictured, seen, tracks(pictured.good), GOAL_M, (0, 0), ()
     )  # fmt: skip
     sigma = np.full((100, 100), 0.5 * GOAL_M)
-    sigma[others.get("rough", slice(0, 0))] = 4 * GOAL_M
+    sigma[rough] = 4 * GOAL_M
     surface = Elevation(height=0 * sigma, sigma=sigma, west=-1.0, north=9.0, cell=0.1)
-    sigmas = np.full(int(good.sum()), np.nan)
-    return replace(found, places=weak_places(found, surface, np.zeros(2), sigmas))
+    known = np.broadcast_to(np.asarray(sigmas, np.float64), int(good.sum()))
+    return replace(found, places=weak_places(found, surface, np.zeros(2), known))
 
 
 def dive_over(found: Found) -> Plan:
@@ -151,6 +158,22 @@ def test_a_rough_patch_of_the_surface_is_flown_again() -> None:
     again = dive_over(found)
     assert again.stations < 0.25 * PLAN.stations
     assert predict(found, again)[0].left <= 0.01
+
+
+def test_a_strip_whose_place_is_less_sure_than_the_rest_gets_a_line() -> None:
+    everything = np.ones(len(FLOWN), bool)
+    strip = FLOWN.line == 0
+    sigmas = np.where(strip, 3.0, 0.5) * GOAL_M
+
+    found = surveyed(everything, ~everything, sigmas=sigmas)
+
+    (place,) = found.places
+    assert place.cause == "loose"
+    np.testing.assert_array_equal(place.stations, np.flatnonzero(strip))
+    assert 0 < place.severity_m2 < place.area_m2
+    (cure,) = predict(found, dive_over(found))
+    assert 0.2 < cure.left < 0.95
+    assert surveyed(everything, ~everything, sigmas=0.9 * sigmas[strip][0]).places == ()
 
 
 def test_the_goal_for_heights_is_a_pixel_of_one_pair() -> None:
