@@ -14,7 +14,7 @@ from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
-from missions.coverage.geofiles import write_coverage_tif, write_holes
+from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.write import counted
@@ -206,7 +206,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
     from missions.coverage.drawing import draw_certificate
 
     folder.mkdir(parents=True, exist_ok=True)
-    write_holes(folder / "holes.geojson", check.flown, check.holes)
+    write_outlines(folder / "holes.geojson", check.plan.datum, check.holes)
     write_coverage_tif(folder / "coverage.tif", check.flown)
     draw_certificate(
         folder / "coverage.png", check.flown, check.holes, f"{check.plan.name}: as flown",

@@ -113,8 +113,8 @@ def _line(start: Array, end: Array, plan: Plan) -> Line | None:
     )  # fmt: skip
 
 
-def predict(found: Found, again: Plan) -> tuple[Prediction, ...]:
-    """What a dive, flown exactly, leaves of each weak place.
+def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], int]:
+    """What a dive, flown exactly, leaves of each weak place, and how many of its stations join.
 
     Pictures that see each place, and tracks by the overlap of footprints with the tracks that this
     survey's overlaps had. This is the one place where a prediction of sigmas is to be called.
@@ -147,15 +147,7 @@ def predict(found: Found, again: Plan) -> tuple[Prediction, ...]:
             left = float(np.mean(~cured.at_overlap[inside])) if inside.any() else 0.0
             words = f"{1 - left:.0%} at the overlap asked for"
         found_left.append(Prediction(left=left, text=words))
-    return tuple(found_left)
-
-
-def joins(found: Found, again: Plan) -> int:
-    """How many stations of a dive, flown exactly, are predicted to join the model."""
-    old = found.pictured.good
-    piece = pieces(_links_after(found, joined(old, stations_of_plan(again))), found.least_tracks)
-    core = np.bincount(piece[: len(old)][found.piece == 0]).argmax()
-    return int((piece[len(old) :] == core).sum())
+    return tuple(found_left), int((piece[len(old) :] == core).sum())
 
 
 def _links_after(found: Found, both: Stations) -> Any:

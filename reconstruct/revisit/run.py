@@ -1,11 +1,10 @@
 """`alice-survey plan revisit`: the weak places of a reconstructed survey, and a dive over them."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import atomic_path, write_json
+from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.executor import Executor
@@ -17,13 +16,14 @@ from missions.coverage.drawing import (
     map_sheet,
     number_place,
 )
+from missions.coverage.geofiles import write_outlines
 from missions.exports.write import counted
 from missions.fly.check import rig_of
 from missions.fly.refly import write_refly
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
-from reconstruct.revisit.dive import Prediction, joins, plan_revisit, predict
+from reconstruct.revisit.dive import Prediction, plan_revisit, predict
 from reconstruct.revisit.weak import Found, find_weak
 
 _COLOURS = {"overlap": "#c0392b", "surface": "#d68910", "loose": "#7d3c98"}
@@ -71,20 +71,17 @@ def revisit_report(
         except PlanError as error:
             warn(f"the weak places cannot be planned again: {error}")
         else:
-            cures = predict(found, again)
+            cures, joining = predict(found, again)
             words, dive = write_refly(
                 folder / "dive", again, rig, config.camera, config.water, config.plan
             )
-            dive["joining_stations"] = joins(found, again)
+            dive["joining_stations"] = joining
             words = _dive_text(found, dive, words, cures)
     elif (folder / "dive").exists():
         warn(f"{folder / 'dive'} is of an earlier revisit: nothing is weak now")
     data = {**_json(found, cures), "dive": dive}
     folder.mkdir(parents=True, exist_ok=True)
-    features = [place.feature(found.plan.datum) for place in found.places]
-    with atomic_path(folder / "weak.geojson") as temporary:
-        collection = {"type": "FeatureCollection", "features": features}
-        temporary.write_text(json.dumps(collection, indent=1) + "\n", encoding="utf-8")
+    write_outlines(folder / "weak.geojson", found.plan.datum, found.places)
     write_json(folder / "revisit.json", data)
     _draw(folder / "weak.png", found, again)
     text = f"{_text(found, cures)}{words}\n{folder}: weak.geojson, weak.png, revisit.json"
@@ -97,9 +94,9 @@ def _json(found: Found, cures: Sequence[Prediction]) -> dict[str, Any]:
         place |= {"predicted_left": round(cure.left, 4), "predicted": cure.text}
     return {
         "plan": found.plan.name,
-        "registered": found.registered[0],
-        "pictures": found.registered[1],
-        "models": list(found.models),
+        "registered": found.record.registered,
+        "pictures": found.record.total,
+        "models": list(found.record.models),
         "stations": len(found.pictured.good),
         "stations_spoilt": len(found.pictured.spoilt),
         "share_at_overlap": found.seen.share_at_overlap,
@@ -118,13 +115,13 @@ def _json(found: Found, cures: Sequence[Prediction]) -> dict[str, Any]:
 def _text(found: Found, cures: Sequence[Prediction]) -> str:
     good, spoilt = len(found.pictured.good), len(found.pictured.spoilt)
     lines = [
-        f"{found.plan.name}: {found.registered[0]} of {found.registered[1]} pictures in the model; "
-        f"{good} of {counted(good + spoilt, 'station')} of use, they see "
+        f"{found.plan.name}: {found.record.registered} of {found.record.total} pictures in the "
+        f"model; {good} of {counted(good + spoilt, 'station')} of use, they see "
         f"{found.seen.covered_share:.2%} and {found.seen.share_at_overlap:.2%} at the overlap "
         "asked for"
     ]
-    if len(found.models) > 1:
-        sizes = " and ".join(map(str, found.models))
+    if len(found.record.models) > 1:
+        sizes = " and ".join(map(str, found.record.models))
         lines.append(f"pictures that were not joined: models of {sizes} pictures")
     if not found.places:
         return "\n".join([*lines, "nothing is weak"])

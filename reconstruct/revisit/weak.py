@@ -18,7 +18,7 @@ from shapely.geometry import MultiPolygon, mapping
 
 from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import Executor
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord, read_manifest
 from alice_survey.base.records import RegistrationRecord
@@ -116,9 +116,7 @@ class Found:
     piece: NDArray[np.int64]
     """(S,) of the good stations; the largest, 0, is what the others are loose from."""
     sigma_goal_m: float
-    registered: tuple[int, int]
-    """Pictures in the model, and in all."""
-    models: tuple[int, ...]
+    record: RegistrationRecord
     places: tuple[WeakPlace, ...]
     """Worst first."""
 
@@ -160,8 +158,6 @@ def find_weak(
     faults = {q.image: [reason.split(":")[0] for reason in q.reasons] for q in judged}
     flaws = {name: words[0] for name, words in faults.items() if words and words[0] != "pale"}
     pictured = sort_stations(records, poses, flaws, taken, rig, plan, elevation, shift_ne[0, :2])
-    pattern = plan_pattern(plan, rig)
-    seen = certificate(plan.area, rig, pictured.good, pattern, executor=executor)
     number_of = {int(number): row for row, number in enumerate(pictured.numbers)}
     station = np.array([number_of.get(view.station, -1) for view in model.views])
     tracks = model.observations[station[model.observations[:, 1]] >= 0]
@@ -170,10 +166,9 @@ def find_weak(
         shape=(len(pictured.good), len(model.points_world)),
     )
     views.data[:] = 1.0  # two cameras of a station may see a point
-    record = RegistrationRecord.read(sparse / "registration.json")
     found = measured(
-        plan, rig, pattern, pictured, seen, views, sigma_goal_m or pair_sigma_m(plan, rig),
-        (record.registered, record.total), record.models,
+        plan, rig, pictured, views, sigma_goal_m or pair_sigma_m(plan, rig),
+        RegistrationRecord.read(sparse / "registration.json"), executor,
     )  # fmt: skip
     sigmas = _station_sigmas(sparse, pictured.numbers)
     return replace(found, places=weak_places(found, elevation, shift_ne[0, :2], sigmas))
@@ -201,27 +196,24 @@ def weak_places(
 def measured(
     plan: Plan,
     rig: Rig,
-    pattern: Pattern,
     pictured: Pictured,
-    seen: Certificate,
     views: sp.csr_array,
     sigma_goal_m: float,
-    registered: tuple[int, int],
-    models: Sequence[int],
+    record: RegistrationRecord,
+    executor: Executor = SERIAL,
 ) -> Found:
-    """How the stations of a survey hang together, next to how those of its plan would.
+    """What the stations of a survey see, and how they hang together next to those of its plan.
 
     Args:
         plan: what was asked for.
         rig: its cameras.
-        pattern: of the plan's lines.
         pictured: its stations.
-        seen: the certificate of the good ones.
         views: (S, P) which good stations see each track.
         sigma_goal_m: largest sigma of heights that is good enough.
-        registered: pictures in the model, and in all.
-        models: pictures in each model that was found.
+        record: of the model.
+        executor: where what is seen is counted.
     """
+    pattern = plan_pattern(plan, rig)
     camera = rig.cameras[rig.reference]
     step_m = min(footprint_size_m(camera, plan.altitude_m)) / _LATTICE
     linked = links(views)
@@ -235,10 +227,10 @@ def measured(
     ideal = links(views_of_floor(footprints(rig, stations_of_plan(plan)), step_m)).sum(axis=0)
     least = LOOSE_SHARE * per_point * float(ideal.min())
     return Found(
-        plan=plan, rig=rig, pattern=pattern, pictured=pictured, seen=seen, linked=linked,
+        plan=plan, rig=rig, pattern=pattern, pictured=pictured, linked=linked, record=record,
+        seen=certificate(plan.area, rig, pictured.good, pattern, executor=executor),
         tracks_per_point=per_point, step_m=step_m, least_tracks=least,
-        piece=pieces(linked, least), sigma_goal_m=sigma_goal_m, registered=registered,
-        models=tuple(models), places=(),
+        piece=pieces(linked, least), sigma_goal_m=sigma_goal_m, places=(),
     )  # fmt: skip
 
 

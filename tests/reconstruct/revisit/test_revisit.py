@@ -12,14 +12,15 @@ import shapely
 from numpy.typing import NDArray
 
 from alice_survey.base.config import SurveyConfig
+from alice_survey.base.records import RegistrationRecord
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
-from missions.coverage.stations import Stations, joined, plan_pattern, stations_of_plan
+from missions.coverage.stations import Stations, joined, stations_of_plan
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.revisit.dive import joins, plan_revisit, predict
+from reconstruct.revisit.dive import plan_revisit, predict
 from reconstruct.revisit.links import cut_around, footprints, links, pieces
 from reconstruct.revisit.weak import Found, Pictured, measured, pair_sigma_m, weak_places
 from tests.oracles_coverage import area_of, lawnmower, plan_of
@@ -27,6 +28,9 @@ from tests.oracles_coverage import area_of, lawnmower, plan_of
 CONFIG = SurveyConfig()
 RIG = design_rig(CONFIG.camera, CONFIG.water)
 GOAL_M = 0.003
+RECORD = RegistrationRecord(
+    registered=0, total=0, points=0, mean_reprojection_px=0, mean_track_length=0, scale_source=None
+)
 PLAN = replace(
     plan_of(area_of(shapely.box(0, 0, 8, 6)), lawnmower(8.0, 6.0, 0.7, 0.46)), line_spacing_m=0.7
 )
@@ -60,11 +64,7 @@ def surveyed(
         spoilt=FLOWN.some(spoilt),
         faults=("not in the model (blurred)",) * int(spoilt.sum()),
     )
-    pattern = plan_pattern(PLAN, RIG)
-    seen = certificate(PLAN.area, RIG, pictured.good, pattern)
-    found = measured(
-        PLAN, RIG, pattern, pictured, seen, tracks(pictured.good), GOAL_M, (0, 0), ()
-    )  # fmt: skip
+    found = measured(PLAN, RIG, pictured, tracks(pictured.good), GOAL_M, RECORD)
     sigma = np.full((100, 100), 0.5 * GOAL_M)
     sigma[rough] = 4 * GOAL_M
     surface = Elevation(height=0 * sigma, sigma=sigma, west=-1.0, north=9.0, cell=0.1)
@@ -135,8 +135,9 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     again = dive_over(found)
 
     assert 0.1 * PLAN.stations < again.stations < 0.6 * PLAN.stations
-    assert joins(found, again) == again.stations
-    assert max(cure.left for cure in predict(found, again)) <= 0.01
+    cures, joining = predict(found, again)
+    assert joining == again.stations
+    assert max(cure.left for cure in cures) <= 0.01
     # What is predicted happens: to coverage, and to tracks that are drawn again.
     both = joined(found.pictured.good, stations_of_plan(again))
     after = certificate(PLAN.area, RIG, both, found.pattern)
@@ -157,7 +158,7 @@ def test_a_rough_patch_of_the_surface_is_flown_again() -> None:
     assert shapely.box(3.9, 1.9, 5.1, 3.6).covers(place.outline)
     again = dive_over(found)
     assert again.stations < 0.25 * PLAN.stations
-    assert predict(found, again)[0].left <= 0.01
+    assert predict(found, again)[0][0].left <= 0.01
 
 
 def test_a_strip_whose_place_is_less_sure_than_the_rest_gets_a_line() -> None:
@@ -171,7 +172,7 @@ def test_a_strip_whose_place_is_less_sure_than_the_rest_gets_a_line() -> None:
     assert place.cause == "loose"
     np.testing.assert_array_equal(place.stations, np.flatnonzero(strip))
     assert 0 < place.severity_m2 < place.area_m2
-    (cure,) = predict(found, dive_over(found))
+    ((cure,), _) = predict(found, dive_over(found))
     assert 0.2 < cure.left < 0.95
     assert surveyed(everything, ~everything, sigmas=0.9 * sigmas[strip][0]).places == ()
 
