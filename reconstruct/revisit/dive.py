@@ -139,7 +139,7 @@ def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], int]:
             held = cut_around(linked, group)
             loose = found.piece[list(place.stations)].any()
             before = cut_around(found.linked, group[: len(old)])
-            left = float(np.mean(piece[group] != core)) if loose else before / held
+            left = float(np.mean(piece[group] != core)) if loose else before / max(held, 1e-9)
             words = f"held by {held:.0f} tracks instead of {before:.0f}"
         else:
             inside = cells_in(found.seen, place.outline)

@@ -76,7 +76,7 @@ def revisit_report(
                 folder / "dive", again, rig, config.camera, config.water, config.plan
             )
             dive["joining_stations"] = joining
-            words = _dive_text(found, dive, words, cures)
+            words = _dive_text(workspace, found, dive, words, cures)
     elif (folder / "dive").exists():
         warn(f"{folder / 'dive'} is of an earlier revisit: nothing is weak now")
     data = {**_json(found, cures), "dive": dive}
@@ -140,7 +140,13 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     return "\n".join(lines)
 
 
-def _dive_text(found: Found, dive: dict[str, Any], words: str, cures: Sequence[Prediction]) -> str:
+def _dive_text(
+    workspace: Path,
+    found: Found,
+    dive: dict[str, Any],
+    words: str,
+    cures: Sequence[Prediction],
+) -> str:
     cured = sum(
         place.severity_m2 * (1 - cure.left) for place, cure in zip(found.places, cures, strict=True)
     )
@@ -148,7 +154,7 @@ def _dive_text(found: Found, dive: dict[str, Any], words: str, cures: Sequence[P
     return (
         f"\nthe dive over them: {words}; {dive['joining_stations']} of its stations are predicted "
         f"to join the model, {cured / whole:.0%} of the weakness to be cured: {dive['folder']}\n"
-        f"when it is flown: alice-survey join WORKSPACE {dive['folder']} -w BOTH"
+        f"with its pictures: alice-survey join {workspace} {dive['folder']} -w BOTH"
     )
 
 

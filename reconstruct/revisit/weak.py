@@ -383,25 +383,27 @@ def _surface_places(found: Found, elevation: Elevation, shift_ne: Array) -> list
     sigma = elevation.at(elevation.sigma, places_en).reshape(seen.grid.shape)
     unsure = ~(sigma <= found.sigma_goal_m)
     weak = most_of_patches(found, unsure & seen.at_overlap)
-    found_places = []
+    lacking = np.where(np.isfinite(sigma), np.maximum(0.0, 1 - found.sigma_goal_m / sigma), 1.0)
+    places = []
     for hole in find_holes(seen, weak):
-        row, column = np.floor(seen.grid.cells_of(np.array(hole.place_ne))).astype(int)
-        typical = float(sigma[row, column])
-        known = np.isfinite(typical)
-        goal = f"{1e3 * found.sigma_goal_m:.1f} mm are asked for"
-        found_places.append(
+        here = cells_in(seen, hole.outline)
+        known = here & np.isfinite(sigma)
+        reason = "no surface"
+        if 2 * known.sum() > here.sum():
+            reason = (
+                f"sigma of heights {1e3 * np.median(sigma[known]):.1f} mm where "
+                f"{1e3 * found.sigma_goal_m:.1f} mm are asked for"
+            )
+        places.append(
             WeakPlace(
                 cause="surface",
-                reason=f"sigma of heights {1e3 * typical:.1f} mm where {goal}"
-                if known
-                else "no surface",
+                reason=reason,
                 outline=hole.outline,
                 area_m2=hole.area_m2,
-                severity_m2=hole.area_m2
-                * (max(0.0, 1 - found.sigma_goal_m / typical) if known else 1.0),
+                severity_m2=float(lacking[here].sum()) * seen.grid.cell_m**2,
             )
         )
-    return found_places
+    return places
 
 
 def _station_sigmas(sparse: Path, numbers: NDArray[np.int64]) -> Array:
