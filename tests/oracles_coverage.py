@@ -52,17 +52,6 @@ def pinhole_rig(across_m: float, along_m: float, baseline_m: float | None = None
     )
 
 
-def joined(first: Stations, second: Stations) -> Stations:
-    """The stations of two dives; lines of the second count on."""
-    after = int(first.line.max(initial=-1)) + 1
-    return Stations(
-        glass_ne=np.concatenate([first.glass_ne, second.glass_ne]),
-        altitude_m=np.concatenate([first.altitude_m, second.altitude_m]),
-        attitude_rad=np.concatenate([first.attitude_rad, second.attitude_rad]),
-        line=np.concatenate([first.line, np.where(second.line < 0, -1, second.line + after)]),
-    )
-
-
 def shifted(stations: Stations, north_m: float, east_m: float) -> Stations:
     """The same stations elsewhere."""
     return replace(stations, glass_ne=stations.glass_ne + np.array([north_m, east_m]))

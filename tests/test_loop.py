@@ -16,7 +16,12 @@ import numpy as np
 import pytest
 import rasterio
 
+from alice_survey.base.config import load_config
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import SERIAL
 from alice_survey.stages import STAGES
+from missions.values.plan_file import read_plan
+from reconstruct.revisit.run import revisit_report
 from tests.small_survey import settings_in, start
 
 pytestmark = pytest.mark.slow
@@ -50,6 +55,26 @@ def test_the_small_survey_is_reconstructed(undisturbed: Path) -> None:
     assert score["mosaic"]["coverage"] > 0.9
     assert score["mosaic"]["position_median_mm"] < 8
     assert score["overlaps"]["forward_mean"] == pytest.approx(0.6, abs=0.06)
+
+
+def test_a_sound_survey_has_no_weak_place_unless_more_is_asked_for(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    config = load_config(undisturbed / "survey.toml")
+
+    text, sound = revisit_report(undisturbed, config, SERIAL, out=tmp_path / "sound")
+    _, asked = revisit_report(undisturbed, config, SERIAL, sigma_mm=0.1, out=tmp_path / "asked")
+
+    assert sound["places"] == []
+    assert "nothing is weak" in text
+    assert "surface" in {place["cause"] for place in asked["places"]} <= {"surface", "loose"}
+    assert asked["weak_m2"] > 0.9 * 1.3 * 1.5
+    again = read_plan(tmp_path / "asked" / "dive" / "plan" / "plan.json")
+    assert asked["dive"]["joining_stations"] == again.stations
+    drawn = json.loads((tmp_path / "asked" / "weak.geojson").read_text())
+    assert len(drawn["features"]) == len(asked["places"])
+    with pytest.raises(WorkspaceError, match="alice-survey plan"):
+        revisit_report(tmp_path, config, SERIAL)
 
 
 def test_every_stage_is_reported(undisturbed: Path) -> None:

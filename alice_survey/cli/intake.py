@@ -74,6 +74,21 @@ def import_images(
     typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
 
 
+@app.command(epilog=examples("join reef reef/revisit/dive -w both", "join day1 day2 day3 -w reef"))
+def join(
+    dives: Annotated[list[Path], typer.Argument(metavar="DIVE...", help="Their workspaces.")],
+    workspace: Workspace = WORK,
+) -> None:
+    """Bring the pictures of several dives together.
+
+    One workspace whose 'reconstruct' makes one model of all. The dives share one rig.
+    """
+    from reconstruct.pictures.joining import join_dives
+
+    found = join_dives(workspace, dives)
+    typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
+
+
 @app.command(
     name="import-log",
     epilog=examples(

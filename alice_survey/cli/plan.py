@@ -29,6 +29,7 @@ app = typer.Typer(
         "plan solve -w reef --resolution 0.5",
         "plan gain 'control/*.jpg'",
         "plan check navigation.csv -w reef",
+        "plan revisit -w reef",
         "plan export -w reef --format cola2 --format wpl",
     ),
 )
@@ -161,6 +162,35 @@ def check(
         ),
         as_json,
     )  # fmt: skip
+
+
+@app.command(epilog=examples("plan revisit -w reef", "plan revisit -w reef --sigma 5 --json"))
+def revisit(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    sigma: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3, help="Sigma of heights to reach, mm; of a pair matched to 1 px if not given."
+        ),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Plan another dive over what the model lacks.
+
+    Lists the weak places of a reconstructed survey with their causes, draws them, and writes a
+    plan that flies them again, with what it is predicted to cure.
+    """
+    from alice_survey.survey import settings
+    from reconstruct.revisit.run import revisit_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(
+        *revisit_report(workspace, config, executor_of(threads), sigma_mm=sigma, out=output),
+        as_json,
+    )
 
 
 @app.command(

@@ -10,7 +10,7 @@ from urllib.parse import unquote_to_bytes
 from alice_survey.base.artefacts import STAGE_FILE
 from alice_survey.stages import LOOSE_FOLDERS, STAGES
 
-PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check")
+PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check", "revisit")
 """Folders that are shown."""
 _LOOSE_FILES = ("survey.toml",)
 _LONGEST_PATH = 2000

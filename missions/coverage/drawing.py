@@ -81,7 +81,7 @@ def draw_certificate(
         label = "" if index else "below the requested overlap"
         draw_polygons(axes, hole.outline, label, edgecolor=_HOLE, lw=1.6)
         if index < _NUMBERED:
-            _number(axes, hole, index + 1)
+            number_place(axes, hole.place_ne, index + 1, _HOLE)
     finish_map(figure, axes, certificate.area.datum, title, _figures(certificate, holes))
     save_figure(figure, path)
 
@@ -223,11 +223,12 @@ def _pixels(area: Area, cell_m: float) -> tuple[Array, tuple[float, float, float
     return np.stack(at, axis=-1), extent
 
 
-def _number(axes: Axes, hole: Hole, number: int) -> None:
+def number_place(axes: Axes, place_ne: tuple[float, float], number: int, colour: str) -> None:
+    """A number in a disc."""
     axes.annotate(
-        str(number), xy=hole.place_ne[::-1], ha="center", va="center", fontsize=8, weight="bold",
+        str(number), xy=place_ne[::-1], ha="center", va="center", fontsize=8, weight="bold",
         color="white", zorder=8,
-        bbox={"boxstyle": "circle,pad=0.22", "fc": _HOLE, "ec": "white", "lw": 0.8},
+        bbox={"boxstyle": "circle,pad=0.22", "fc": colour, "ec": "white", "lw": 0.8},
     )  # fmt: skip
 
 

@@ -3,14 +3,14 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.frames import Array
+from alice_survey.base.frames import Array, Datum
 from missions.coverage.certificate import Certificate
-from missions.coverage.holes import Hole
 
 NO_DATA = 65535
 """Outside of the area."""
@@ -71,9 +71,17 @@ def write_coverage_tif(path: Path, certificate: Certificate) -> None:
             raster.set_band_description(band, text)
 
 
-def write_holes(path: Path, certificate: Certificate, holes: Sequence[Hole]) -> None:
-    """Write the holes, RFC 7946 (WGS 84)."""
-    features = [hole.feature(certificate.area.datum) for hole in holes]
+class Outlined(Protocol):
+    """What has an outline to be drawn on a map."""
+
+    def feature(self, datum: Datum) -> dict[str, Any]:
+        """It as a GeoJSON feature, WGS 84."""
+        ...
+
+
+def write_outlines(path: Path, datum: Datum, places: Sequence[Outlined]) -> None:
+    """Write holes or weak places, RFC 7946 (WGS 84)."""
+    features = [place.feature(datum) for place in places]
     with atomic_path(path) as temporary:
         text = json.dumps(
             {"type": "FeatureCollection", "features": features}, indent=1, allow_nan=False

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, mapping
 
 from alice_survey.base.frames import Array, Datum
@@ -58,15 +59,23 @@ class Hole:
         }
 
 
-def find_holes(certificate: Certificate) -> tuple[Hole, ...]:
+def find_holes(
+    certificate: Certificate, short: NDArray[np.bool_] | None = None
+) -> tuple[Hole, ...]:
     """The holes of a certificate: first what is unseen most, then what is largest.
 
     Cells that touch at a corner belong to one hole.
+
+    Args:
+        certificate: what is seen.
+        short: (rows, columns) cells that lack something; left out, those that are not covered at
+            the overlap requested.
     """
     import cv2
     from rasterio import features
 
-    short = certificate.inside & ~certificate.at_overlap
+    if short is None:
+        short = certificate.inside & ~certificate.at_overlap
     if not short.any():
         return ()
     count, labels = cv2.connectedComponents(short.astype(np.uint8), connectivity=8)

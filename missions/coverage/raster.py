@@ -47,6 +47,12 @@ class Grid:
         c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
         return np.array([[c, s], [-s, c]])
 
+    @cached_property
+    def middles_ne(self) -> Array:
+        """(rows, columns, 2): north and east of the middles of the cells."""
+        row, column = np.indices(self.shape) + 0.5
+        return self.places_of(np.stack([row, column], axis=-1))
+
     def cells_of(self, points_ne: Array) -> Array:
         """Row and column, (..., 2), of places (..., 2); the middle of a cell is at a half."""
         cells: Array = (points_ne - np.array(self.origin_ne)) @ self.axes.T / self.cell_m

@@ -114,6 +114,17 @@ def stations_of_flight(flight: "Flight") -> Stations:
     )
 
 
+def joined(first: Stations, second: Stations) -> Stations:
+    """The stations of two dives, without times; lines of the second count on."""
+    after = int(first.line.max(initial=-1)) + 1
+    return Stations(
+        glass_ne=np.concatenate([first.glass_ne, second.glass_ne]),
+        altitude_m=np.concatenate([first.altitude_m, second.altitude_m]),
+        attitude_rad=np.concatenate([first.attitude_rad, second.attitude_rad]),
+        line=np.concatenate([first.line, np.where(second.line < 0, -1, second.line + after)]),
+    )
+
+
 def plan_pattern(plan: Plan, rig: Rig) -> Pattern:
     """The pattern that a plan's lines follow."""
     return sure_pattern(rig, plan.altitude_m, plan.line_spacing_m, plan.station_spacing_m)

@@ -1,29 +1,26 @@
 """`alice-survey plan check`: what a dive has seen, which holes are left, and a plan for these."""
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
-from alice_survey.base.config import CameraConfig, PlanConfig, SurveyConfig, WaterConfig
+from alice_survey.base.artefacts import need_stage, write_json
+from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
-from missions.coverage.geofiles import write_coverage_tif, write_holes
+from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exports.options import options_of
-from missions.exports.write import counted, write_exports
+from missions.exports.write import counted
 from missions.fly.monte_carlo import MonteCarlo
 from missions.fly.monte_carlo import monte_carlo as fly_often
-from missions.fly.refly import refly_plan
+from missions.fly.refly import refly_plan, to_see, write_refly
 from missions.fly.simulation import flight_settings, floor_grid
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
@@ -162,8 +159,9 @@ def check_report(
             plan = refly_plan(
                 check.plan,
                 check.rig,
-                check.flown,
-                check.holes,
+                to_see(check.plan.area, check.flown, check.holes),
+                check.flown.pattern,
+                name=f"{check.plan.name} holes",
                 costs=survey_costs(config),
                 settings=config.plan,
                 usable_wh=usable_wh(config.vehicle),
@@ -171,11 +169,13 @@ def check_report(
         except PlanError as error:
             warn(f"the holes cannot be planned again: {error}")
         else:
-            again = _write_refly(
-                folder / "refly", plan, check, config.camera, config.water, config.plan
+            words, data["refly"] = write_refly(
+                folder / "refly", plan, rig, config.camera, config.water, config.plan
             )
-            data["refly"] = again
-            text += _refly_text(again)
+            text += (
+                f"\nto fly the holes again: {words}; then {plan.coverage:.2%} of them are at that "
+                f"overlap: {folder / 'refly'}"
+            )
     if monte_carlo:
         terrain = survey_terrain(
             config.seafloor,
@@ -206,55 +206,13 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
     from missions.coverage.drawing import draw_certificate
 
     folder.mkdir(parents=True, exist_ok=True)
-    write_holes(folder / "holes.geojson", check.flown, check.holes)
+    write_outlines(folder / "holes.geojson", check.plan.datum, check.holes)
     write_coverage_tif(folder / "coverage.tif", check.flown)
     draw_certificate(
         folder / "coverage.png", check.flown, check.holes, f"{check.plan.name}: as flown",
         check.record.stations,
     )  # fmt: skip
     write_json(folder / "certificate.json", data)
-
-
-def _write_refly(
-    folder: Path,
-    plan: Plan,
-    check: Check,
-    camera: CameraConfig,
-    water: WaterConfig,
-    settings: PlanConfig,
-) -> dict[str, Any]:
-    """Write the plan of the holes as a workspace to fly in."""
-    values = plan.to_json()
-    text = json.dumps(values, sort_keys=True)
-    stage = Stage(
-        name="plan",
-        version=1,
-        settings={
-            "camera": camera.model_dump(mode="json"),
-            "water": water.model_dump(mode="json"),
-            "plan": settings.model_dump(mode="json"),
-            "refly_of": check.plan.name,
-            "digest": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
-        },
-    )
-
-    def work(part: Path) -> None:
-        write_json(part / "plan.json", values)
-        options = options_of(camera, settings)
-        write_exports(part / "exports", plan, check.rig, options=options)
-
-    run_stage(folder, stage, work)
-    return {
-        "folder": str(folder),
-        "lines": len(plan.lines),
-        "stations": plan.stations,
-        "dives": len(plan.dives),
-        "length_m": plan.length_m,
-        "duration_s": plan.duration_s,
-        "energy_wh": plan.energy_wh,
-        "coverage": plan.coverage,
-        "area_m2": plan.area.survey.area,
-    }
 
 
 def _draw_flights(folder: Path, plan: Plan, result: MonteCarlo) -> None:
@@ -332,16 +290,6 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
         rest = sum(hole.area_m2 for hole in holes[_LISTED:])
         rows.append(f"  and {len(holes) - _LISTED} more, {rest:.2f} m2 in all (certificate.json)")
     return rows
-
-
-def _refly_text(again: dict[str, Any]) -> str:
-    return (
-        f"\nto fly the holes again: {counted(again['lines'], 'line')}, "
-        f"{counted(again['stations'], 'station')}, "
-        f"{again['length_m']:.0f} m, {again['duration_s'] / 60:.0f} min in "
-        f"{counted(again['dives'], 'dive')}; then {again['coverage']:.2%} of them are at that "
-        f"overlap: {again['folder']}"
-    )
 
 
 def _flights_text(result: MonteCarlo) -> str:

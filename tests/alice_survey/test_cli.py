@@ -23,7 +23,7 @@ from camera_calib.rig import design_rig, write_rig
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-log", "measure",
-    "control", "quality", "mosaic-tiles", "report", "view",
+    "control", "quality", "mosaic-tiles", "report", "view", "join",
 )  # fmt: skip
 
 

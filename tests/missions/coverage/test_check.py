@@ -14,9 +14,9 @@ from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole, find_holes
-from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
+from missions.coverage.stations import Stations, joined, plan_pattern, stations_of_plan
 from missions.fly.check import check_report
-from missions.fly.refly import refly_plan
+from missions.fly.refly import refly_plan, to_see
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.route.ways import Ways
@@ -24,7 +24,7 @@ from missions.values.line import Line
 from missions.values.navigation import write_navigation
 from missions.values.plan_file import Plan, read_plan
 from tests.missions.coverage.logs import log_of, write_triggers
-from tests.oracles_coverage import DATUM, area_of, joined, lawnmower, plan_of
+from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 from tests.oracles_route import inside
 
 CONFIG = SurveyConfig()
@@ -33,7 +33,7 @@ RIG = design_rig(CONFIG.camera, CONFIG.water)
 
 def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
     return refly_plan(
-        plan, RIG, flown, holes,
+        plan, RIG, to_see(plan.area, flown, holes), flown.pattern, name="holes",
         costs=survey_costs(CONFIG), settings=CONFIG.plan, usable_wh=usable_wh(CONFIG.vehicle),
     )  # fmt: skip
 

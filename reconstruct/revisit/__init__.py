@@ -1,0 +1,1 @@
+"""Weak places of a reconstructed survey, and a dive that cures them."""
