@@ -43,6 +43,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
 from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.altitude_scale import scale_by_altitudes
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import (
     CONTROL_FILE,
@@ -120,6 +121,8 @@ class _KnownScale:
     source: str
     sigma: float
     """Relative sigma of the scale."""
+    held: bool = True
+    """Whether the scale changes by control alone."""
 
 
 def run_sparse(
@@ -287,6 +290,8 @@ def find_place(task: Placing) -> Placed:
     centres = np.stack([p.translation for p in _by_station(task.records, task.pinholes)])
     levelled = level(points, centres)
     known = _known_scale(task.workspace, task.mapping)
+    if known is None and task.datum is None:
+        known = _altitude_scale(task, levelled, points)
     scale = None if known is None else known.scale
     path = task.workspace / CONTROL_FILE
     control = read_control(path) if path.is_file() else Control()
@@ -352,7 +357,9 @@ def _fit(
     Also, of a fit to navigation without positions, what of the place is the model's own.
     """
     # Control corrects a known scale within its sigma; without control it is held.
-    sigma = known.sigma if known is not None and ties.informs_scale else 0.0
+    sigma = 0.0
+    if known is not None and (ties.informs_scale or not known.held):
+        sigma = known.sigma
     fit, modes = None, None
     if task.shape is not None:
         modes = picture_modes(task.shape, task.records, task.pinholes)
@@ -385,7 +392,11 @@ def _fit(
                 f"{len(ties.used_points)} control points do not place the model without "
                 "navigation: three that are not on one line do"
             )
-        fit = navigate(None)
+        bars = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
+        if bars is not None:
+            fit = navigate(None, known_scale=bars[0], scale_sigma=bars[1])
+        else:
+            fit = navigate(None)
         note = None if fit is None else _local_note(task.records, headed=task.rig is not None)
         return fit, note
     fit = fit_control(
@@ -475,6 +486,17 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
         source="scaled by one known length",
         sigma=LENGTH_SCALE_SIGMA,
     )
+
+
+def _altitude_scale(task: Placing, levelled: Similarity, points: Array) -> _KnownScale | None:
+    """The scale by altitudes, where neither a rig nor positions give one."""
+    centres = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
+    found = scale_by_altitudes(task.records, centres, levelled.apply(points))
+    if found is None:
+        return None
+    scale, sigma = found
+    source = f"scale from altitudes, sigma {sigma:.1%}"
+    return _KnownScale(scale=scale, source=source, sigma=sigma, held=False)
 
 
 def _by_station(
