@@ -305,7 +305,9 @@ def find_place(task: Placing) -> Placed:
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
             datum = None
-        if task.datum is not None or local is not None:
+            has_depth = any(math.isfinite(r.depth_m) for r in task.records)
+            vertical = str(task.survey.vertical_datum) if has_depth else _VERTICAL_OF_LEVEL
+        elif task.datum is not None:
             vertical = str(task.survey.vertical_datum)
         notes += [source] if datum is not None else [source, local or _LOCAL]
     else:

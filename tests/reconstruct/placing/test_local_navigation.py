@@ -1,6 +1,7 @@
 """Navigation without positions: what depths, headings and attitudes give on their own."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ DOWN = np.array([0.0, 0.0, 1.0])
 def with_only(records: list[ImageRecord], *names: str) -> list[ImageRecord]:
     readings = ("latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
                 "altitude_m")  # fmt: skip
-    lost = {name: NAN for name in readings if name not in names}
+    lost: dict[str, Any] = {name: NAN for name in readings if name not in names}
     return [replace(r, **lost) for r in records]
 
 
