@@ -54,6 +54,22 @@ class ImageRecord:
         return not math.isnan(self.latitude_deg + self.longitude_deg + self.depth_m)
 
     @property
+    def has_horizontal(self) -> bool:
+        """Whether latitude and longitude are known."""
+        return not math.isnan(self.latitude_deg + self.longitude_deg)
+
+    @property
+    def readings(self) -> dict[str, bool]:
+        """What navigation may measure of a picture, and whether it did."""
+        return {
+            "latitude and longitude": self.has_horizontal,
+            "depth": not math.isnan(self.depth_m),
+            "roll and pitch": not math.isnan(self.roll_deg + self.pitch_deg),
+            "heading": not math.isnan(self.heading_deg),
+            "altitude": not math.isnan(self.altitude_m),
+        }
+
+    @property
     def has_attitude(self) -> bool:
         """Whether roll, pitch and heading are known."""
         return not math.isnan(self.roll_deg + self.pitch_deg + self.heading_deg)

@@ -15,7 +15,8 @@ from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array
 from missions.values.navigation import COLUMNS
 
-POSITION, OPTIONAL = COLUMNS[:3], COLUMNS[3:]
+POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
+"""What a navigation log can measure; the other columns are sigmas."""
 _RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
 """A gap is longer than both this many seconds and this many median intervals."""
@@ -115,26 +116,29 @@ def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
         raise ValueError(f"{text} is not within the years 1 to 9999 in UTC") from None
 
 
-def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
-    """Read a navigation CSV: `time_s` or `time_utc`, latitude, longitude, depth, and optional rest.
+def read_navigation(path: Path, zone: tzinfo, needed: Sequence[str] = POSITION) -> NavigationLog:
+    """Read a navigation CSV: `time_s` or `time_utc`, what is needed, and any other of `COLUMNS`.
 
-    A row without a finite time or position, or whose time does not follow the row before, is left
-    out with a warning that names its line; of an optional value only the value is left out.
+    A row without a finite time or a needed value, or whose time does not follow the row before, is
+    left out with a warning that names its line; of any other value only the value is left out.
 
     Args:
         path: the file.
         zone: of dates that name none.
+        needed: columns without which a row is of no use; with none, any one value is enough.
 
     Raises:
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
-    header, rows = read_csv(path, POSITION)
+    header, rows = read_csv(path, needed)
     time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
     if time_name is None:
         raise NavigationError(
             f"{path}: no column time_s or time_utc; it has {shown(', '.join(header))}"
         )
-    names = [*POSITION, *(name for name in OPTIONAL if name in header)]
+    names = [*needed, *(name for name in COLUMNS if name in header and name not in needed)]
+    if not set(names) & set(READINGS):
+        raise NavigationError(f"{path}: none of the columns {', '.join(READINGS)}")
     start: datetime | None = None
     times: list[float] = []
     table: list[list[float]] = []
@@ -146,7 +150,7 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
                 start = date
             since = date - start if date is not None and start is not None else None
             time = since.total_seconds() if since is not None else _number(row, time_name)
-            position = [_number(row, name) for name in POSITION]
+            first = [_number(row, name) for name in needed]
         except ValueError as error:
             faults.append((line, str(error)))
             continue
@@ -154,22 +158,23 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
             faults.append((line, "time does not follow that of the row before"))
             continue
         rest = []
-        for name in names[len(POSITION) :]:
+        for name in names[len(needed) :]:
             try:
                 rest.append(_number(row, name) if row[name] else math.nan)
             except ValueError as error:
                 faults.append((line, f"{error} (that value only)"))
                 rest.append(math.nan)
         times.append(time)
-        table.append([*position, *rest])
+        table.append([*first, *rest])
     if faults:
         texts = _by_ranges(faults)
         more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
         warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
-    if not times:
-        raise NavigationError(f"{path}: no row with a time and a position")
-    values = np.array(table)
+    values = np.array(table).reshape(len(times), len(names))
     columns = {name: values[:, i] for i, name in enumerate(names)}
+    if not any(np.isfinite(columns[name]).any() for name in READINGS if name in columns):
+        what = "a position" if needed else "a reading"
+        raise NavigationError(f"{path}: no row with a time and {what}")
     return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start)
 
 

@@ -27,8 +27,7 @@ from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import (
-    OPTIONAL,
-    POSITION,
+    READINGS,
     NavigationLog,
     find_zone,
     read_navigation,
@@ -125,7 +124,8 @@ def import_images(
             of one number in them.
         video: a video to take frames from.
         every_s: seconds between frames.
-        navigation: CSV with time and position (see `read_navigation`).
+        navigation: CSV with time and any of position, depth, attitude and altitude (see
+            `read_navigation`).
         clock_offset_s: what to add to the times of pictures to get those of navigation.
         time_zone: of dates that name none, in EXIF and navigation.
         vertical_datum: name of the level that the depths of navigation count from, such as that of
@@ -192,7 +192,7 @@ def import_images(
 
     def work(partial: Path) -> None:
         notes: list[str] = []
-        log = None if navigation is None else read_navigation(navigation, zone)
+        log = None if navigation is None else read_navigation(navigation, zone, ())
         if video is not None:
             entries = _take_frames(video, every_s, partial, mono)
         else:
@@ -486,8 +486,8 @@ def _place(
     else:
         records = _with_gps(records, entries)
         level = "EXIF GPS altitude"
-    placed = [r for r in records if r.has_position]
-    if not placed:
+    told = Counter(name for r in records for name, known in r.readings.items() if known)
+    if not told:
         if log is not None:
             raise ImageError(
                 f"no picture was taken while navigation was logged: pictures at "
@@ -498,7 +498,13 @@ def _place(
         return list(records), None, "none"
     if log is None:
         notes.append("positions from EXIF GPS, of unknown accuracy")
-    first = placed[0]
+    complete = {name for name, count in told.items() if count == len(records)}
+    if complete != set(records[0].readings):
+        counts = ", ".join(f"{name} of {told[name]}" for name in records[0].readings)
+        notes.append(f"navigation of {len(records)} pictures: {counts}")
+    first = next((r for r in records if r.has_horizontal), None)
+    if first is None:
+        return list(records), None, level
     datum = {"latitude_deg": first.latitude_deg, "longitude_deg": first.longitude_deg}
     return list(records), datum, level
 
@@ -531,13 +537,12 @@ def _with_navigation(
     records: Sequence[ImageRecord], times: Array, log: NavigationLog
 ) -> list[ImageRecord]:
     found = log.at(times)
-    complete = np.isfinite(sum(found[name] for name in POSITION))
-    warn_of_gaps([r.image for r in records], times, np.where(complete, 1.0, np.nan), log)
-    names = [name for name in (*POSITION, *OPTIONAL) if name in found]
+    told = np.any([np.isfinite(found[name]) for name in READINGS if name in found], axis=0)
+    warn_of_gaps([r.image for r in records], times, np.where(told, 1.0, np.nan), log)
     placed = []
     for i, record in enumerate(records):
-        values: dict[str, Any] = {name: float(found[name][i]) for name in names}
-        placed.append(replace(record, **values) if complete[i] else record)
+        values: dict[str, Any] = {name: float(column[i]) for name, column in found.items()}
+        placed.append(replace(record, **values) if told[i] else record)
     return placed
 
 
@@ -548,9 +553,10 @@ def _with_gps(records: Sequence[ImageRecord], entries: Sequence[_Incoming]) -> l
         place = (facts.latitude_deg, facts.longitude_deg, facts.altitude_m)
         if any(value is None for value in place):
             lost.append(record.image)
+        if all(value is None for value in place):
             placed.append(record)
             continue
-        latitude, longitude, altitude = (float(v) for v in place if v is not None)
+        latitude, longitude, altitude = (np.nan if v is None else float(v) for v in place)
         placed.append(
             replace(
                 record,

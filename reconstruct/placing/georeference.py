@@ -11,6 +11,7 @@ from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
+from reconstruct.placing.first_placement import first_placement, observable
 from reconstruct.placing.generalised_fit import (
     Correlation,
     Estimate,
@@ -117,7 +118,7 @@ def fit_navigation(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
     body_from_cam: Mapping[str, RigidTransform] | None,
-    datum: Datum,
+    datum: Datum | None,
     levelled: Similarity,
     *,
     known_scale: float | None,
@@ -133,7 +134,8 @@ def fit_navigation(
         model_from_cam: pose of each picture's camera in the model.
         body_from_cam: mount of every camera, metres; None where it is unknown: positions are those
             of the cameras, and attitudes, which are the vehicle's, are not used.
-        datum: origin of the local frame.
+        datum: origin of the local frame; None where no latitude and longitude are known: the model
+            keeps the origin of `levelled`, its heading too where none is known.
         levelled: `level` of the model; where no attitude is known it keeps the model from turning
             about a straight track, with a sigma of 10 degrees.
         known_scale: metres in a unit of the model, or None: then the scale is fitted too.
@@ -147,12 +149,12 @@ def fit_navigation(
         no scale in common with the model.
     """
     epochs = read_epochs(records, model_from_cam, body_from_cam, datum, modes)
-    if epochs is None:
+    if epochs is None or (datum is not None and not epochs.has_horizontal):
         return None
-    start = _start(epochs, levelled, known_scale)
+    start = first_placement(epochs, levelled, known_scale)
     if start is None:
         return None
-    free = [0, 1, 2, 3, 4, 5]
+    free = observable(epochs)
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
     task = _NavigationTask(
@@ -289,8 +291,9 @@ class _NavigationTask:
         bounds: Mapping[int, float],
     ) -> PlacementFit:
         epochs = self.epochs.deformed(sizes)
-        kept = got.used[epochs.moment, 0]
+        kept = got.used[epochs.moment, :3].any(axis=1)
         misses = (epochs.positions(place) - epochs.measured_ned)[kept]
+        misses = np.where(got.used[epochs.moment, :3][kept], misses, np.nan)
         lost = epochs.known & ~got.used
         first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
         joint = [*range(PLACE), *range(PARAMETERS, len(got.change))]
@@ -308,9 +311,9 @@ class _NavigationTask:
                 )
         return PlacementFit(
             ned_from_model=place,
-            used=int(got.used[:, 0].sum()),
+            used=int(got.used[:, :3].any(axis=1).sum()),
             left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
-            rms_m=np.sqrt((misses**2).mean(axis=0)) if len(misses) else np.full(3, np.nan),
+            rms_m=_rms(misses),
             free_scale=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
             free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
             middle_ned=middle,
@@ -391,7 +394,7 @@ class _NavigationTask:
         take their turn for a second, independent reading of the heading would count one error
         twice as if it were two. In the same way a log's velocities are all wrong by one factor.
         """
-        if not self.epochs.has_attitude:
+        if not (self.epochs.known[:, 5].any() and self.epochs.has_horizontal):
             return {}
         plan = self.epochs.measured_ned[self.epochs.known[self.epochs.moment, 0], :2]
         radius = float(np.sqrt(plan.var(axis=0).sum()))
@@ -402,7 +405,7 @@ class _NavigationTask:
     def _extra(self, place: Similarity, middle: Array, sizes: Array) -> Extra:
         columns = PARAMETERS + len(sizes)
         misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
-        if self.levelled is not None and not self.epochs.has_attitude:
+        if self.levelled is not None and not self.epochs.has_tilt:
             down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
             sigma = np.deg2rad(_LEVEL_SIGMA_DEG)
             tilt = np.zeros((2, columns))
@@ -464,34 +467,9 @@ def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
     return Similarity(scale=place.scale * grow, rotation=turn * place.rotation, translation=shift)
 
 
-def _start(epochs: Epochs, levelled: Similarity, known_scale: float | None) -> Similarity | None:
-    """A first placement: from attitudes, else from the levelled model and the positions' plan."""
-    at = epochs.known[epochs.moment, 0]
-    count = int(epochs.known[:, 0].sum())
-    measured = epochs.measured_ned[at]
-    spread = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
-    need = float(np.median(epochs.sigma[:, 0]))
-    flat = levelled.apply(epochs.centres)[at]
-    has = epochs.known[epochs.moment, 3]
-    if not has.any() or known_scale is None:
-        least = 2 if has.any() else 3
-        if count < least or spread <= need:
-            warn(
-                f"{count} positions spread over {spread:.2f} m at a sigma of {need:.2f} m do not "
-                "place the model: it stays without CRS"
-            )
-            return None
-    a = (flat[:, :2] - flat[:, :2].mean(axis=0)) @ [1.0, 1j]
-    b = (measured[:, :2] - measured[:, :2].mean(axis=0)) @ [1.0, 1j]
-    turn = complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-300))
-    if has.any():
-        some = np.flatnonzero(has)
-        rotation = (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
-    else:
-        rotation = Rotation.from_rotvec([0.0, 0.0, np.angle(turn)]) * levelled.rotation
-    scale = abs(turn) if known_scale is None else known_scale
-    start = Similarity(scale=scale, rotation=rotation, translation=np.zeros(3))
-    off = epochs.measured_ned - epochs.positions(start)
-    off[~epochs.known[epochs.moment][:, :3]] = np.nan
-    shift = np.nanmedian(off, axis=0)
-    return Similarity(scale=scale, rotation=rotation, translation=shift)
+def _rms(misses: Array) -> Array:
+    """(3,) root mean squares of (N, 3) that may be NaN; NaN where all are."""
+    known = np.isfinite(misses)
+    total = np.where(known, misses, 0.0) ** 2
+    counts = known.sum(axis=0)
+    return np.sqrt(np.where(counts > 0, total.sum(axis=0) / np.maximum(counts, 1), np.nan))

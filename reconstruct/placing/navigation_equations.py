@@ -82,27 +82,45 @@ class Epochs:
 
     @property
     def has_attitude(self) -> bool:
-        """Whether any attitude is known."""
+        """Whether any roll, pitch or heading is known."""
         return bool(self.known[:, 3:].any())
+
+    @property
+    def has_tilt(self) -> bool:
+        """Whether any roll and pitch are known together."""
+        return bool(np.any(self.known[:, 3] & self.known[:, 4]))
+
+    @property
+    def has_horizontal(self) -> bool:
+        """Whether any north and east are known."""
+        return bool(self.known[:, 0].any())
 
 
 def read_epochs(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
     body_from_cam: Mapping[str, RigidTransform] | None,
-    datum: Datum,
+    datum: Datum | None,
     modes: Array | None = None,
 ) -> Epochs | None:
-    """Collect what navigation measured; None where it has no position.
+    """Collect what navigation measured; None where it measured nothing.
+
+    Every channel helps on its own, but latitude and longitude together only. Without a datum these
+    are not used.
 
     `modes` are those of all pictures, (N, 6, K); None where the model is stiff.
 
     Pictures of one station share one reading of navigation, which must not count twice. Without
     `body_from_cam` positions are those of the cameras, and what attitudes mean for them is unknown.
     """
-    if not any(r.has_position for r in records):
+    told = np.array([_told(r) for r in records])
+    if datum is None:
+        told[:, :2] = np.nan
+    if body_from_cam is None:
+        told[:, 3:] = np.nan
+    chosen = [int(i) for i in np.flatnonzero(np.isfinite(told).any(axis=1))]
+    if not chosen:
         return None
-    chosen = [i for i, r in enumerate(records) if np.any(np.isfinite(_told(r)))]
     timed = all(np.isfinite(records[i].time_s) for i in chosen)
     chosen.sort(
         key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image)
@@ -112,12 +130,15 @@ def read_epochs(
     number = {station: k for k, station in enumerate(stations)}
     first = [next(r for r in rows if r.station == station) for station in stations]
     moment = np.array([number[r.station] for r in rows])
-    told = np.array([_told(r) for r in rows])
-    if body_from_cam is None:
-        told[:, 3:] = np.nan
+    told = told[chosen]
+    for station in range(len(stations)):  # its pictures share what is told of one of them
+        of = told[moment == station]
+        for channel in np.flatnonzero(np.isfinite(of).any(axis=0)):
+            column = of[:, channel]
+            of[:, channel] = np.where(np.isnan(column), column[np.isfinite(column)][0], column)
+        told[moment == station] = of
     known = np.zeros((len(stations), 6), dtype=bool)
     np.logical_or.at(known, moment, np.isfinite(told))
-    has = np.isfinite(told[:, 3:]).all(axis=1)
     unknown = RigidTransform.identity()
     levers = [unknown if body_from_cam is None else body_from_cam[r.camera] for r in rows]
     time = [r.time_s for r in first] if timed else [float(s) for s in stations]
@@ -133,8 +154,8 @@ def read_epochs(
             ]
         ),
         levers=np.stack([-lever.translation for lever in levers]),
-        measured_ned=_positions(told, rows, datum),
-        ned_from_body=rotation_from_attitude(*np.deg2rad(np.where(has[:, None], told[:, 3:], 0)).T),
+        measured_ned=_positions(told, datum),
+        ned_from_body=rotation_from_attitude(*np.deg2rad(np.nan_to_num(told[:, 3:])).T),
         sigma=_sigmas(first),
         known=known,
         modes=np.zeros((len(chosen), 6, 0)) if modes is None else modes[chosen],
@@ -142,20 +163,23 @@ def read_epochs(
 
 
 def _told(record: ImageRecord) -> Array:
-    """(6,) what each channel of navigation says of a picture; NaN where it says nothing.
-
-    Latitude and longitude help together only, and so do the angles of an attitude.
-    """
-    level = record.latitude_deg + record.longitude_deg
-    attitude = np.array([record.roll_deg, record.pitch_deg, record.heading_deg])
-    attitude = attitude + 0.0 * attitude.sum()
-    return np.array([level, level, record.depth_m, *attitude])
+    """(6,) what each channel of navigation says of a picture; NaN where it says nothing."""
+    place = np.array([record.latitude_deg, record.longitude_deg])
+    place = place + 0.0 * place.sum()  # one without the other is of no use
+    attitude = record.roll_deg, record.pitch_deg, record.heading_deg
+    return np.array([*place, record.depth_m, *attitude])
 
 
-def _positions(told: Array, rows: Sequence[ImageRecord], datum: Datum) -> Array:
-    """(N, 3) positions in NED; what is not told of one is that of the middle of all."""
-    places = np.array([[r.latitude_deg, r.longitude_deg, r.depth_m] for r in rows])
-    places[~np.isfinite(told[:, :2]).all(axis=1), :2] = np.nan
+def _positions(told: Array, datum: Datum | None) -> Array:
+    """(N, 3) positions in NED; what is not told of one is that of the middle of all, else zero."""
+    known = [bool(np.isfinite(column).any()) for column in told[:, :3].T]
+    if datum is None or not known[0]:
+        depths = told[:, 2]
+        depths = np.where(np.isfinite(depths), depths, np.nanmean(depths) if known[2] else 0.0)
+        return np.outer(depths, [0.0, 0.0, 1.0])
+    places = told[:, :3].copy()
+    if not known[2]:
+        places[:, 2] = 0.0
     middle = np.nanmean(places, axis=0)
     return datum.ned_from_geodetic(np.where(np.isfinite(places), places, middle))
 

@@ -43,6 +43,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
 from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.altitude_scale import scale_by_altitudes
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import (
     CONTROL_FILE,
@@ -121,6 +122,8 @@ class _KnownScale:
     source: str
     sigma: float
     """Relative sigma of the scale."""
+    held: bool = True
+    """Whether the scale changes by control alone."""
 
 
 def run_sparse(
@@ -288,20 +291,26 @@ def find_place(task: Placing) -> Placed:
     centres = np.stack([p.translation for p in _by_station(task.records, task.pinholes)])
     levelled = level(points, centres)
     known = _known_scale(task.workspace, task.mapping)
+    if known is None and task.datum is None:
+        known = _altitude_scale(task, levelled, points)
     scale = None if known is None else known.scale
     path = task.workspace / CONTROL_FILE
     control = read_control(path) if path.is_file() else Control()
     datum = task.datum or control.datum()
     ties = _tie(task, control, datum)
-    fit = _fit(task, levelled, scale, known, ties, datum)
+    fit, local = _fit(task, levelled, scale, known, ties, datum)
     notes = [*task.survey.notes, *task.mapping.notes]
     if fit is not None:
         place = fit.ned_from_model
         source = _scale_source(known, ties)
         scaled, vertical = True, _VERTICAL_OF_CONTROL
-        if task.datum is not None:
+        if local is not None:
+            datum = None
+            has_depth = any(math.isfinite(r.depth_m) for r in task.records)
+            vertical = str(task.survey.vertical_datum) if has_depth else _VERTICAL_OF_LEVEL
+        elif task.datum is not None:
             vertical = str(task.survey.vertical_datum)
-        notes += [source] if datum is not None else [source, _LOCAL]
+        notes += [source] if datum is not None else [source, local or _LOCAL]
     else:
         found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
         factor = 1.0 if scale is None else scale
@@ -327,7 +336,7 @@ def find_place(task: Placing) -> Placed:
         fit=fit,
         scale_source=source,
         control=ties if (control.points or control.lengths) and scaled else None,
-        located=fit is not None,
+        located=fit is not None and local is None,
     )
 
 
@@ -345,35 +354,40 @@ def _fit(
     known: _KnownScale | None,
     ties: ControlFit,
     datum: Datum | None,
-) -> PlacementFit | None:
-    """The fit to navigation and control, to one of them, or None where nothing places it."""
+) -> tuple[PlacementFit | None, str | None]:
+    """The fit to navigation and control, to one of them, or None where nothing places it.
+
+    Also, of a fit to navigation without positions, what of the place is the model's own.
+    """
     # Control corrects a known scale within its sigma; without control it is held.
-    sigma = known.sigma if known is not None and ties.informs_scale else 0.0
+    sigma = 0.0
+    if known is not None and (ties.informs_scale or not known.held):
+        sigma = known.sigma
     fit, modes = None, None
     if task.shape is not None:
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    if task.datum is not None:
-        if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
-            warn(
-                "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
-                "import the pictures with --rig, whose body_from_rig says so"
-            )
-        fit = fit_navigation(
-            task.records,
-            task.pinholes,
-            None if task.rig is None else body_from_pinhole(task.rig, task.warps),
-            task.datum,
-            levelled,
-            known_scale=scale,
-            mount_sigma_deg=task.settings.mount_sigma_deg,
-            scale_sigma=sigma,
-            control=ties.equations if ties.informs else None,
-            modes=modes,
+    if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
+        warn(
+            "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
+            "import the pictures with --rig, whose body_from_rig says so"
         )
+    navigate = partial(
+        fit_navigation,
+        task.records,
+        task.pinholes,
+        None if task.rig is None else body_from_pinhole(task.rig, task.warps),
+        levelled=levelled,
+        known_scale=scale,
+        mount_sigma_deg=task.settings.mount_sigma_deg,
+        scale_sigma=sigma,
+        modes=modes,
+    )
+    if task.datum is not None:
+        fit = navigate(task.datum, control=ties.equations if ties.informs else None)
     if fit is not None:
-        return fit
+        return fit, None
     start = ties.start(scale)
     if start is None:
         if ties.used_points:
@@ -381,11 +395,31 @@ def _fit(
                 f"{len(ties.used_points)} control points do not place the model without "
                 "navigation: three that are not on one line do"
             )
-        return None
-    return fit_control(
+        bars = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
+        if bars is not None:
+            fit = navigate(None, known_scale=bars[0], scale_sigma=bars[1])
+        else:
+            fit = navigate(None)
+        note = None if fit is None else _local_note(task.records, headed=task.rig is not None)
+        return fit, note
+    fit = fit_control(
         task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma,
         modes=modes,
     )  # fmt: skip
+    return fit, None
+
+
+def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
+    """What of a place without positions is measured, and what is the model's own."""
+    known = {name for record in records for name, told in record.readings.items() if told}
+    axes = {
+        "levelled": bool(known & {"depth", "roll and pitch"}),
+        "depth": "depth" in known,
+        "heading": headed and "heading" in known,
+    }
+    measured = " and ".join(name for name, has in axes.items() if has)
+    own = " and ".join(["origin", *(name for name in ("depth", "heading") if not axes[name])])
+    return f"no latitude and longitude: {measured} by navigation, {own} the model's own; no CRS"
 
 
 def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
@@ -455,6 +489,17 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
         source="scaled by one known length",
         sigma=LENGTH_SCALE_SIGMA,
     )
+
+
+def _altitude_scale(task: Placing, levelled: Similarity, points: Array) -> _KnownScale | None:
+    """The scale by altitudes, where neither a rig nor positions give one."""
+    centres = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
+    found = scale_by_altitudes(task.records, centres, levelled.apply(points))
+    if found is None:
+        return None
+    scale, sigma = found
+    source = f"scale from altitudes, sigma {sigma:.1%}"
+    return _KnownScale(scale=scale, source=source, sigma=sigma, held=False)
 
 
 def _by_station(

@@ -128,3 +128,12 @@ def test_dates_that_no_clock_in_utc_shows_are_left_out(
     rows = [f"{date},60,5,1,0,2", "2024-05-01T12:00:00Z,60,5,1,0,2"]
     assert len(read_navigation(log_file(tmp_path, *rows, header=header), UTC).time_s) == 1
     assert "line 2" in capsys.readouterr().err
+
+
+def test_any_one_reading_is_enough_where_none_is_needed(tmp_path: Path) -> None:
+    path = log_file(tmp_path, "0,5.0,", "1,,90", "2,6.0,x", header="time_s,depth_m,heading_deg")
+    log = read_navigation(path, UTC, ())
+    np.testing.assert_array_equal(log.columns["depth_m"], [5.0, np.nan, 6.0])
+    np.testing.assert_array_equal(log.columns["heading_deg"], [np.nan, 90.0, np.nan])
+    with pytest.raises(NavigationError, match="none of the columns latitude_deg"):
+        read_navigation(log_file(tmp_path, "0,1", header="time_s,sigma_depth_m"), UTC, ())

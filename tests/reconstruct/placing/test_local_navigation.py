@@ -1,0 +1,137 @@
+"""Navigation without positions: what depths, headings and attitudes give on their own."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
+from tests.reconstruct.placing.test_georeference import (
+    exact,
+    gauge,
+    in_model,
+    points_in_model,
+)
+from tests.reconstruct.scenes import DATUM, Scene, make_scene
+
+NAN = float("nan")
+DOWN = np.array([0.0, 0.0, 1.0])
+
+
+def with_only(records: list[ImageRecord], *names: str) -> list[ImageRecord]:
+    readings = ("latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
+                "altitude_m")  # fmt: skip
+    lost: dict[str, Any] = {name: NAN for name in readings if name not in names}
+    return [replace(r, **lost) for r in records]
+
+
+def local_fit(
+    scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool, tilt_deg: float = 0
+) -> PlacementFit | None:
+    poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
+    points = points_in_model(scene.points_ned, truth)
+    start = level(points, np.stack([p.translation for p in poses]))
+    lean = Rotation.from_euler("xy", [tilt_deg, -tilt_deg], degrees=True)
+    start = replace(start, rotation=lean * start.rotation)
+    arms = {name: scene.rig.body_from_cam(name) for name in scene.rig.cameras}
+    return fit_navigation(
+        records, poses, arms, None, start, known_scale=truth.scale if known else None
+    )
+
+
+def tilt_deg(found: Similarity, truth: Similarity) -> float:
+    down = (found.rotation * truth.rotation.inv()).apply([0.0, 0.0, 1.0])
+    return float(np.rad2deg(np.arccos(np.clip(down[2], -1, 1))))
+
+
+def test_exact_depths_alone_level_a_rigs_model_and_give_its_depth() -> None:
+    scene, truth = make_scene(points=400), gauge(4, 1.0)
+    found = local_fit(scene, with_only(exact(scene), "depth_m"), truth, known=True, tilt_deg=4)
+    assert found is not None
+    assert tilt_deg(found.ned_from_model, truth) < 0.1
+    model = points_in_model(scene.points_ned, truth)
+    np.testing.assert_allclose(
+        found.ned_from_model.apply(model)[:, 2], scene.points_ned[:, 2], atol=0.01
+    )
+    assert found.ned_from_model.scale == truth.scale
+    np.testing.assert_array_equal(found.sigma_position_m[:2], 0.0)
+    assert found.sigma_heading_deg == 0.0
+    assert 0.0 < found.sigma_position_m[2] < 1.0
+
+
+@pytest.mark.parametrize("sigma_m", [0.001])
+def test_headings_and_depths_turn_a_model_to_north(sigma_m: float) -> None:
+    scene, truth = make_scene(points=400), gauge(5, 1.0)
+    records = [
+        replace(r, sigma_depth_m=sigma_m) for r in with_only(exact(scene), "depth_m", "heading_deg")
+    ]
+    found = local_fit(scene, records, truth, known=True)
+    assert found is not None
+    turn = found.ned_from_model.rotation * truth.rotation.inv()
+    assert np.rad2deg(turn.magnitude()) < 0.2
+    assert found.sigma_heading_deg > 0
+
+
+def test_roll_and_pitch_alone_level_a_model() -> None:
+    scene, truth = make_scene(points=400), gauge(6, 1.0)
+    found = local_fit(
+        scene, with_only(exact(scene), "roll_deg", "pitch_deg"), truth, known=True, tilt_deg=5
+    )
+    assert found is not None
+    assert tilt_deg(found.ned_from_model, truth) < 0.01
+
+
+def test_depths_of_a_track_without_relief_give_no_scale(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene, truth = make_scene(points=400), gauge(7, 2.0)
+    records = [replace(r, sigma_depth_m=1.0) for r in with_only(exact(scene), "depth_m")]
+    assert local_fit(scene, records, truth, known=False) is None
+    assert "too little for its scale" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("reading", ["depths", "positions"])
+def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
+    """Of a track whose depth varies by 0.4 m, over 24 seeds of white errors."""
+    scene, sigma_m = make_scene(points=400), 0.01
+    rng = np.random.default_rng(11)
+    stations = {r.station for r in scene.records}
+    rise = {s: 0.4 * rng.standard_normal() for s in stations}
+    lifted = replace(
+        scene,
+        ned_from_cam=[
+            RigidTransform.from_components(p.translation + rise[r.station] * DOWN, p.rotation)
+            for r, p in zip(scene.records, scene.ned_from_cam, strict=True)
+        ],
+    )
+    errors = []
+    for seed in range(24):
+        rng, truth = np.random.default_rng(seed), gauge(seed, 0.3)
+        off = {s: sigma_m * rng.standard_normal(3) for s in stations}
+        kept = ("depth_m",) if reading == "depths" else ("latitude_deg", "longitude_deg", "depth_m")
+        places = np.stack(
+            [p.translation + off[r.station] for r, p in
+             zip(lifted.records, lifted.ned_from_cam, strict=True)]
+        )  # fmt: skip
+        records = [
+            replace(r, latitude_deg=a, longitude_deg=b, depth_m=d, sigma_depth_m=sigma_m,
+                    sigma_horizontal_m=sigma_m)
+            for r, (a, b, d) in zip(
+                lifted.records, DATUM.geodetic_from_ned(places), strict=True
+            )
+        ]  # fmt: skip
+        poses = [in_model(pose, truth) for pose in lifted.ned_from_cam]
+        points = points_in_model(scene.points_ned, truth)
+        mono = [i for i, r in enumerate(records) if r.camera == "left"]
+        start = level(points, np.stack([poses[i].translation for i in mono]))
+        found = fit_navigation(
+            with_only([records[i] for i in mono], *kept), [poses[i] for i in mono], None,
+            None if reading == "depths" else DATUM, start, known_scale=None,
+        )  # fmt: skip
+        assert found is not None
+        errors.append(np.log(found.ned_from_model.scale / truth.scale) / found.sigma_scale)
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
