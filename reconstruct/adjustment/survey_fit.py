@@ -186,13 +186,13 @@ def fit_survey(
         before=np.array([value(problem.start.state.rig, name) for name in problem.fields]),
         prior_sigmas=np.sqrt(np.diag(inverse_of(problem.information))),
         covariance=covariance,
-        calibration=_motions(equations, guess.state.points, known) if fields else None,
+        calibration=motions_of(equations, guess.state.points, known) if fields else None,
         sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
     )
 
 
-def _motions(equations: PointEquations, places: Array, covariance: Array) -> Motions:
+def motions_of(equations: PointEquations, places: Array, covariance: Array) -> Motions:
     """What changes of the shared parameters do to stations and points."""
     stations = equations.response
     units = np.eye(len(covariance), len(covariance) + 1)

@@ -64,6 +64,13 @@ def quadratic(places: Array) -> tuple[Array, Array, Array]:
     return np.column_stack(columns), sizes, axes
 
 
+def sag_weights(places: Array) -> Array:
+    """(1 or 2, N) that take heights at places (N, 2) to the sags along and, if wide, across."""
+    columns, sizes, _ = quadratic(places)
+    weights: Array = np.linalg.pinv(columns)[2::2]
+    return weights * sizes[: len(weights), None] ** 2 / 8.0
+
+
 def bend_modes(places_ned: Array, place: Similarity) -> Array:
     """Deformations that bend a model by a unit of curvature downwards, like its soft modes.
 
