@@ -10,7 +10,8 @@ from alice_survey.base.block_solver import inverse_of
 from alice_survey.base.config import SurveyConfig
 from alice_survey.seafloor.board import PoolBoard, pool_poses
 from camera_calib.freedom import USUAL_LENS, of_lenses, of_ports, pose_names
-from camera_calib.rig import Covariance, Rig, design_rig, read_rig
+from camera_calib.rig import Covariance, Rig, design_rig
+from missions.fly.check import rig_of
 from reconstruct.adjustment.exact_observations import Pixels, RigState, exact_observations
 from reconstruct.mapping.arrays import cross_matrices
 
@@ -21,12 +22,8 @@ demo and of Caesarea show 0.008 and 0.012 px."""
 
 def expected_rig(workspace: Path, config: SurveyConfig) -> Rig:
     """The rig of the workspace's calibration, else the designed one with a usual covariance."""
-    path = workspace / "calibration" / "rig.json"
-    if path.is_file():
-        rig = read_rig(path)
-        if rig.covariance is not None:
-            return rig
-    return usual_rig(config)
+    rig = rig_of(workspace, config.camera, config.water)
+    return usual_rig(config) if rig.covariance is None else rig
 
 
 def usual_rig(config: SurveyConfig) -> Rig:

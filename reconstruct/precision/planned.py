@@ -18,7 +18,13 @@ _BETWEEN_DIVES_S = 3600.0
 
 
 def planned_block(
-    plan: Plan, rig: Rig, config: SurveyConfig, *, drawn: float | None = None, seed: int = 0
+    plan: Plan,
+    rig: Rig,
+    config: SurveyConfig,
+    *,
+    tracks: TrackModel | None = None,
+    drawn: float | None = None,
+    seed: int = 0,
 ) -> ExpectedBlock:
     """The pictures of a plan flown exactly by a level vehicle.
 
@@ -26,6 +32,7 @@ def planned_block(
         plan: it.
         rig: its cameras.
         config: of the survey.
+        tracks: of points; None as rendered surveys have them.
         drawn: see `expected_block`.
         seed: of the draw.
 
@@ -43,8 +50,8 @@ def planned_block(
         return mean + ripple(places)
 
     return expected_block(
-        rig, *stations_and_times(plan, rig, config), depth_at, TrackModel.of(config), drawn=drawn,
-        seed=seed,
+        rig, *stations_and_times(plan, rig, config), depth_at, tracks or TrackModel.of(config),
+        drawn=drawn, seed=seed,
     )  # fmt: skip
 
 
