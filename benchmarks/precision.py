@@ -138,9 +138,7 @@ def errors(track: FlownTrack, rig: Rig, cell_m: float, seed: int) -> Array:
     read = drawn(track, 0.0, seed)
     begun = start(track, rig, wrong_rig(rig, 1.0, seed), read, seed)
     with TemporaryDirectory() as folder:
-        found = adjusted(
-            begun.mapped, begun.seen, rig, begun.distances, begun.datum, Path(folder)
-        )
+        found = adjusted(begun.mapped, begun.seen, rig, begun.distances, begun.datum, Path(folder))
     pairs = zip(begun.scene.ned_from_cam, begun.scene.records, strict=True)
     true = RigidTransform.concatenate(
         [pose for pose, record in pairs if record.camera == rig.reference]
@@ -174,8 +172,7 @@ def compare(config: SurveyConfig, rig: Rig, seeds: int) -> Compared:
     said = np.array([*expected.bend_m, expected.scale, expected.heights_rms_m])
     began = time.process_time()
     found = [
-        errors(swayed(plan, rig, config, seed), rig, expected.cell_m, seed)
-        for seed in range(seeds)
+        errors(swayed(plan, rig, config, seed), rig, expected.cell_m, seed) for seed in range(seeds)
     ]
     rms = np.sqrt((np.array(found) ** 2).mean(axis=0))
     return Compared(
@@ -199,8 +196,9 @@ def main() -> None:
     about = machine(("numpy", "scipy", "pycolmap"))
     print(f"{heading(about)}\n\nerror (predicted){'':13}" + "".join(f"{n:>20}" for n in NAMES))
     options.work.mkdir(parents=True, exist_ok=True)
-    settings, rig = bend_survey.example_config(options.work, "caesarea"), calibrated_rig(
-        options.work, "caesarea", 4, 8
+    settings, rig = (
+        bend_survey.example_config(options.work, "caesarea"),
+        calibrated_rig(options.work, "caesarea", 4, 8),
     )
     figures: list[Figure] = []
     done = {}
@@ -221,8 +219,9 @@ def _gain(plain: Compared, crossed: Compared) -> Figure:
     print(f"\ncross lines take {real:.0%} off the bend; predicted: {said:.0%}")
     goal = Goal(least=1.0 - _GAIN_WITHIN, most=1.0 + _GAIN_WITHIN, of="ratio")
     return Figure(
-        name="gain of cross lines", value=real, unit="", peer="predicted", peer_value=said, goal=goal
-    )
+        name="gain of cross lines", value=real, unit="", peer="predicted", peer_value=said,
+        goal=goal,
+    )  # fmt: skip
 
 
 def _figures(name: str, found: Compared) -> list[Figure]:
@@ -230,7 +229,8 @@ def _figures(name: str, found: Compared) -> list[Figure]:
         f"{rms:.2f} ({said:.2f})".rjust(20) if np.isfinite(said) else f"{rms:.2f} (-)".rjust(20)
         for rms, said in zip(found.rms, found.said, strict=True)
     )
-    print(f"{name:<30}{cells}   {found.stations} stations, {found.seconds:.1f} s a survey", flush=True)
+    cost = f"{found.stations} stations, {found.seconds:.1f} s a survey"
+    print(f"{name:<30}{cells}   {cost}", flush=True)
     goal = Goal(least=1.0 - _WITHIN, most=1.0 / (1.0 - _WITHIN), of="ratio")
     return [
         Figure(

@@ -54,9 +54,7 @@ def usual_rig(config: SurveyConfig) -> Rig:
     )
 
 
-def _board_seen(
-    rig: Rig, board: PoolBoard, views: list[RigidTransform]
-) -> tuple[RigState, Pixels]:
+def _board_seen(rig: Rig, board: PoolBoard, views: list[RigidTransform]) -> tuple[RigState, Pixels]:
     """Views of the board as stations about it, every corner in every picture."""
     cameras, corners = len(rig.cameras), board.corners
     board_from_rig = RigidTransform.concatenate(views).inv()

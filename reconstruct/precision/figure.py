@@ -42,6 +42,7 @@ def draw_precision(
         for line in plan.lines:
             left.plot(*line.stations_ne.T[::-1], color="white", lw=0.6, alpha=0.7)
         colour_bar(image, left, "sigma of heights, mm")
+        left.grid(False)
         map_axes(left)
         shown = {"all errors": found, **{f"without {name}": p for name, p in without.items()}}
         worst = [_MM * float(np.nanmax(p.bend_m)) for p in shown.values()]

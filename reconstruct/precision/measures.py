@@ -89,7 +89,10 @@ def with_control(base: Candidate) -> Candidate:
     """The same with control points, which cost no time of dive that a plan knows of."""
     change = f"4 control points of {1e3 * CONTROL_SIGMA_M:g} mm at the corners"
     return Candidate(
-        changes=(*base.changes, change), config=base.config, plan=base.plan, rig=base.rig,
+        changes=(*base.changes, change),
+        config=base.config,
+        plan=base.plan,
+        rig=base.rig,
         with_control=True,
     )
 
@@ -156,13 +159,12 @@ def _levels(plan: PlanConfig) -> Iterator[Sequence[_Level]]:
     overlaps = {"forward_overlap": "forward"}
     if plan.line_spacing_m is None:
         overlaps["side_overlap"] = "side"
-    for setting, word in overlaps.items():
-        own = getattr(plan, setting)
-        yield [
-            _Level(f"{word} overlap {own + more:.0%}", setting, round(own + more, 3))
-            for more in _MORE_OVERLAP
-            if own + more <= _MOST_OVERLAP
-        ]
+    yield [
+        _Level(f"{word} overlap {own + more:.0%}", setting, round(own + more, 3))
+        for setting, word in overlaps.items()
+        for more in _MORE_OVERLAP
+        if (own := getattr(plan, setting)) + more <= _MOST_OVERLAP
+    ]
 
 
 def _changed(base: Candidate, levels: Sequence[_Level]) -> Candidate | None:

@@ -11,7 +11,7 @@ from missions.plan.planner import area_bathymetry
 from missions.plan.run import station_times_s
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan
-from reconstruct.precision.tracks import ExpectedBlock, Floor, TrackModel, expected_block, waves
+from reconstruct.precision.tracks import ExpectedBlock, TrackModel, expected_block, waves
 
 _BETWEEN_DIVES_S = 3600.0
 """By then slow errors of navigation are new ones."""
@@ -55,9 +55,7 @@ def planned_block(
     )  # fmt: skip
 
 
-def stations_and_times(
-    plan: Plan, rig: Rig, config: SurveyConfig
-) -> tuple[RigidTransform, Array]:
+def stations_and_times(plan: Plan, rig: Rig, config: SurveyConfig) -> tuple[RigidTransform, Array]:
     """Poses `ned_from_body` (S,) of a plan's stations in the order of flight, and their times."""
     stations = stations_of_plan(plan)
     costs, start_s = survey_costs(config, imaging_w=0.0), 0.0

@@ -87,7 +87,7 @@ def predict(
         control_sigma_m: of each coordinate of these.
     """
     state, noise_px = block.state, block.noise_px * (1.0 if pixels else _EXACT)
-    rig, count = state.rig, len(state.centres)
+    rig = state.rig
     fields = calibrated_parameters(rig, list(rig.cameras)) if calibration else ()
     linear = exact_observations(state, block.pixels, fields)
     linear.rest[..., -1] = 0.0

@@ -11,7 +11,7 @@ from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.frames import Array
 from alice_survey.base.text_table import text_table
-from missions.values.plan_file import Plan, read_plan
+from missions.values.plan_file import read_plan
 from reconstruct.precision.calibration import expected_rig
 from reconstruct.precision.measures import (
     Candidate,

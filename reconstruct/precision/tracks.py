@@ -29,10 +29,10 @@ _MATCHED = 0.45
 _SHARE = 0.7
 """Of the features that a picture may have, those in a track. Demo: 0.84, Caesarea: 0.63."""
 _NOISE_PX = 0.15
-"""Residuals show 0.033 px in the demo and 0.060 in Caesarea, but errors of one feature or picture go
-together: with 0.15 px for independent ones the cameras' errors are 0.3 and 1.1 mm, where 0.18 and
-1.7 mm were found."""
-_MOST_OBSERVATIONS, _PER_PICTURE = 60_000, (12, 60)
+"""Residuals show 0.033 px in the demo and 0.060 in Caesarea, but errors of one feature or picture
+go together. Independent ones of 0.15 px give the errors of both surveys' cameras within a factor of
+two: 0.21 and 0.85 mm, where 0.18 and 1.7 mm were found."""
+_MOST_OBSERVATIONS, _PER_PICTURE = 80_000, (20, 60)
 """Drawn in all, and least and most of a picture, which two parts of it share."""
 _LEAST_ANGLE_RAD = math.radians(1.5)
 """Between two rays to a point; COLMAP's least."""
@@ -125,8 +125,8 @@ def expected_block(
             )
     rows = np.concatenate(seen)
     rays = points[rows[:, 0].astype(int)] - np.repeat(centres, [len(part) for part in seen], axis=0)
-    kept = _is_wide(rows[:, 0].astype(int), rays / np.linalg.norm(rays, axis=1)[:, None])
-    rows = rows[kept]
+    wide = _is_wide(rows[:, 0].astype(int), rays / np.linalg.norm(rays, axis=1)[:, None])
+    rows = rows[wide]
     if not len(rows):
         raise PlanError("pictures of this plan share no point: raise forward_overlap")
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
