@@ -326,7 +326,7 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
     ]
     scene = Scene(
         rig=rig,
-        records=_records(track, list(rig.cameras), read),
+        records=records_of(track, list(rig.cameras), read),
         ned_from_cam=where,
         points_ned=points[:enough],
         pixels=pixels,
@@ -355,7 +355,8 @@ def _points(track: FlownTrack, seed: int) -> Array:
     return np.column_stack([level, track.floor.depth_at(level)])
 
 
-def _records(track: FlownTrack, cameras: Sequence[str], read: Readings) -> list[ImageRecord]:
+def records_of(track: FlownTrack, cameras: Sequence[str], read: Readings) -> list[ImageRecord]:
+    """Pictures of all stations with what the log says of them."""
     places = track.datum.geodetic_from_ned(read.ned)
     return [
         ImageRecord(

@@ -32,6 +32,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from alice_survey.base.block_solver import product_of
 from alice_survey.base.contents import read_arrays, taken_from
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
@@ -238,6 +239,18 @@ class BlockShape:
     noise: Array
     """(P, 3, 3) what the noise of a point's own keypoints does."""
     modes: SoftModes
+    equations: PointEquations
+    """Of the stations, with nothing shared."""
+    calibration: Motions | None
+    """What errors of the rig do; None where they are unknown."""
+
+    def variance(self, weights: Array) -> float:
+        """Variance of a sum over stations, (F, 6), that no motion of the whole block changes."""
+        found = float((weights * self.equations.covariance_times(weights[..., None])[..., 0]).sum())
+        if self.calibration is not None:
+            along = product_of(weights[..., None], self.calibration.stations)[0]
+            found += float(along @ self.calibration.covariance @ along)
+        return found
 
 
 def shape_of_block(
@@ -278,6 +291,8 @@ def shape_of_block(
         points=of_points,
         noise=equations.point_inverse,
         modes=_soft_modes(equations, gauge, moving, points),
+        equations=equations,
+        calibration=calibration,
     )
 
 

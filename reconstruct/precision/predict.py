@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.block_solver import inverse_of
+from alice_survey.base.block_solver import inverse_of, product_of
 from alice_survey.base.frames import Array
 from camera_calib.freedom import Prior
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
@@ -189,22 +189,36 @@ def _precision(block: ExpectedBlock, shape: BlockShape, joint: Array, middle: Ar
     heights += np.einsum("pk,kl,pl->p", points[:, 2], left, points[:, 2])
     cell_m = cell_of(block)
     cells_ne, variances = by_cell(state.points[:, :2], heights, cell_m)
-    weights = sag_weights(state.centres[:, :2]) @ shifts[:, 2]
     bend = np.full(2, np.nan)
-    bend[: len(weights)] = np.sqrt(np.einsum("ik,kl,il->i", weights, left, weights))
+    for k, weights in enumerate(sag_weights(state.centres[:, :2])):
+        bend[k] = _sigma(shape, weights[:, None] * [0.0, 0.0, 1.0], joint)
     arms = state.centres - state.centres.mean(axis=0)
-    scaling = np.zeros(len(joint))
-    scaling[SCALE] = 1.0
-    scaling[PLACE:] = np.einsum("fi,fik->k", arms, shifts) / (arms**2).sum()
     return Precision(
         bend_m=bend,
-        scale=float(np.sqrt(scaling @ joint @ scaling)),
+        scale=_sigma(shape, arms / (arms**2).sum(), joint, whole=1.0),
         shape_m=np.sqrt(np.maximum(rest + own, 0.0)),
         place_m=np.sqrt(np.maximum(rest + placed, 0.0)),
         cells_ne=cells_ne,
         cell_m=cell_m,
         heights_m=np.sqrt(np.maximum(variances, 0.0)),
     )
+
+
+def _sigma(shape: BlockShape, weights: Array, joint: Array, *, whole: float = 0.0) -> float:
+    """Sigma of a sum over the stations' shifts.
+
+    Args:
+        shape: of the block.
+        weights: (S, 3) of the shifts; the sum is the same wherever the block lies.
+        joint: covariance of placement and modes.
+        whole: weight of the placement's scale.
+    """
+    both = np.concatenate([np.zeros_like(weights), weights], axis=1)
+    along = np.zeros(len(joint))
+    along[SCALE] = whole
+    along[PLACE:] = product_of(both[..., None], shape.modes.stations)[0]
+    stiff = shape.variance(both) - float(along[PLACE:] @ along[PLACE:])
+    return math.sqrt(max(stiff, 0.0) + float(along @ joint @ along))
 
 
 def cell_of(block: ExpectedBlock) -> float:

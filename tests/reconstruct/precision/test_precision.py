@@ -101,9 +101,7 @@ def test_sigmas_go_with_the_root_of_all_that_errs() -> None:
     once = predict(block(), NAVIGATION)
     noisier = replace(TRACKS, noise_px=2 * TRACKS.noise_px)
     fewer = replace(noisier, per_picture=4 * TRACKS.per_picture)
-    np.testing.assert_allclose(
-        figures(predict(block(fewer), NAVIGATION)), figures(once), rtol=1e-9
-    )
+    np.testing.assert_allclose(figures(predict(block(fewer), NAVIGATION)), figures(once), rtol=1e-9)
     held = predict(block(), NAVIGATION.times(1e-6), calibration=False)
     twice = predict(block(noisier), NAVIGATION.times(2e-6), calibration=False)
     np.testing.assert_allclose(figures(twice)[2:], 2 * figures(held)[2:], rtol=0.05)
@@ -124,19 +122,22 @@ def test_what_is_left_out_does_not_err() -> None:
 
 
 def test_depth_alone_holds_the_bend_as_a_plain_fit_would() -> None:
-    """Soft pictures, white depth: the sag's variance is that of a paraboloid through readings."""
-    soft = replace(TRACKS, noise_px=1e3)
+    """White depth and nothing else: the sag is that of a paraboloid through the readings, weighed
+    with what the pictures know themselves."""
+    soft = block(replace(TRACKS, noise_px=0.3))
     channels = {
         name: replace(errs, constant=1e3 * errs.constant, white=1e3 * errs.white)
         for name, errs in NAVIGATION.channels.items()
     }
     white_m = 0.002
+    free = {**channels, "depth": replace(channels["depth"], constant=10.0, white=10.0)}
     channels["depth"] = replace(channels["depth"], constant=0.01, slow=1e-9, white=white_m)
-    found = predict(block(soft), replace(NAVIGATION, channels=channels))
-    weights = sag_weights(block().state.centres[:, :2])
-    plain = white_m * np.linalg.norm(weights, axis=1)
-    assert np.all(found.bend_m < 1.05 * plain)
-    assert np.all(found.bend_m > 0.5 * plain)
+    found, alone = (
+        predict(soft, replace(NAVIGATION, channels=given)).bend_m for given in (channels, free)
+    )
+    plain = white_m * np.linalg.norm(sag_weights(soft.state.centres[:, :2]), axis=1)
+    np.testing.assert_allclose(found, (alone**-2 + plain**-2) ** -0.5, rtol=0.2)
+    assert np.all(found < 0.6 * alone)
 
 
 def test_tracks_are_as_the_model_states() -> None:
