@@ -46,7 +46,8 @@ def shown_bend(track: FlownTrack, sag_m: float) -> Bend:
     bent = RigidTransform.from_components(
         places + step[:, :3], Rotation.from_rotvec(step[:, 3:]) * true.rotation
     )
-    floor = np.column_stack([places[:, :2], track.floor.depth_at(places[:, :2])])
+    depth_m = np.full(len(places), track.config.area.seafloor_depth_m)
+    floor = np.column_stack([places[:, :2], depth_m])
     fit = fit_navigation(
         records_of(track, [rig.reference], logged(track, 0.0, 0)),
         list(bent),

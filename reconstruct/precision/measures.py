@@ -110,14 +110,16 @@ def worst_bend(found: Precision) -> float:
 
 
 def sets_of_measures(base: Candidate) -> Iterator[Candidate]:
-    """All sets of measures that can be planned, the shortest dives first; the first is none."""
+    """None, then all sets of measures that can be planned, the shortest dives first."""
+    yield base
     kinds = [[None, *levels] for levels in _levels(base.config.plan)]
     made = [
         one
         for chosen in itertools.product(*kinds)
-        if (one := _changed(base, [level for level in chosen if level is not None])) is not None
+        if (levels := [level for level in chosen if level is not None])
+        and (one := _changed(base, levels)) is not None
     ]
-    yield from sorted(made, key=lambda one: (len(one.changes) > 0, one.minutes))
+    yield from sorted(made, key=lambda one: one.minutes)
 
 
 def cheapest(base: Candidate, bend_m: float) -> Candidate:
@@ -169,8 +171,6 @@ def _levels(plan: PlanConfig) -> Iterator[Sequence[_Level]]:
 
 def _changed(base: Candidate, levels: Sequence[_Level]) -> Candidate | None:
     """The survey planned with some measures; None where no plan meets them."""
-    if not levels:
-        return base
     update = {level.setting: level.value for level in levels}
     plan = base.config.plan.model_copy(update=update)
     config = base.config.model_copy(update={"plan": plan})
