@@ -34,10 +34,11 @@ from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import Rig
 from missions.plan.planner import plan_survey
+from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.precision.navigation import ChannelErrors, NavigationErrors
-from reconstruct.precision.planned import planned_block, stations_and_times
+from reconstruct.precision.planned import Candidate, stations_and_times
 from reconstruct.precision.predict import Precision, by_cell, predict
 from reconstruct.precision.tracks import TrackModel
 
@@ -120,20 +121,20 @@ def errors_of_drawn_logs(span_s: float) -> NavigationErrors:
 
 def predicted(plan: Plan, rig: Rig, config: SurveyConfig) -> Precision:
     """What the plan alone says of such surveys."""
-    poses, time_s = stations_and_times(plan, rig, config)
+    poses, time_s = stations_and_times(plan, rig, survey_costs(config))
     pictures = len(poses) * len(rig.cameras)
     tracks = TrackModel(
         per_picture=bend_survey.OBSERVATIONS / pictures, matched=bend_survey.MATCHED,
         noise_px=bend_survey.NOISE_PX,
     )  # fmt: skip
-    block = planned_block(plan, rig, config, tracks=tracks)
+    block = Candidate(config=config, plan=plan, rig=rig).block(tracks)
     return predict(block, errors_of_drawn_logs(float(np.ptp(time_s))))
 
 
 def swayed(plan: Plan, rig: Rig, config: SurveyConfig, seed: int) -> FlownTrack:
     """A flight of the plan with a little sway."""
     rng = np.random.default_rng([seed, _SWAY])
-    poses, time_s = stations_and_times(plan, rig, config)
+    poses, time_s = stations_and_times(plan, rig, survey_costs(config))
     turns = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(_SWAY_DEG), (len(poses), 3)))
     places = poses.translation + rng.normal(0.0, _SWAY_M, (len(poses), 3))
     flown = RigidTransform.from_components(places, turns * poses.rotation)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.block_solver import inverse_of
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import CameraConfig, ImagingConfig, WaterConfig
 from alice_survey.seafloor.board import PoolBoard, pool_poses
 from camera_calib.freedom import USUAL_LENS, of_lenses, of_ports, pose_names
 from camera_calib.rig import Covariance, Rig, design_rig
@@ -20,22 +20,24 @@ CORNER_PX = 0.01
 demo and of Caesarea show 0.008 and 0.012 px."""
 
 
-def expected_rig(workspace: Path, config: SurveyConfig) -> Rig:
+def expected_rig(
+    workspace: Path, camera: CameraConfig, water: WaterConfig, imaging: ImagingConfig
+) -> Rig:
     """The rig of the workspace's calibration, else the designed one with a usual covariance."""
-    rig = rig_of(workspace, config.camera, config.water)
-    return usual_rig(config) if rig.covariance is None else rig
+    rig = rig_of(workspace, camera, water)
+    return usual_rig(camera, water, imaging) if rig.covariance is None else rig
 
 
-def usual_rig(config: SurveyConfig) -> Rig:
+def usual_rig(camera: CameraConfig, water: WaterConfig, imaging: ImagingConfig) -> Rig:
     """The designed rig with the covariance that views of a board in a pool would leave.
 
     As many views as `imaging.pool_views` of the simulated pool's board, through the ports, the
     lens free (Cramer-Rao bound).
     """
-    rig = design_rig(config.camera, config.water, config.imaging.scale)
-    board, rng = PoolBoard(), np.random.default_rng(config.seed)
-    views = pool_poses(board, rig, config.imaging.pool_views, rng)
-    names = (*of_lenses(rig, USUAL_LENS[config.camera.lens]), *of_ports(rig), *pose_names(rig))
+    rig = design_rig(camera, water, imaging.scale)
+    board, rng = PoolBoard(), np.random.default_rng(0)
+    views = pool_poses(board, rig, imaging.pool_views, rng)
+    names = (*of_lenses(rig, USUAL_LENS[camera.lens]), *of_ports(rig), *pose_names(rig))
     names = tuple(name for name in names if not name.endswith(".n_water"))
     linear = exact_observations(*_board_seen(rig, board, views), names)
     size = len(board.corners) * len(rig.cameras)

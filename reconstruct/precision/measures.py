@@ -3,75 +3,30 @@
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from alice_survey.base.config import PlanConfig, SurveyConfig
 from alice_survey.base.errors import PlanError, collected_by
-from alice_survey.base.frames import Array
 from camera_calib.rig import Rig, design_rig
 from missions.plan.planner import plan_survey
-from missions.values.plan_file import Plan
-from reconstruct.precision.navigation import NavigationErrors
-from reconstruct.precision.planned import planned_block
-from reconstruct.precision.predict import Precision, predict
+from reconstruct.precision.planned import CONTROL_SIGMA_M, Candidate
+from reconstruct.precision.predict import Precision
 
-CONTROL_SIGMA_M = 0.01
-"""Of each coordinate of a control point."""
 _MORE_CROSS_LINES = (1, 2, 4)
 _MORE_OVERLAP = (0.1, 0.2)
 _MOST_OVERLAP = 0.9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Candidate:
-    """A plan that was changed and made, and what it is predicted to give."""
-
-    changes: tuple[str, ...]
-    """In words; empty of the plan as set."""
-    config: SurveyConfig
-    plan: Plan
-    rig: Rig
-    with_control: bool = False
-    """Whether four points at the corners of the area are surveyed."""
-
-    @property
-    def name(self) -> str:
-        """In words."""
-        return " and ".join(self.changes) or "as planned"
-
-    @property
-    def minutes(self) -> float:
-        """Of all dives."""
-        return self.plan.duration_s / 60.0
-
-    @cached_property
-    def precision(self) -> Precision:
-        """Predicted."""
-        block = planned_block(self.plan, self.rig, self.config)
-        points = block.state.points
-        control = points[_corners(points)] if self.with_control else None
-        return predict(
-            block, NavigationErrors.of(self.config.navigation), control=control,
-            control_sigma_m=CONTROL_SIGMA_M,
-        )  # fmt: skip
-
-
-def _corners(points: Array) -> list[int]:
-    """The points farthest to the four sides."""
-    level = points[:, :2] - points[:, :2].mean(axis=0)
-    u, v = (level @ np.linalg.svd(level, full_matrices=False)[2].T).T
-    return [int(np.argmax(a * u / np.ptp(u) + b * v / np.ptp(v))) for a in (-1, 1) for b in (-1, 1)]
-
-
-def as_planned(config: SurveyConfig, rig: Rig) -> Candidate:
-    """The survey as set.
+def as_planned(config: SurveyConfig, rig: Rig, changes: tuple[str, ...] = ()) -> Candidate:
+    """The survey as set, or as changes in words have set it.
 
     Raises:
         PlanError: no plan meets the settings.
     """
-    return Candidate(changes=(), config=config, plan=_plan(config), rig=rig)
+    with collected_by(lambda *_: None):
+        plan = plan_survey(config, design_rig(config.camera, config.water)).plan
+    return Candidate(changes=changes, config=config, plan=plan, rig=rig)
 
 
 def single_measures(base: Candidate) -> list[Candidate]:
@@ -143,46 +98,38 @@ def cheapest(base: Candidate, bend_m: float) -> Candidate:
 
 
 @dataclass(frozen=True)
-class _Level:
+class _PlanChange:
     change: str
     setting: str
     value: float | bool
 
 
-def _levels(plan: PlanConfig) -> Iterator[Sequence[_Level]]:
+def _levels(plan: PlanConfig) -> Iterator[Sequence[_PlanChange]]:
     """Kinds of measures, of each of which a set has at most one."""
     lines = plan.cross_lines
     yield [
-        _Level(f"{more} more cross line{'s' * (more > 1)}", "cross_lines", lines + more)
+        _PlanChange(f"{more} more cross line{'s' * (more > 1)}", "cross_lines", lines + more)
         for more in _MORE_CROSS_LINES
     ]
     if not plan.closing_line:
-        yield [_Level("a closing line", "closing_line", True)]
+        yield [_PlanChange("a closing line", "closing_line", True)]
     overlaps = {"forward_overlap": "forward"}
     if plan.line_spacing_m is None:
         overlaps["side_overlap"] = "side"
     yield [
-        _Level(f"{word} overlap {own + more:.0%}", setting, round(own + more, 3))
+        _PlanChange(f"{word} overlap {own + more:.0%}", setting, round(own + more, 3))
         for setting, word in overlaps.items()
         for more in _MORE_OVERLAP
         if (own := getattr(plan, setting)) + more <= _MOST_OVERLAP
     ]
 
 
-def _changed(base: Candidate, levels: Sequence[_Level]) -> Candidate | None:
+def _changed(base: Candidate, levels: Sequence[_PlanChange]) -> Candidate | None:
     """The survey planned with some measures; None where no plan meets them."""
     update = {level.setting: level.value for level in levels}
     plan = base.config.plan.model_copy(update=update)
     config = base.config.model_copy(update={"plan": plan})
     try:
-        return Candidate(
-            changes=tuple(level.change for level in levels), config=config, plan=_plan(config),
-            rig=base.rig,
-        )  # fmt: skip
+        return as_planned(config, base.rig, tuple(level.change for level in levels))
     except PlanError:
         return None
-
-
-def _plan(config: SurveyConfig) -> Plan:
-    with collected_by(lambda *_: None):
-        return plan_survey(config, design_rig(config.camera, config.water)).plan

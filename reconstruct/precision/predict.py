@@ -149,9 +149,9 @@ def _placed(
     if control is not None:
         near = KDTree(state.points).query(control)[1]
         at, motions = state.points[near], shape.modes.points[near].astype(np.float64)
-        told = np.zeros((len(at), 3, columns))
-        told[:, :, :PLACE], told[:, :, PARAMETERS:] = _by_place(at - middle), motions
-        rows = np.concatenate([rows, told.reshape(-1, columns) / control_sigma_m])
+        known_at = np.zeros((len(at), 3, columns))
+        known_at[:, :, :PLACE], known_at[:, :, PARAMETERS:] = _by_place(at - middle), motions
+        rows = np.concatenate([rows, known_at.reshape(-1, columns) / control_sigma_m])
     free = [*range(6), TURN, STRETCH, *range(LEVER.start, LEVER.stop), CLOCK]
     if not np.isfinite(state.rig.baseline_m):
         free.append(SCALE)

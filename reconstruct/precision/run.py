@@ -14,7 +14,6 @@ from alice_survey.base.text_table import text_table
 from missions.values.plan_file import read_plan
 from reconstruct.precision.calibration import expected_rig
 from reconstruct.precision.measures import (
-    Candidate,
     as_planned,
     cheapest,
     gain_per_minute,
@@ -23,7 +22,7 @@ from reconstruct.precision.measures import (
     worst_bend,
 )
 from reconstruct.precision.navigation import NavigationErrors
-from reconstruct.precision.planned import planned_block
+from reconstruct.precision.planned import Candidate
 from reconstruct.precision.predict import Precision, predict
 
 _UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -67,9 +66,9 @@ def precision_report(
         PlanError: the plan does not tie its pictures together.
     """
     plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
-    rig = expected_rig(workspace, config)
-    block, errors = planned_block(plan, rig, config), NavigationErrors.of(config.navigation)
-    found = predict(block, errors)
+    rig = expected_rig(workspace, config.camera, config.water, config.imaging)
+    base = Candidate(config=config, plan=plan, rig=rig)
+    block, errors, found = base.block(), NavigationErrors.of(config.navigation), base.precision
     without = {
         "calibration": predict(block, errors, calibration=False),
         "navigation": predict(block, errors.times(_EXACT)),
@@ -88,7 +87,6 @@ def precision_report(
         **to_json(found), "without": {name: to_json(p) for name, p in without.items()},
     }  # fmt: skip
     if measures:
-        base = Candidate(changes=(), config=config, plan=plan, rig=rig)
         options = [*single_measures(base), with_control(base)]
         text.append(_measures_text(base, options))
         data["measures"] = [_measure_json(base, one) for one in options]
@@ -105,7 +103,7 @@ def bend_report(workspace: Path, config: SurveyConfig, bend_m: float) -> tuple[s
     Raises:
         PlanError: no set of measures does.
     """
-    base = as_planned(config, expected_rig(workspace, config))
+    base = as_planned(config, expected_rig(workspace, config.camera, config.water, config.imaging))
     found = cheapest(base, bend_m)
     plan = found.config.plan
     changed = {

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.stats.qmc import Halton
 
 from alice_survey.base.block_solver import Flags, Indices
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
@@ -53,9 +53,9 @@ class TrackModel:
     """Sigma of one coordinate."""
 
     @classmethod
-    def of(cls, config: SurveyConfig) -> "TrackModel":
+    def of(cls, settings: ReconstructConfig) -> "TrackModel":
         """As rendered surveys show for these settings."""
-        return cls(per_picture=_SHARE * config.reconstruct.max_features)
+        return cls(per_picture=_SHARE * settings.max_features)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
