@@ -215,7 +215,7 @@ def main() -> None:
     for shape in shapes if options.quick else [*shapes, CROSSED]:
         seeds = range(shape.first_seed, shape.first_seed + options.seeds)
         done[shape.name] = compare(shape.config(settings), rig, seeds)
-        figures += _figures(shape.name, done[shape.name])
+        figures += _figures(shape.name, done[shape.name], judged=not options.quick)
     if {SHAPES[-1].name, CROSSED.name} <= set(done):
         figures.append(_gain(done[SHAPES[-1].name], done[CROSSED.name]))
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures))))
@@ -235,7 +235,8 @@ def _gain(plain: Compared, crossed: Compared) -> Figure:
     )  # fmt: skip
 
 
-def _figures(name: str, found: Compared) -> list[Figure]:
+def _figures(name: str, found: Compared, *, judged: bool) -> list[Figure]:
+    """Figures of a row; few surveys are not judged."""
     cells = "".join(
         f"{rms:.2f} ({said:.2f})".rjust(20) if np.isfinite(said) else f"{rms:.2f} (-)".rjust(20)
         for rms, said in zip(found.rms, found.said, strict=True)
@@ -246,7 +247,7 @@ def _figures(name: str, found: Compared) -> list[Figure]:
     return [
         Figure(
             name=f"{name}: {what.split(',')[0]}", value=float(rms), unit=what.split()[-1],
-            peer="predicted", peer_value=float(said), goal=goal,
+            peer="predicted", peer_value=float(said), goal=goal if judged else None,
         )
         for what, rms, said in zip(NAMES, found.rms, found.said, strict=True)
         if np.isfinite(said)

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from alice_survey.base.config import NavigationConfig, SurveyConfig
+from alice_survey.base.config import NavigationConfig, SurveyConfig, load_config
 from alice_survey.base.errors import ConfigError, PlanError
+from alice_survey.base.executor import SERIAL
+from alice_survey.survey import run
 from benchmarks import bend_survey
 from benchmarks.precision import errors, errors_of_drawn_logs, swayed
 from camera_calib.rig import Rig, design_rig
@@ -29,8 +32,9 @@ from reconstruct.precision.measures import (
 from reconstruct.precision.navigation import NavigationErrors
 from reconstruct.precision.planned import Candidate, stations_and_times
 from reconstruct.precision.predict import Precision, predict
-from reconstruct.precision.run import bend_report, length_m
+from reconstruct.precision.run import bend_report, length_m, precision_report
 from reconstruct.precision.tracks import ExpectedBlock, TrackModel
+from tests.small_survey import settings_in
 
 TRACKS = TrackModel(per_picture=400.0, matched=0.5, noise_px=0.1)
 FIGURES = ("bend along", "bend across", "scale", "heights", "shape")
@@ -212,6 +216,19 @@ def test_the_cheapest_set_reaches_the_bend_or_it_says_how_near_it_comes(
     with pytest.raises(PlanError, match=r"no lines reach .* control points") as error:
         cheapest(base, 1e-7)
     assert "\n" not in str(error.value)
+
+
+def test_the_report_of_a_planned_workspace_draws_what_it_says(tmp_path: Path) -> None:
+    workspace = settings_in(tmp_path / "w")
+    run(["plan"], workspace, None, executor=SERIAL)
+    config = load_config(workspace / "survey.toml")
+    text, data = precision_report(workspace, config, measures=False, plot=tmp_path / "p.png")
+    assert "without errors of calibration" in text
+    assert 0 < data["heights_rms_m"] < 0.01
+    assert 0 < data["without"]["calibration"]["scale"] < data["scale"] < 1e-3
+    assert data["stations_shape_rms_m"] < data["stations_shape_worst_m"]
+    with Image.open(tmp_path / "p.png") as picture:
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 50
 
 
 @pytest.mark.parametrize(("text", "metres"), [("5mm", 5e-3), ("0.5cm", 5e-3), (" 5 ", 5e-3)])
