@@ -1,6 +1,6 @@
 """The end of the pipeline, from a model near the truth to a placed one: what `bend` scores."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +42,8 @@ class Adjusted:
     """(2,) of the sag along and across the block; NaN where unknown."""
     scale_sigma: float
     """Relative; NaN where unknown."""
+    points_ned: Mapping[int, Array]
+    """Points by their ids."""
     correlation: str
     """How navigation's errors of depth are correlated, in words."""
 
@@ -117,6 +119,7 @@ def adjusted(
         ),
         bend_sigmas_m=np.sqrt(np.einsum("ik,kl,il->i", spreads, left, spreads)),
         scale_sigma=float(np.sqrt(scaling @ left @ scaling)),
+        points_ned={int(i): point.xyz for i, point in model.points3D.items()},
         correlation=(
             f"{depth.factor:.2g} of stated, {depth.tau:.3g} {fit.time_unit}, white "
             f"{depth.white:.2g}, constant {depth.constant:.2g}"

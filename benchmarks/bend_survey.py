@@ -47,7 +47,7 @@ port_distance_m = 0.1
 glass_thickness_m = 0.02
 port_tilt_deg = [2, 0]
 """
-_MATCHED = 0.5
+MATCHED = 0.5
 """Share of the pictures that show a point in which it is matched: the demo's tracks have 4.9 views
 where 8.2 pictures show a point."""
 _MARGIN_M = 1.5
@@ -56,10 +56,10 @@ _FAR = 1.6
 """Altitudes from a camera beyond which nothing is in its picture."""
 _RIG, _POINTS, _NOISE, _LOG = range(4)
 """Streams of random numbers of one seed."""
-_DEPTH_CONSTANT_M, _DEPTH_SLOW_M, _DEPTH_SLOW_S, _DEPTH_WHITE_M = 0.05, 0.006, 600.0, 0.0016
-_FIX_M, _STRETCH, _WALK_M, _LEVEL_WHITE_M = 0.03, 0.003, 0.001, 0.002
+DEPTH_CONSTANT_M, DEPTH_SLOW_M, DEPTH_SLOW_S, DEPTH_WHITE_M = 0.05, 0.006, 600.0, 0.0016
+FIX_M, STRETCH, WALK_M, LEVEL_WHITE_M = 0.03, 0.003, 0.001, 0.002
 """Of a drawn log: the fix it starts from, stretch, metres in a second's root, and white noise."""
-_TILT_DEG, _HEADING_DEG, _ATTITUDE_WHITE_DEG = 0.01, 0.3, 0.014
+TILT_DEG, HEADING_DEG, ATTITUDE_WHITE_DEG = 0.01, 0.3, 0.014
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +73,8 @@ class FlownTrack:
     taken_s: Array
     """(S,) times of the stations."""
     truth: Trajectory
-    log: NavigationLog
+    log: NavigationLog | None
+    """None of a flight that no sensor logged."""
 
     def at(self, time_s: Array) -> RigidTransform:
         """(N,) true poses of the body."""
@@ -144,6 +145,11 @@ def calibrated_rig(
     )
 
 
+def example_config(folder: Path, example: str) -> SurveyConfig:
+    """Settings of an example, kept in a folder."""
+    return Survey(_workspace(folder, "settings", example, None, "")).config
+
+
 def _workspace(folder: Path, name: str, example: str, seed: int | None, extra: str) -> Path:
     """A workspace with an example's settings, another seed and more settings."""
     workspace = folder / f"{example}-{name}"
@@ -206,6 +212,7 @@ class Readings:
 
 def logged(track: FlownTrack, clock_s: float, _: int) -> Readings:
     """The log of the simulated flight."""
+    assert track.log is not None
     columns = track.log.at(track.taken_s + clock_s)
 
     def rows(*names: str) -> Array:
@@ -230,27 +237,27 @@ def drawn(track: FlownTrack, clock_s: float, seed: int) -> Readings:
     time_s = track.taken_s + clock_s
     bodies, count = track.at(time_s), len(time_s)
     place = bodies.translation
-    depth_off = rng.normal(0, _DEPTH_CONSTANT_M) + rng.normal(0, _DEPTH_WHITE_M, count)
-    depth_off += _DEPTH_SLOW_M * _gauss_markov(rng, time_s, _DEPTH_SLOW_S)
+    depth_off = rng.normal(0, DEPTH_CONSTANT_M) + rng.normal(0, DEPTH_WHITE_M, count)
+    depth_off += DEPTH_SLOW_M * _gauss_markov(rng, time_s, DEPTH_SLOW_S)
     away = place[:, :2] - place[0, :2]
-    turn_rad = np.deg2rad(rng.normal(0, _HEADING_DEG))
+    turn_rad = np.deg2rad(rng.normal(0, HEADING_DEG))
     walk = rng.normal(size=(count, 2)) * np.sqrt(np.diff(time_s, prepend=time_s[0]))[:, None]
     level_off = (
-        rng.normal(0, _FIX_M, 2)
-        + rng.normal(0, _STRETCH) * away
+        rng.normal(0, FIX_M, 2)
+        + rng.normal(0, STRETCH) * away
         + turn_rad * np.column_stack([-away[:, 1], away[:, 0]])
-        + _WALK_M * np.cumsum(walk, axis=0)
-        + rng.normal(0, _LEVEL_WHITE_M, (count, 2))
+        + WALK_M * np.cumsum(walk, axis=0)
+        + rng.normal(0, LEVEL_WHITE_M, (count, 2))
     )
-    constant = np.array([*rng.normal(0, _TILT_DEG, 2), np.rad2deg(turn_rad)])
+    constant = np.array([*rng.normal(0, TILT_DEG, 2), np.rad2deg(turn_rad)])
     return Readings(
         ned=place + np.column_stack([level_off, depth_off]),
         angles_deg=np.rad2deg(attitude_from_rotation(bodies.rotation))
         + constant
-        + rng.normal(0, _ATTITUDE_WHITE_DEG, (count, 3)),
+        + rng.normal(0, ATTITUDE_WHITE_DEG, (count, 3)),
         sigmas=np.tile(
-            [np.hypot(_FIX_M, _STRETCH * np.ptp(away)), _DEPTH_CONSTANT_M,
-             np.hypot(_TILT_DEG, _ATTITUDE_WHITE_DEG), _HEADING_DEG],
+            [np.hypot(FIX_M, STRETCH * np.ptp(away)), DEPTH_CONSTANT_M,
+             np.hypot(TILT_DEG, ATTITUDE_WHITE_DEG), HEADING_DEG],
             (count, 1),
         ),
     )  # fmt: skip
@@ -307,7 +314,7 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
             local = pose.inv().apply(points[near])
             at = camera.project(local)
             inside = np.all((at > 1) & (at < [camera.width_px - 1, camera.height_px - 1]), axis=1)
-            inside &= rng.uniform(size=len(near)) < _MATCHED
+            inside &= rng.uniform(size=len(near)) < MATCHED
             where.append(pose)
             seen.append((near[inside], at[inside]))
             depths.append(local[inside, 2])
@@ -319,7 +326,7 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
     ]
     scene = Scene(
         rig=rig,
-        records=_records(track, list(rig.cameras), read),
+        records=records_of(track, list(rig.cameras), read),
         ned_from_cam=where,
         points_ned=points[:enough],
         pixels=pixels,
@@ -348,7 +355,8 @@ def _points(track: FlownTrack, seed: int) -> Array:
     return np.column_stack([level, track.floor.depth_at(level)])
 
 
-def _records(track: FlownTrack, cameras: Sequence[str], read: Readings) -> list[ImageRecord]:
+def records_of(track: FlownTrack, cameras: Sequence[str], read: Readings) -> list[ImageRecord]:
+    """Pictures of all stations with what the log says of them."""
     places = track.datum.geodetic_from_ned(read.ned)
     return [
         ImageRecord(

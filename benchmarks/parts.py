@@ -128,6 +128,13 @@ PARTS = (
     Part(name="features", module="features", arguments=_features, needs=_need_features),
     Part(name="refraction", module="refraction"),
     Part(name="bend", module="bend", arguments=lambda _, work: ("--work", str(work))),
+    Part(name="bend-power", module="bend_power", arguments=lambda _, work: ("--work", str(work))),
+    Part(
+        name="precision",
+        module="precision",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
     Part(
         name="reconstruct-peers",
         module="reconstruct",

@@ -36,8 +36,8 @@ def test_every_benchmark_that_hands_figures_over_is_a_part() -> None:
     found = sorted(file.stem for file in files if "add_options(parser" in file.read_text())
 
     assert found == MODULES
-    assert {"camera", "planner", "vehicle", "features", "refraction", "bend", "reconstruct",
-            "mosaic", "real_pictures"} == {*MODULES}  # fmt: skip
+    assert {"camera", "planner", "vehicle", "features", "refraction", "bend", "bend_power",
+            "precision", "reconstruct", "mosaic", "real_pictures"} == {*MODULES}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -27,6 +27,7 @@ app = typer.Typer(
         "plan -w reef --all",
         "plan -w reef -s other.toml --json",
         "plan solve -w reef --resolution 0.5",
+        "plan precision -w reef",
         "plan gain 'control/*.jpg'",
         "plan check navigation.csv -w reef",
         "plan revisit -w reef",
@@ -63,6 +64,7 @@ def plan(
         "plan solve -w reef --resolution 0.5",
         "plan solve -w reef --dive 3600",
         "plan solve -w reef --rate 0.25 --lens 12.5 --lens 25 --json",
+        "plan solve -w reef --bend 5mm",
     )
 )
 def solve(
@@ -74,17 +76,30 @@ def solve(
     dive: Annotated[float | None, typer.Option(min=1, max=1e6, help="Length of a dive, s.")] = None,
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Fixed frame rate, Hz.")] = None,
     lens: Annotated[list[float] | None, typer.Option(help="Focal lengths at hand, mm.")] = None,
+    bend: Annotated[
+        str | None,
+        typer.Option(help="Sigma of the model's bend (5mm, 0.5cm, or mm): the measures it takes."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Find settings from what is given.
 
-    Altitude and lens for a resolution, the area that fits a dive, or the speed for a frame rate.
+    Altitude and lens for a resolution, the area that fits a dive, the speed for a frame rate, or
+    the cross lines, closing line and overlaps that keep a model from bending.
     """
+    from alice_survey.base.errors import ConfigError
     from alice_survey.survey import settings
     from missions.exposure.settings import ImagingSetup
     from missions.exposure.solve import solve_report
 
     config = settings(workspace, survey, needed=False)
+    if bend is not None:
+        from reconstruct.precision.run import bend_report, length_m
+
+        if not resolution is dive is rate is None:
+            raise ConfigError("--bend goes alone: solve for the rest first, and set it")
+        print_result(*bend_report(workspace, config, length_m(bend)), as_json)
+        return
     print_result(
         *solve_report(
             ImagingSetup.of(config),
@@ -96,6 +111,32 @@ def solve(
         ),
         as_json,
     )
+
+
+@app.command(
+    epilog=examples(
+        "plan precision -w reef", "plan precision -w reef --plot precision.png --no-measures --json"
+    )
+)
+def precision(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    measures: Annotated[
+        bool, typer.Option(help="Also plan more cross lines, overlap and more, and rank them.")
+    ] = True,
+    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Predict how well the survey will be known.
+
+    Sigmas of bend, scale, heights and stations from the plan's stations, the calibration and the
+    navigation, what dominates them, and what measures bring for a minute of dive.
+    """
+    from alice_survey.survey import settings
+    from reconstruct.precision.run import precision_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(*precision_report(workspace, config, measures=measures, plot=plot), as_json)
 
 
 @app.command(

@@ -174,7 +174,7 @@ def fit_survey(
     if not fields:  # held: what errors of the calibration do, all the same
         fields = calibrated_parameters(rig, names)
         if rig.covariance is not None:
-            known = _calibrated(rig, fields)
+            known = calibrated_covariance(rig, fields)
         linear = exact_observations(guess.state, pixels, fields)
         equations = problem.reduced(replace(guess, linear=linear), found.noise)
     sigma_px, variance = found.noise.tolist()
@@ -187,13 +187,13 @@ def fit_survey(
         before=np.array([value(problem.start.state.rig, name) for name in problem.fields]),
         prior_sigmas=np.sqrt(np.diag(inverse_of(problem.information))),
         covariance=covariance,
-        calibration=_motions(equations, guess.state.points, known) if fields else None,
+        calibration=motions_of(equations, guess.state.points, known) if fields else None,
         sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
     )
 
 
-def _motions(equations: PointEquations, places: Array, covariance: Array) -> Motions:
+def motions_of(equations: PointEquations, places: Array, covariance: Array) -> Motions:
     """What changes of the shared parameters do to stations and points."""
     stations = equations.response
     units = np.eye(len(covariance), len(covariance) + 1)
@@ -312,10 +312,10 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
     if not known:
         return loose
     prior = Prior.of_rig(rig, known)
-    return replace(prior, covariance=_calibrated(rig, known)).and_also(loose)
+    return replace(prior, covariance=calibrated_covariance(rig, known)).and_also(loose)
 
 
-def _calibrated(rig: Rig, names: Sequence[str]) -> Array:
+def calibrated_covariance(rig: Rig, names: Sequence[str]) -> Array:
     """What a calibration knows of where keypoints lie, as a covariance of its parameters."""
     bias = bias_covariance(rig, names)
     return bias if rig.covariance is None else bias + rig.covariance.marginal(names).matrix

@@ -32,6 +32,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from alice_survey.base.block_solver import product_of
 from alice_survey.base.contents import read_arrays, taken_from
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
@@ -208,32 +209,90 @@ def estimate(
     sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
     weights = cauchy_weights(linear.miss, sigma)
     variance = variance_of(linear.miss, weights, left)
-    linear = linear.weighted(weights / variance)
     centres = rig_poses(model, frames).inv().translation
-    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
-    loose = np.bincount(linear.station, minlength=len(frames)) < LEAST_POINTS
-    equations = replace(reduce_points(linear, len(frames)), free=~(gauge.held | loose[:, None]))
-    blocks = gauge.shape_blocks(equations)
-    blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
-    points = equations.point_covariances(blocks)
-    frame_cov = blocks[equations.own]
-    moving = None
-    if calibration is not None:
-        shape = calibration.without(gauge)
-        frame_cov = frame_cov + shape.of_stations()
-        points += shape.of_points(seen.points)
-        moving = None if held else calibration
+    shape = shape_of_block(
+        linear.weighted(weights / variance), centres, seen.points, calibration,
+        scale_free=scale_free, held=held,
+    )  # fmt: skip
     first = _first_pictures(model, seen, frames)
     return Uncertainty(
         frames=frames,
         stations=np.array([records[n - 1].station for n in first], dtype=np.int64),
         images=tuple(records[n - 1].image for n in first),
-        frame_cov=frame_cov,
+        frame_cov=shape.stations,
         point_ids=seen.point_ids,
-        point_cov=points,
-        point_noise=equations.point_inverse,
+        point_cov=shape.points,
+        point_noise=shape.noise,
         sigma_px=float(np.sqrt(variance / weights.mean())),
-        modes=_soft_modes(equations, gauge, moving, seen.points),
+        modes=shape.modes,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockShape:
+    """Covariances of a block's shape (see `Uncertainty`)."""
+
+    stations: Array
+    """(F, 6, 6); NaN of one that sees too little."""
+    points: Array
+    """(P, 3, 3)."""
+    noise: Array
+    """(P, 3, 3) what the noise of a point's own keypoints does."""
+    modes: SoftModes
+    equations: PointEquations
+    """Of the stations, with nothing shared."""
+    calibration: Motions | None
+    """What errors of the rig do; None where they are unknown."""
+
+    def variance(self, weights: Array) -> float:
+        """Variance of a sum over stations, (F, 6), that no motion of the whole block changes."""
+        found = float((weights * self.equations.covariance_times(weights[..., None])[..., 0]).sum())
+        if self.calibration is not None:
+            along = product_of(weights[..., None], self.calibration.stations)[0]
+            found += float(along @ self.calibration.covariance @ along)
+        return found
+
+
+def shape_of_block(
+    linear: LinearObservations,
+    centres: Array,
+    points: Array,
+    calibration: Motions | None,
+    *,
+    scale_free: bool,
+    held: bool = False,
+) -> BlockShape:
+    """Covariances of the shape that weighted observations and a calibration determine.
+
+    Args:
+        linear: observations in their sigmas; nothing is shared.
+        centres: (F, 3) of the stations.
+        points: (P, 3).
+        calibration: what errors of the rig do; None where they are unknown.
+        scale_free: whether nothing fixes the scale.
+        held: whether the rig stays as it is, so that no mode may move it.
+    """
+    count = len(centres)
+    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
+    loose = np.bincount(linear.station, minlength=count) < LEAST_POINTS
+    equations = replace(reduce_points(linear, count), free=~(gauge.held | loose[:, None]))
+    blocks = gauge.shape_blocks(equations)
+    blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
+    of_points = equations.point_covariances(blocks)
+    of_stations = blocks[equations.own]
+    moving = None
+    if calibration is not None:
+        shape = calibration.without(gauge)
+        of_stations = of_stations + shape.of_stations()
+        of_points += shape.of_points(points)
+        moving = None if held else calibration
+    return BlockShape(
+        stations=of_stations,
+        points=of_points,
+        noise=equations.point_inverse,
+        modes=_soft_modes(equations, gauge, moving, points),
+        equations=equations,
+        calibration=calibration,
     )
 
 

@@ -486,8 +486,8 @@ def _place(
     else:
         records = _with_gps(records, entries)
         level = "EXIF GPS altitude"
-    told = Counter(name for r in records for name, known in r.readings.items() if known)
-    if not told:
+    counted = Counter(name for r in records for name, known in r.readings.items() if known)
+    if not counted:
         if log is not None:
             raise ImageError(
                 f"no picture was taken while navigation was logged: pictures at "
@@ -498,9 +498,9 @@ def _place(
         return list(records), None, "none"
     if log is None:
         notes.append("positions from EXIF GPS, of unknown accuracy")
-    complete = {name for name, count in told.items() if count == len(records)}
+    complete = {name for name, count in counted.items() if count == len(records)}
     if complete != set(records[0].readings):
-        counts = ", ".join(f"{name} of {told[name]}" for name in records[0].readings)
+        counts = ", ".join(f"{name} of {counted[name]}" for name in records[0].readings)
         notes.append(f"navigation of {len(records)} pictures: {counts}")
     first = next((r for r in records if r.has_horizontal), None)
     if first is None:
@@ -537,12 +537,12 @@ def _with_navigation(
     records: Sequence[ImageRecord], times: Array, log: NavigationLog
 ) -> list[ImageRecord]:
     found = log.at(times)
-    told = np.any([np.isfinite(found[name]) for name in READINGS if name in found], axis=0)
-    warn_of_gaps([r.image for r in records], times, np.where(told, 1.0, np.nan), log)
+    has_reading = np.any([np.isfinite(found[name]) for name in READINGS if name in found], axis=0)
+    warn_of_gaps([r.image for r in records], times, np.where(has_reading, 1.0, np.nan), log)
     placed = []
     for i, record in enumerate(records):
         values: dict[str, Any] = {name: float(column[i]) for name, column in found.items()}
-        placed.append(replace(record, **values) if told[i] else record)
+        placed.append(replace(record, **values) if has_reading[i] else record)
     return placed
 
 

@@ -50,9 +50,9 @@ _SETTLED_SIGMAS = 0.01
 _LEAST_BOUND = 1e-9
 _SHRUNK = 1e-6
 """Share of its first scale below which a model has shrunk to a point."""
-_LEVER_SIGMA_M = 0.02
+LEVER_SIGMA_M = 0.02
 """Of the measured place of a camera on its vehicle, along each axis."""
-_CLOCK_SIGMA_S = 0.2
+CLOCK_SIGMA_S = 0.2
 """Of the clock of cameras against that of navigation."""
 _CONTRADICTION_SIGMAS = 3.0
 """A nuisance this far from what is expected of it is reported."""
@@ -72,8 +72,8 @@ _NUISANCES = {
     "clock_s": (CLOCK, 1.0),
 }
 _EXPECTED = {
-    "lever_forward_m": _LEVER_SIGMA_M, "lever_right_m": _LEVER_SIGMA_M,
-    "lever_down_m": _LEVER_SIGMA_M, "clock_s": _CLOCK_SIGMA_S,
+    "lever_forward_m": LEVER_SIGMA_M, "lever_right_m": LEVER_SIGMA_M,
+    "lever_down_m": LEVER_SIGMA_M, "clock_s": CLOCK_SIGMA_S,
 }  # fmt: skip
 
 
@@ -420,7 +420,7 @@ class _NavigationTask:
             rows.append(scale)
         known = np.zeros(columns)
         known[PARAMETERS:] = 1.0
-        known[LEVER], known[CLOCK] = 1.0 / _LEVER_SIGMA_M, 1.0 / _CLOCK_SIGMA_S
+        known[LEVER], known[CLOCK] = 1.0 / LEVER_SIGMA_M, 1.0 / CLOCK_SIGMA_S
         if self.mount_sigma_rad > 0:
             known[MOUNT] = 1.0 / self.mount_sigma_rad
         at = np.flatnonzero(known)

@@ -113,12 +113,12 @@ def read_epochs(
     Pictures of one station share one reading of navigation, which must not count twice. Without
     `body_from_cam` positions are those of the cameras, and what attitudes mean for them is unknown.
     """
-    told = np.array([_told(r) for r in records])
+    readings = np.array([_readings(r) for r in records])
     if datum is None:
-        told[:, :2] = np.nan
+        readings[:, :2] = np.nan
     if body_from_cam is None:
-        told[:, 3:] = np.nan
-    chosen = [int(i) for i in np.flatnonzero(np.isfinite(told).any(axis=1))]
+        readings[:, 3:] = np.nan
+    chosen = [int(i) for i in np.flatnonzero(np.isfinite(readings).any(axis=1))]
     if not chosen:
         return None
     timed = all(np.isfinite(records[i].time_s) for i in chosen)
@@ -128,17 +128,17 @@ def read_epochs(
     rows = [records[i] for i in chosen]
     stations = list(dict.fromkeys(r.station for r in rows))
     number = {station: k for k, station in enumerate(stations)}
-    first = [next(r for r in rows if r.station == station) for station in stations]
+    firsts: dict[int, ImageRecord] = {}
+    for row in rows:
+        firsts.setdefault(row.station, row)
+    first = list(firsts.values())
     moment = np.array([number[r.station] for r in rows])
-    told = told[chosen]
-    for station in range(len(stations)):  # its pictures share what is told of one of them
-        of = told[moment == station]
-        for channel in np.flatnonzero(np.isfinite(of).any(axis=0)):
-            column = of[:, channel]
-            of[:, channel] = np.where(np.isnan(column), column[np.isfinite(column)][0], column)
-        told[moment == station] = of
-    known = np.zeros((len(stations), 6), dtype=bool)
-    np.logical_or.at(known, moment, np.isfinite(told))
+    readings = readings[chosen]
+    shared = np.full((len(stations), 6), np.nan)  # pictures of a station share what one has
+    for at, row_of in zip(moment[::-1], readings[::-1], strict=True):
+        shared[at] = np.where(np.isnan(row_of), shared[at], row_of)
+    readings = np.where(np.isnan(readings), shared[moment], readings)
+    known = np.isfinite(shared)
     unknown = RigidTransform.identity()
     levers = [unknown if body_from_cam is None else body_from_cam[r.camera] for r in rows]
     time = [r.time_s for r in first] if timed else [float(s) for s in stations]
@@ -154,15 +154,15 @@ def read_epochs(
             ]
         ),
         levers=np.stack([-lever.translation for lever in levers]),
-        measured_ned=_positions(told, datum),
-        ned_from_body=rotation_from_attitude(*np.deg2rad(np.nan_to_num(told[:, 3:])).T),
+        measured_ned=_positions(readings, datum),
+        ned_from_body=rotation_from_attitude(*np.deg2rad(np.nan_to_num(readings[:, 3:])).T),
         sigma=_sigmas(first),
         known=known,
         modes=np.zeros((len(chosen), 6, 0)) if modes is None else modes[chosen],
     )
 
 
-def _told(record: ImageRecord) -> Array:
+def _readings(record: ImageRecord) -> Array:
     """(6,) what each channel of navigation says of a picture; NaN where it says nothing."""
     place = np.array([record.latitude_deg, record.longitude_deg])
     place = place + 0.0 * place.sum()  # one without the other is of no use
@@ -170,14 +170,14 @@ def _told(record: ImageRecord) -> Array:
     return np.array([*place, record.depth_m, *attitude])
 
 
-def _positions(told: Array, datum: Datum | None) -> Array:
-    """(N, 3) positions in NED; what is not told of one is that of the middle of all, else zero."""
-    known = [bool(np.isfinite(column).any()) for column in told[:, :3].T]
+def _positions(readings: Array, datum: Datum | None) -> Array:
+    """(N, 3) positions in NED; what is not known of one is that of the middle of all, else zero."""
+    known = [bool(np.isfinite(column).any()) for column in readings[:, :3].T]
     if datum is None or not known[0]:
-        depths = told[:, 2]
+        depths = readings[:, 2]
         depths = np.where(np.isfinite(depths), depths, np.nanmean(depths) if known[2] else 0.0)
         return np.outer(depths, [0.0, 0.0, 1.0])
-    places = told[:, :3].copy()
+    places = readings[:, :3].copy()
     if not known[2]:
         places[:, 2] = 0.0
     middle = np.nanmean(places, axis=0)

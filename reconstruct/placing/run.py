@@ -411,7 +411,7 @@ def _fit(
 
 def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
     """What of a place without positions is measured, and what is the model's own."""
-    known = {name for record in records for name, told in record.readings.items() if told}
+    known = {name for record in records for name, known in record.readings.items() if known}
     axes = {
         "levelled": bool(known & {"depth", "roll and pitch"}),
         "depth": "depth" in known,

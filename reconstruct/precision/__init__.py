@@ -1,0 +1,1 @@
+"""How well a survey will be known, predicted from its plan."""
