@@ -311,7 +311,7 @@ class _NavigationTask:
                 )
         return PlacementFit(
             ned_from_model=place,
-            used=int(got.used[:, :3].any(axis=1).sum()),
+            used=int((got.used[:, 0] if got.used[:, 0].any() else got.used[:, 2]).sum()),
             left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
             rms_m=_rms(misses),
             free_scale=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,

@@ -24,7 +24,7 @@ class PlacementFit:
 
     ned_from_model: Similarity
     used: int
-    """Stations with a position that took part."""
+    """Stations with a position (without any, with a depth) that took part."""
     left_out: Mapping[str, int]
     """For each group of channels, how many readings the rest contradicts."""
     rms_m: Array

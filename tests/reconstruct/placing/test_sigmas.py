@@ -183,7 +183,8 @@ def test_the_mount_adds_its_sigma_and_a_turning_vehicle_shows_it() -> None:
 
 def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:
     body = flight(1, 20)
-    records = [replace(r, roll_deg=np.nan) for r in flown(body, 6, 1.0)]
+    unknown = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), np.nan)
+    records = [replace(r, **unknown) for r in flown(body, 6, 1.0)]
     fit, error, sigma = place(body, records, 1)
     about_line, about_slope, heading = np.rad2deg(sigma[3:6])
     assert 8.0 < about_line < 10.5  # what the level sea floor says
