@@ -6,6 +6,7 @@ pixels as taken depend on stations, on points and on every parameter of the rig.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,8 +21,8 @@ from reconstruct.mapping.mapper import Mapped
 
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
-_MOST_OBSERVATIONS = 500_000
-"""Linearised they take 1.2 kB each; of more, whole points are left out evenly."""
+PART = 250_000
+"""Observations that are linearised at a time, some: they take 1.2 kB each."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,6 +44,25 @@ class Pixels:
     def points(self) -> int:
         """How many there are."""
         return len(self.starts) - 1
+
+    @property
+    def seen_by(self) -> Indices:
+        """(O,) how many observations each one's point has."""
+        counts: Indices = np.diff(self.starts)
+        return np.repeat(counts, counts)
+
+    def parts(self) -> "list[Pixels]":
+        """Runs of whole points, of about `PART` observations each."""
+        ends = np.searchsorted(self.starts, np.arange(PART, len(self.station), PART))
+        bounds = np.unique([0, *ends, self.points])
+        return [self._run(first, end) for first, end in pairwise(bounds.tolist())]
+
+    def _run(self, first: int, end: int) -> "Pixels":
+        rows = slice(self.starts[first], self.starts[end])
+        return Pixels(
+            starts=self.starts[first : end + 1] - self.starts[first], station=self.station[rows],
+            camera=self.camera[rows], taken=self.taken[rows], point=self.point[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,10 +102,8 @@ def choose_pixels(
         taken[rows] = seen.taken[number - 1][found.keypoint[rows]]
         camera[rows] = names.index(record.camera)
         station[rows] = np.searchsorted(frames, model.images[number].frame_id)
-    every = -(-len(found.point) // _MOST_OBSERVATIONS)
     lost = np.unique(found.point[~np.isfinite(taken).all(axis=1)])
-    kept = (found.point % every == 0) & ~np.isin(found.point, lost)
-    order = np.flatnonzero(kept)
+    order = np.flatnonzero(~np.isin(found.point, lost))
     order = order[np.argsort(found.point[order], kind="stable")]
     points, inverse = np.unique(found.point[order], return_inverse=True)
     starts = np.concatenate([[0], np.cumsum(np.bincount(inverse, minlength=len(points)))])
@@ -124,6 +142,17 @@ def start_state(
         centres=poses.translation,
         points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
     )
+
+
+def exact_misses(state: RigState, pixels: Pixels) -> Array:
+    """(O, 2) computed pixels minus observed ones; NaN where no ray explains one."""
+    arm = state.points[pixels.point] - state.centres[pixels.station]
+    misses = np.empty((len(arm), 2))
+    for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
+        rows = np.flatnonzero(pixels.camera == c)
+        in_rig = np.einsum("nij,ni->nj", state.turns[pixels.station[rows]], arm[rows])
+        misses[rows] = state.rig.cameras[name].project(pose.apply(in_rig)) - pixels.taken[rows]
+    return misses
 
 
 def exact_observations(

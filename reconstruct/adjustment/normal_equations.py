@@ -8,6 +8,7 @@ one, which leaves a block-sparse system of the stations with a border of what is
 (`alice_survey.base.block_solver`).
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,7 +64,8 @@ class LinearObservations:
 class PointEquations(Equations):
     """Normal equations of stations and of what is shared, the points eliminated."""
 
-    linear: LinearObservations
+    parts: Iterable[LinearObservations]
+    """Observations by whole points, in order; all that is taken from them is a sum over points."""
     point_inverse: Array
     """(P, 3, 3) covariance of the points where all else is known."""
 
@@ -73,7 +75,25 @@ class PointEquations(Equations):
 
     def follow(self, poses: Array, rest: Array) -> Array:
         """Motions (P, 3) of points by steps (F, 6) of stations and (G + 1,) of the `rest`."""
-        return _follow(*self.linear.arrays, self.point_inverse, poses, rest)
+        return self._by_point(lambda part, inverse: _follow(*part.arrays, inverse, poses, rest))
+
+    def follow_shared(self, response: Array, every: int) -> Array:
+        """Motions (P', 3, G) of every n-th point by what is shared.
+
+        Args:
+            response: (F, 6, G) how stations move by it.
+            every: n.
+        """
+        poses = np.ascontiguousarray(response.transpose(2, 0, 1))
+        units = np.eye(len(poses), len(poses) + 1)
+
+        def found(part: LinearObservations, inverse: Array) -> Array:
+            moved = [
+                _follow(*part.arrays, inverse, *step) for step in zip(poses, units, strict=True)
+            ]
+            return np.stack(moved, axis=-1)
+
+        return self._by_point(found, every)
 
     def point_covariances(self, blocks: Array) -> Array:
         """Covariance of every point, (P, 3, 3), from those of its stations.
@@ -84,7 +104,19 @@ class PointEquations(Equations):
             blocks: (B, 6, 6) covariances between the stations that see a point in common.
         """
         pattern = self.pointers, self.columns
-        return _point_covariances(*self.linear.arrays, self.point_inverse, *pattern, blocks)
+        return self._by_point(
+            lambda part, inverse: _point_covariances(*part.arrays, inverse, *pattern, blocks)
+        )
+
+    def _by_point(
+        self, found: Callable[[LinearObservations, Array], Array], every: int = 1
+    ) -> Array:
+        values, first = [], 0
+        for part in self.parts:
+            end = first + len(part.starts) - 1
+            values.append(found(part, self.point_inverse[first:end])[-first % every :: every])
+            first = end
+        return np.concatenate(values)
 
 
 def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
@@ -94,15 +126,36 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
         linear: observations; every point needs two that see it from apart.
         stations: F, how many there are.
     """
+    return reduce_parts([linear], linear.starts, linear.station, stations)
+
+
+def reduce_parts(
+    parts: Iterable[LinearObservations], starts: Indices, station: Indices, stations: int
+) -> PointEquations:
+    """Eliminate the points of observations that are too many to be linearised all at a time.
+
+    Args:
+        parts: the observations by whole points, in order; iterated whenever they are needed.
+        starts: (P + 1,) start of each point's observations.
+        station: (O,) of all observations.
+        stations: F, how many there are.
+    """
     meets = np.eye(stations, dtype=np.bool_)
-    _mark(linear.starts, linear.station, meets)
+    _mark(starts, station, meets)
     rows, columns = np.nonzero(meets)
     pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
     columns = columns.astype(np.int64)
-    blocks, border, shared, inverse = _reduce(*linear.arrays, pointers, columns)
+    sums: list[Array] = []
+    inverses = []
+    for part in parts:
+        *found, inverse = _reduce(*part.arrays, pointers, columns)
+        sums = [a + b for a, b in zip(sums, found, strict=True)] if sums else found
+        inverses.append(inverse)
+    blocks, border, shared = sums
     return PointEquations(
         pointers=pointers, columns=columns, blocks=blocks, border=border, shared=shared,
-        free=np.ones((stations, POSE), dtype=np.bool_), linear=linear, point_inverse=inverse,
+        free=np.ones((stations, POSE), dtype=np.bool_), parts=parts,
+        point_inverse=np.concatenate(inverses),
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ what is free. The model is then rebuilt on the pinholes of the refined rig.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -30,6 +30,7 @@ from reconstruct.adjustment.exact_observations import (
     RigState,
     calibrated_parameters,
     choose_pixels,
+    exact_misses,
     exact_observations,
     start_state,
 )
@@ -39,7 +40,7 @@ from reconstruct.adjustment.normal_equations import (
     POSE,
     LinearObservations,
     PointEquations,
-    reduce_points,
+    reduce_parts,
 )
 from reconstruct.adjustment.uncertainty import Motions, SoftModes
 from reconstruct.mapping.arrays import Indices, frames_of
@@ -55,6 +56,8 @@ _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
 _STEPS = 20
+_MOST_PLACES = 100_000
+"""Points whose motions by 65 parameters take 160 MB."""
 _SETTLED = 0.05
 """Length of a step of all parameters, in sigmas, at which the adjustment ends."""
 
@@ -175,10 +178,9 @@ def fit_survey(
         fields = calibrated_parameters(rig, names)
         if rig.covariance is not None:
             known = calibrated_covariance(rig, fields)
-        linear = exact_observations(guess.state, pixels, fields)
-        equations = problem.reduced(replace(guess, linear=linear), found.noise)
+        equations = problem.reduced(guess, found.noise, fields)
     sigma_px, variance = found.noise.tolist()
-    weights = cauchy_weights(guess.linear.miss, sigma_px)
+    weights = cauchy_weights(guess.miss, sigma_px)
     return SurveyFit(
         calibrated=rig,
         state=guess.state,
@@ -193,16 +195,20 @@ def fit_survey(
     )
 
 
-def motions_of(equations: PointEquations, places: Array, covariance: Array) -> Motions:
-    """What changes of the shared parameters do to stations and points."""
-    stations = equations.response
-    units = np.eye(len(covariance), len(covariance) + 1)
-    points = [
-        equations.follow(np.ascontiguousarray(stations[:, :, g]), unit)
-        for g, unit in enumerate(units)
-    ]
+def motions_of(equations: PointEquations, points: Array, covariance: Array) -> Motions:
+    """What changes of the shared parameters do to stations and to points, evenly chosen.
+
+    Args:
+        equations: of the block.
+        points: (P, 3).
+        covariance: (G, G) of the parameters.
+    """
+    stations, every = equations.response, -(-len(points) // _MOST_PLACES)
     return Motions(
-        stations=stations, places=places, points=np.stack(points, axis=-1), covariance=covariance
+        stations=stations,
+        places=points[::every],
+        points=equations.follow_shared(stations, every),
+        covariance=covariance,
     )
 
 
@@ -211,9 +217,30 @@ class _Guess:
     """One guess of all unknowns, with what is seen from there."""
 
     state: RigState
-    linear: LinearObservations
+    miss: Array
+    """(O, 2) computed pixels minus observed ones, 0 where no ray explains one."""
     lost: int
     """Observations that no ray explains: they do not count."""
+
+
+class _Linearised:
+    """Weighted observations from one guess, part by part; anew each time, but for a single part."""
+
+    def __init__(self, state: RigState, pixels: Pixels, fields: Sequence[str], noise: Array):
+        self.state, self.fields, self.noise = state, fields, noise
+        self.runs = pixels.parts()
+        self.kept: LinearObservations | None = None
+
+    def __iter__(self) -> Iterator[LinearObservations]:
+        sigma, variance = self.noise
+        for run in self.runs:
+            found = self.kept
+            if found is None:
+                found = exact_observations(self.state, run, self.fields)
+                found = found.weighted(cauchy_weights(found.miss, sigma) / variance)
+            if len(self.runs) == 1:
+                self.kept = found
+            yield found
 
 
 class _SurveyProblem:
@@ -241,14 +268,15 @@ class _SurveyProblem:
         return spare
 
     def _seen(self, state: RigState) -> _Guess:
-        linear = exact_observations(state, self.pixels, self.fields)
-        lost = int((~linear.by_point[:, 0].any(axis=1)).sum())
-        return _Guess(state=state, linear=linear, lost=lost)
+        miss = exact_misses(state, self.pixels)
+        lost = ~np.isfinite(miss).all(axis=1)
+        miss[lost] = 0.0
+        return _Guess(state=state, miss=miss, lost=int(lost.sum()))
 
     def noise(self, guess: _Guess) -> Array:
         """Sigma of a keypoint's coordinate for the weights, and variance that scales them."""
-        miss = guess.linear.miss
-        sigma = sigma_of(miss, guess.linear.seen_by, len(guess.state.centres))
+        miss = guess.miss
+        sigma = sigma_of(miss, self.pixels.seen_by, len(guess.state.centres))
         return np.array([sigma, variance_of(miss, cauchy_weights(miss, sigma), self.left)])
 
     def cost(self, guess: _Guess, noise: Array) -> float:
@@ -257,21 +285,22 @@ class _SurveyProblem:
             return math.inf
         sigma, variance = noise
         off = self.prior.misfit(guess.state.rig)
-        pixels = cauchy_cost(guess.linear.miss, sigma) / variance
+        pixels = cauchy_cost(guess.miss, sigma) / variance
         return 0.5 * float(pixels + off @ self.information @ off)
 
     def linearised(self, guess: _Guess, noise: Array) -> PointEquations:
         """Normal equations with the points eliminated."""
-        found = self.reduced(guess, noise)
+        found = self.reduced(guess, noise, self.fields)
         found.shared[:-1, :-1] += self.information
         found.shared[:-1, -1] += self.information @ self.prior.misfit(guess.state.rig)
         return found
 
-    def reduced(self, guess: _Guess, noise: Array) -> PointEquations:
-        """The same without what is known before the pictures."""
-        sigma, variance = noise
-        weights = cauchy_weights(guess.linear.miss, sigma) / variance
-        found = reduce_points(guess.linear.weighted(weights), len(guess.state.centres))
+    def reduced(self, guess: _Guess, noise: Array, fields: Sequence[str]) -> PointEquations:
+        """The same without what is known before the pictures, for any fields of the rig."""
+        pixels = self.pixels
+        parts = _Linearised(guess.state, pixels, fields, noise)
+        stations = len(guess.state.centres)
+        found = reduce_parts(parts, pixels.starts, pixels.station, stations)
         found.free[self.held] = False
         return found
 

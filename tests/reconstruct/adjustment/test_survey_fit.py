@@ -15,6 +15,7 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.records import RangeRecord
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
+from reconstruct.adjustment import exact_observations, survey_fit
 from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
 from reconstruct.adjustment.exact_observations import start_state
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
@@ -193,26 +194,34 @@ def test_keypoints_as_taken_come_back_from_the_model(tmp_path: Path) -> None:
         np.testing.assert_allclose(again, seen.taken[number - 1][rows], atol=1e-3)
 
 
-def test_points_that_took_no_part_move_along(
+def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An adjustment takes some of a large survey's points, and the others follow."""
     rng = np.random.default_rng(8)
     pixels = [p + rng.normal(0, 0.05, p.shape) for p in clean().pixels]
     scene = replace(clean(), pixels=pixels)
     wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
-    mapped, _ = modelled(scene, wrong, tmp_path)
-    errors = []
-    for most in (200_000, mapped.model.compute_num_observations() // 4):
-        monkeypatch.setattr("reconstruct.adjustment.exact_observations._MOST_OBSERVATIONS", most)
-        found = adjust_survey(mapped, scene.records, wrong, DISTANCES, RIG)
-        assert found.exact is not None
-        errors.append(points_rms(found.mapped, scene))
-        px = found.mapped.model.compute_mean_reprojection_error()
-        assert 0.03 < px < 0.09
-    assert len(found.exact.fit.point_ids) < 0.3 * len(mapped.model.points3D)
-    assert errors[0] < 0.5 * points_rms(mapped, scene)
-    assert errors[1] < 3.0 * errors[0]  # from a quarter of the observations
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    whole = fit_survey(mapped, seen, wrong, port=False, pose=True)
+    monkeypatch.setattr(exact_observations, "PART", whole.observations // 7)
+    parts = fit_survey(mapped, seen, wrong, port=False, pose=True)
+    assert whole.calibration is not None and parts.calibration is not None
+    assert whole.observations == parts.observations
+    for found, wanted in (
+        (parts.after, whole.after),
+        (parts.covariance, whole.covariance),
+        (parts.state.points, whole.state.points),
+        (parts.calibration.points, whole.calibration.points),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
+    monkeypatch.setattr(survey_fit, "_MOST_PLACES", len(whole.point_ids) // 3)
+    some = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
+    assert some is not None
+    assert 0.2 < len(some.places) / len(whole.point_ids) < 0.35
+    every = round(len(whole.point_ids) / len(some.places))
+    wanted = whole.calibration.points[::every]
+    np.testing.assert_allclose(some.points, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(some.places, whole.state.points[::every], rtol=1e-9)
 
 
 def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path) -> None:
