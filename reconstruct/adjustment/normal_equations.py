@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scipy.sparse import csr_matrix, identity
+
 from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices, product_of
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
@@ -140,32 +142,24 @@ def reduce_parts(
         station: (O,) of all observations.
         stations: F, how many there are.
     """
-    meets = np.eye(stations, dtype=np.bool_)
-    _mark(starts, station, meets)
-    rows, columns = np.nonzero(meets)
-    pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
-    columns = columns.astype(np.int64)
-    sums: list[Array] = []
+    seen = csr_matrix(
+        (np.ones(len(station), np.int32), station, starts), shape=(len(starts) - 1, stations)
+    )
+    meets = csr_matrix(seen.T @ seen + identity(stations, np.int32, format="csr"))
+    meets.sort_indices()
+    pointers, columns = meets.indptr.astype(np.int64), meets.indices.astype(np.int64)
     inverses = []
     for part in parts:
-        *found, inverse = _reduce(*part.arrays, pointers, columns)
-        sums = [a + b for a, b in zip(sums, found, strict=True)] if sums else found
-        inverses.append(inverse)
-    blocks, border, shared = sums
+        if not inverses:
+            count = part.rest.shape[2]
+            blocks, border = np.zeros((len(columns), POSE, POSE)), np.zeros((stations, POSE, count))
+            shared = np.zeros((count, count))
+        inverses.append(_reduce(*part.arrays, pointers, columns, blocks, border, shared))
     return PointEquations(
-        pointers=pointers, columns=columns, blocks=blocks, border=border, shared=shared,
-        free=np.ones((stations, POSE), dtype=np.bool_), parts=parts,
-        point_inverse=np.concatenate(inverses),
+        pointers=pointers, columns=columns, blocks=blocks, border=border,
+        shared=shared + np.tril(shared, -1).T, free=np.ones((stations, POSE), dtype=np.bool_),
+        parts=parts, point_inverse=np.concatenate(inverses),
     )  # fmt: skip
-
-
-@compiled
-def _mark(starts: Indices, station: Indices, meets: Flags) -> None:
-    """Mark the pairs of stations that see a point in common, in place."""
-    for p in range(starts.shape[0] - 1):
-        for a in range(starts[p], starts[p + 1]):
-            for b in range(starts[p], starts[p + 1]):
-                meets[station[a], station[b]] = True
 
 
 @compiled
@@ -208,12 +202,11 @@ def _invert(m: Array, out: Array) -> None:
 @compiled
 def _reduce(
     starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array,
-    pointers: Indices, columns: Indices,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, rest.shape[2]
+    pointers: Indices, columns: Indices, blocks: Array, border: Array, shared: Array,
+) -> Array:  # fmt: skip
+    """Add what some points say, in place, of `shared` below its diagonal; their (P, 3, 3)."""
+    points, count = starts.shape[0] - 1, rest.shape[2]
     longest = np.diff(starts).max()
-    blocks = np.zeros((columns.shape[0], 6, 6))
-    border, shared = np.zeros((stations, 6, count)), np.zeros((count, count))
     inverse = np.empty((points, 3, 3))
     pose = np.empty((longest, 2, 6))
     cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
@@ -280,10 +273,7 @@ def _reduce(
             for j in range(3):
                 for h in range(g + 1):
                     shared[g, h] -= together[j, g] * solved[j, h]
-    for g in range(count):
-        for h in range(g):
-            shared[h, g] = shared[g, h]
-    return blocks, border, shared, inverse
+    return inverse
 
 
 @compiled

@@ -167,7 +167,7 @@ def fit_survey(
     frames = frames_of(mapped.model)
     pixels, ids = choose_pixels(mapped, seen, names, frames)
     free = _prior(rig, names, port=port, pose=pose) if port or pose else Prior.around(rig, {})
-    problem = _SurveyProblem(pixels, start_state(mapped, rig, names, frames, ids), free)
+    problem = SurveyProblem(pixels, start_state(mapped, rig, names, frames, ids), free)
     found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
     if not found.is_settled:
         warn(f"the last adjustment did not settle in {_STEPS} steps: trust it with care")
@@ -243,7 +243,7 @@ class _Linearised:
             yield found
 
 
-class _SurveyProblem:
+class SurveyProblem:
     """Stations, points and rig of a survey as `minimise` adjusts them."""
 
     def __init__(self, pixels: Pixels, state: RigState, prior: Prior) -> None:

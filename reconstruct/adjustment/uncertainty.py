@@ -290,13 +290,13 @@ def shape_of_block(
         stations=of_stations,
         points=of_points,
         noise=equations.point_inverse,
-        modes=_soft_modes(equations, gauge, moving, points),
+        modes=soft_modes(equations, gauge, moving, points),
         equations=equations,
         calibration=calibration,
     )
 
 
-def _soft_modes(
+def soft_modes(
     equations: PointEquations, gauge: Gauge, calibration: Motions | None, points: Array
 ) -> SoftModes:
     """The leading eigenvectors of the covariance of the shape.
@@ -336,9 +336,10 @@ def _soft_modes(
     start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
     values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
     kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
-    shape, places, rigs = [], [], []
+    shape, rigs = [], []
+    places = np.empty((*points.shape, len(kept)), np.float32)
     nearest = None if calibration is None else calibration.nearest(points)
-    for k in kept.tolist():
+    for n, k in enumerate(kept.tolist()):
         own, step, rig = moved(vectors[:, k].reshape(stations, width))
         place = equations.follow(own, np.zeros(1))
         if calibration is not None:
@@ -346,12 +347,11 @@ def _soft_modes(
         whole = gauge.motion_in(step)
         size_of = np.sqrt(values[k])
         shape.append((step - gauge.motions @ whole) / size_of)
-        moved_by = (place - gauge.of_points(points) @ whole) / size_of
-        places.append(moved_by.astype(np.float32))
+        places[..., n] = (place - gauge.of_points(points) @ whole) / size_of
         rigs.append(rig / size_of)
     return SoftModes(
         stations=np.stack(shape, axis=-1),
-        points=np.stack(places, axis=-1),
+        points=places,
         calibration=np.stack(rigs, axis=-1),
     )
 
