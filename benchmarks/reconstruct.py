@@ -31,15 +31,8 @@ from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
 from benchmarks.reconstruct_figures import against_peers, against_real, grown, of_real
-from benchmarks.reconstruct_surveys import (
-    Accuracy,
-    pictures_of,
-    render,
-    score_ours,
-    score_peer,
-    subset,
-    survey_toml,
-)
+from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
+from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
 
 PARTS = ("peers", "growth", "haltbrekken", "brighton")
 NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.figures import Figure, Findings
 from benchmarks.measured import Cost
-from benchmarks.reconstruct_surveys import Accuracy
+from benchmarks.reconstruct_scores import Accuracy
 
 _Numbers = dict[str, tuple[float, str]]
 """Value and unit by name."""

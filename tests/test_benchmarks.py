@@ -20,7 +20,7 @@ from benchmarks.figures import Figure, Findings, Goal, hand_over
 from benchmarks.measured import Cost
 from benchmarks.parts import PARTS, Part, Settings, chosen
 from benchmarks.reconstruct_figures import against_peers
-from benchmarks.reconstruct_surveys import Accuracy
+from benchmarks.reconstruct_scores import Accuracy
 from benchmarks.runs import Run, run
 
 ROOT = Path(__file__).parents[1]

@@ -1,0 +1,69 @@
+"""Areas to plan: a quad, two L-shapes, a star, and a coast; each some number of rows wide."""
+
+import math
+
+import numpy as np
+import shapely
+import shapely.affinity
+from shapely.geometry import MultiPolygon, Polygon, box
+
+from alice_survey.base.frames import Array, Datum
+from missions.values.area import Area, multipolygon
+
+_COAST_SEED = 5
+_COAST_CORNERS = 500
+
+
+def shapes() -> dict[str, Polygon]:
+    """By name; x = north is one unit wide, and rows follow y = east."""
+    ell = Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
+    holes = Polygon([(0.1, 0.12), (0.3, 0.1), (0.33, 0.3), (0.12, 0.28)]), box(0.6, 0.15, 0.8, 0.32)
+    angles = np.arange(10) * math.pi / 5
+    radii = np.where(np.arange(10) % 2, 0.45, 1.0)
+    named = {
+        "quad": Polygon([(0, 0.1), (0.9, 0), (1, 0.8), (0.15, 1)]),
+        "L": ell,
+        "L, two holes": ell.difference(shapely.union_all(holes)),
+        "star": Polygon(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)),
+        f"coast, {_COAST_CORNERS} corners": _coast(),
+    }
+    return {name: _one_wide(shape) for name, shape in named.items()}
+
+
+def planned_area(shape: Polygon, rows: int, spacing_m: float, margin_m: float) -> Area:
+    """A shape as large as some rows; its holes are no-go zones, a margin is left to turn."""
+    size_m = rows * spacing_m
+    survey = shapely.affinity.scale(shape, size_m, size_m, origin=(0, 0))
+    holes = MultiPolygon([Polygon(ring) for ring in survey.interiors])
+    around = survey.buffer(margin_m, join_style="mitre").difference(holes)
+    return Area(
+        datum=Datum(latitude_deg=32.8, longitude_deg=34.9),
+        survey=multipolygon(survey),
+        allowed=multipolygon(around),
+        no_go=multipolygon(holes),
+    )
+
+
+def _one_wide(shape: Polygon) -> Polygon:
+    north_0, east_0, north_1, _ = shape.bounds
+    moved = shapely.affinity.translate(shape, -north_0, -east_0)
+    scale = 1.0 / (north_1 - north_0)
+    return shapely.affinity.scale(moved, scale, scale, origin=(0, 0))
+
+
+def _coast() -> Polygon:
+    """A closed coast by midpoint displacement (B. Mandelbrot 1982), the first that is simple."""
+    for attempt in range(1000):
+        rng = np.random.default_rng([_COAST_SEED, attempt])
+        angles = np.arange(8) * math.pi / 4
+        ring: Array = np.stack([np.cos(angles), 0.7 * np.sin(angles)], axis=1)
+        while len(ring) < _COAST_CORNERS:
+            sides = np.roll(ring, -1, axis=0) - ring
+            normals = sides[:, ::-1] * np.array([1.0, -1.0])
+            middles = ring + sides / 2 + normals * rng.normal(0, 0.13, (len(ring), 1))
+            ring = np.stack([ring, middles], axis=1).reshape(-1, 2)
+        kept = np.sort(rng.choice(len(ring), _COAST_CORNERS, replace=False))
+        coast = Polygon(ring[kept])
+        if coast.is_valid:
+            return coast
+    raise RuntimeError("no coast of these is simple")
