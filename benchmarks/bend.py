@@ -162,7 +162,8 @@ def score(found: Adjusted, true: RigidTransform) -> Score:
     at = found.ned_from_cam.translation
     aligned = align_rigid(at, true.translation).apply(at)
     off = aligned - true.translation
-    sags = sag_weights(true.translation[:, :2]) @ -off[:, 2]
+    sags = np.append(sag_weights(true.translation[:, :2]) @ -off[:, 2], np.nan)[:2]
+    along_sigma, across_sigma = (*found.bend_sigmas_m, np.nan)[:2]
     own = np.diagonal(found.shape, axis1=1, axis2=2)[:, :3]
     sigmas = np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
     turns = (found.ned_from_cam.rotation * true.rotation.inv()).as_rotvec()
@@ -171,15 +172,15 @@ def score(found: Adjusted, true: RigidTransform) -> Score:
     stated = np.sqrt(np.nanmean(own.sum(axis=1)))
     return Score(
         along=float(sags[0]),
-        along_sigma=found.bend_sigmas_m[0],
+        along_sigma=along_sigma,
         across=float(sags[1]),
-        across_sigma=found.bend_sigmas_m[1],
+        across_sigma=across_sigma,
         cameras=float(np.sqrt((off**2).sum(axis=1).mean())),
         cameras_sigma=float(stated),
         scale=1.0 / align_similarity(at, true.translation).scale - 1.0,
         scale_sigma=found.scale_sigma,
-        along_ratio=float(sags[0]) / found.bend_sigmas_m[0],
-        across_ratio=float(sags[1]) / found.bend_sigmas_m[1],
+        along_ratio=float(sags[0]) / along_sigma,
+        across_ratio=float(sags[1]) / across_sigma,
         cameras_ratio=float(np.sqrt(np.nanmean(off**2 / own))),
         north_ratio=float(ratios[0]),
         east_ratio=float(ratios[1]),

@@ -33,6 +33,7 @@ from camera_calib.freedom import moved
 from camera_calib.rig import Covariance, Rig, read_rig
 from missions.logs.navigation_csv import NavigationLog, read_navigation
 from missions.values.plan_file import read_plan
+from reconstruct.adjustment.keypoint_bias import bias_covariance
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.working_range import WorkingDistances
@@ -163,14 +164,24 @@ def _workspace(folder: Path, name: str, example: str, seed: int | None, extra: s
     return workspace
 
 
-def wrong_rig(rig: Rig, times: float, seed: int) -> Rig:
-    """A rig off another by a draw from its covariance, so many times as large."""
+def wrong_rig(rig: Rig, times: float, seed: int, *, bias_px: float = 0.0) -> Rig:
+    """A rig off another by a draw from its covariance.
+
+    Args:
+        rig: as calibrated.
+        times: as large.
+        seed: of the draw.
+        bias_px: radial shift, root mean square over a picture, of keypoints in all pictures of a
+            camera, as of another lens.
+    """
     assert rig.covariance is not None
     rng = np.random.default_rng([seed, _RIG])
-    scale = np.sqrt(np.diag(rig.covariance.matrix))
+    names, scale = rig.covariance.parameters, np.sqrt(np.diag(rig.covariance.matrix))
     factor = np.linalg.cholesky(rig.covariance.correlation)
     step = times * scale * (factor @ rng.normal(size=len(scale)))
-    return moved(rig, rig.covariance.parameters, step)
+    parts, axes = np.linalg.eigh(bias_covariance(rig, names, bias_px) / np.outer(scale, scale))
+    step += scale * (axes @ (np.sqrt(np.maximum(parts, 0.0)) * rng.normal(size=len(scale))))
+    return moved(rig, names, step)
 
 
 @dataclass(frozen=True, kw_only=True)

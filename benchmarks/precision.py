@@ -37,8 +37,8 @@ from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan
 from reconstruct.placing.alignment import align_rigid
-from reconstruct.precision.navigation import ChannelErrors, NavigationErrors
-from reconstruct.precision.planned import Candidate, stations_and_times
+from reconstruct.precision.candidates import Candidate, stations_and_times
+from reconstruct.precision.instruments import ChannelErrors, NavigationErrors
 from reconstruct.precision.predict import Precision, by_cell, predict
 from reconstruct.precision.tracks import TrackModel
 
@@ -49,6 +49,8 @@ _SWAY_M, _SWAY_DEG = 0.03, 0.5
 _CELLS = 3.0
 """Sides of cells over those of a prediction: in the median of a cell's points their own noise is
 lost."""
+_KEYPOINT_BIAS_PX = 0.006
+"""Of rendered surveys; the reconstruction and the prediction allow for 0.01."""
 _SWAY = 99
 """Stream of random numbers."""
 
@@ -127,7 +129,7 @@ def predicted(plan: Plan, rig: Rig, config: SurveyConfig) -> Precision:
         per_picture=bend_survey.OBSERVATIONS / pictures, matched=bend_survey.MATCHED,
         noise_px=bend_survey.NOISE_PX,
     )  # fmt: skip
-    block = Candidate(config=config, plan=plan, rig=rig).block(tracks)
+    block = Candidate(config=config, made=plan, rig=rig).block(tracks)
     return predict(block, errors_of_drawn_logs(float(np.ptp(time_s))))
 
 
@@ -147,8 +149,8 @@ def swayed(plan: Plan, rig: Rig, config: SurveyConfig, seed: int) -> FlownTrack:
 
 def errors(track: FlownTrack, rig: Rig, cell_m: float, seed: int) -> Array:
     """Sag along and across, scale, and rms of heights, of one reconstructed survey; metres."""
-    read = drawn(track, 0.0, seed)
-    begun = start(track, rig, wrong_rig(rig, 1.0, seed), read, seed)
+    read, true_rig = drawn(track, 0.0, seed), wrong_rig(rig, 1.0, seed, bias_px=_KEYPOINT_BIAS_PX)
+    begun = start(track, rig, true_rig, read, seed)
     with TemporaryDirectory() as folder:
         found = adjusted(begun.mapped, begun.seen, rig, begun.distances, begun.datum, Path(folder))
     pairs = zip(begun.scene.ned_from_cam, begun.scene.records, strict=True)

@@ -8,7 +8,15 @@ from urllib.parse import quote
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.config import SeaConfig
 from alice_survey.base.frames import Datum
-from alice_survey.kit.document import Link, MapScript, Report, Section, Table, Verdict
+from alice_survey.kit.document import (
+    Link,
+    MapScript,
+    PictureLayer,
+    Report,
+    Section,
+    Table,
+    Verdict,
+)
 from alice_survey.kit.page import render_html
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry
@@ -31,6 +39,7 @@ def write_page(
     sea: SeaConfig,
     warnings: Sequence[str],
     links: Sequence[Link],
+    layers: Sequence[PictureLayer] = (),
 ) -> None:
     """Write a plan as a page with an interactive map.
 
@@ -44,9 +53,10 @@ def write_page(
         sea: its mean current near the sea floor is shown.
         warnings: where the plan differs from what was requested.
         links: files to point to, their addresses as paths relative to the page.
+        layers: more of the map.
     """
     chart = replace(
-        plan_map(plan, rig, certificate, bathymetry, sea),
+        plan_map(plan, rig, certificate, bathymetry, sea, layers),
         script=MapScript(
             text=_SCRIPT.read_text(encoding="utf-8"), data=station_data(plan, rig, certificate)
         ),

@@ -7,7 +7,7 @@ five-thousandth of the map's width is left out.
 import base64
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,7 @@ def plan_map(
     certificate: Certificate,
     bathymetry: Bathymetry | None,
     sea: SeaConfig,
+    more: Sequence[Layer] = (),
 ) -> SurveyMap:
     """The layers of a plan's map.
 
@@ -67,11 +68,12 @@ def plan_map(
         certificate: how many pictures see each place.
         bathymetry: for contours, or None.
         sea: for the current.
+        more: layers over the counts.
     """
     outline = footprint_outline(plan, rig)
     extent = map_extent(plan, outline)
     detail_m = max(_FINEST_M, max(extent[2] - extent[0], extent[3] - extent[1]) * _DETAIL)
-    layers = [*_coverage_layers(certificate), *_area_layers(plan, detail_m)]
+    layers = [*_coverage_layers(certificate), *more, *_area_layers(plan, detail_m)]
     if bathymetry is not None:
         layers += _contour_layer(bathymetry, extent, detail_m)
     camera = f"Footprints ({rig.reference} camera)"
@@ -310,18 +312,35 @@ def _coverage_layers(seen: Certificate) -> list[Layer]:
     missed[within & ~met] = [*_channels(COLOURS["missed"]), _MISSED_OPACITY]
     scale = Scale(label="pictures that see a place", low=0, high=most, colours=_RAMP)
 
-    def layer(name: str, title: str, about: str, rgba: NDArray[np.uint8], **more: Any) -> Layer:
-        rows, columns = rgba.shape[:2]
-        return PictureLayer(
-            name=name, title=title, about=about, west_m=corner[1], north_m=corner[0],
-            pixel_m=pixel_m, width_px=columns, height_px=rows, tile_px=max(rows, columns),
-            levels=1, tiles={"0/0/0": _png(rgba)}, shown=True, base=False, group="Pictures", **more,
-        )  # fmt: skip
-
     return [
-        layer("counts", "Pictures that see a place", "Of all cameras.", counts, scale=scale),
-        layer("missed", "Below the requested overlap", "", missed),
-    ]
+        picture_layer(
+            counts, corner, pixel_m, name="counts", title="Pictures that see a place",
+            about="Of all cameras.", scale=scale, shown=True,
+        ),
+        picture_layer(
+            missed, corner, pixel_m, name="missed", title="Below the requested overlap", about="",
+            shown=True,
+        ),
+    ]  # fmt: skip
+
+
+def picture_layer(
+    rgba: NDArray[np.uint8], corner_ne: tuple[float, float], pixel_m: float, **more: Any
+) -> PictureLayer:
+    """A layer of one picture.
+
+    Args:
+        rgba: (H, W, 4) with north up.
+        corner_ne: upper left.
+        pixel_m: side of a pixel.
+        more: fields of the layer.
+    """
+    rows, columns = rgba.shape[:2]
+    return PictureLayer(
+        west_m=corner_ne[1], north_m=corner_ne[0], pixel_m=pixel_m, width_px=columns,
+        height_px=rows, tile_px=max(rows, columns), levels=1, tiles={"0/0/0": _png(rgba)},
+        base=False, group="Pictures", **more,
+    )  # fmt: skip
 
 
 def _channels(colour: str) -> list[int]:

@@ -1,5 +1,6 @@
 """The stage `plan`: a survey planned, and written for the next stages, for people, for vehicles."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
-from alice_survey.kit.document import Link
+from alice_survey.kit.document import Link, PictureLayer
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of
 from missions.exports.write import write_exports
@@ -37,7 +38,12 @@ def run_plan(workspace: Path, folder: Path, executor: Executor, *, survey: Surve
 
 @progress.step("write plan, maps and missions")
 def write_planned(
-    folder: Path, planned: Planned, rig: Rig, options: Options, sea: SeaConfig
+    folder: Path,
+    planned: Planned,
+    rig: Rig,
+    options: Options,
+    sea: SeaConfig,
+    layers: Sequence[PictureLayer] = (),
 ) -> None:
     """Write a plan.
 
@@ -47,6 +53,7 @@ def write_planned(
         rig: its cameras in water.
         options: what vehicles need besides the plan.
         sea: the current that maps show.
+        layers: more of the page's map.
     """
     plan = planned.plan
     write_json(folder / "plan.json", plan.to_json())
@@ -69,6 +76,7 @@ def write_planned(
             Link(text=file.name, address=f"exports/{file.name}", about=about)
             for file, about in files.items()
         ],
+        layers=layers,
     )
 
 

@@ -34,7 +34,7 @@ from reconstruct.placing.navigation_equations import (
     Epochs,
     equations,
 )
-from reconstruct.precision.navigation import NavigationErrors
+from reconstruct.precision.instruments import NavigationErrors
 from reconstruct.precision.tracks import ExpectedBlock
 
 _CELL_POINTS = 12

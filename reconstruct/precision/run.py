@@ -1,32 +1,51 @@
 """`plan precision` and `plan solve --bend`: what a plan is predicted to give, and what helps."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import need_stage
+from alice_survey.base.artefacts import atomic_path, need_stage, read_json, write_json
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import ConfigError
+from alice_survey.base.errors import ConfigError, warn
 from alice_survey.base.frames import Array
 from alice_survey.base.text_table import text_table
-from missions.values.plan_file import read_plan
-from reconstruct.precision.calibration import expected_rig
-from reconstruct.precision.measures import (
-    as_planned,
+from alice_survey.kit.document import PictureLayer, Scale
+from alice_survey.kit.figure import (
+    check_figure_path,
+    colour_bar,
+    figure_style,
+    map_axes,
+    new_figure,
+    palette_colours,
+    palette_steps,
+    save_figure,
+)
+from camera_calib.rig import design_rig
+from missions.exports.options import options_of
+from missions.plan.page_map import picture_layer
+from missions.plan.planner import plan_survey
+from missions.plan.run import write_planned
+from missions.values.plan_file import Plan, read_plan
+from reconstruct.precision.candidates import (
+    Candidate,
     cheapest,
     gain_per_minute,
     single_measures,
     with_control,
     worst_bend,
 )
-from reconstruct.precision.navigation import NavigationErrors
-from reconstruct.precision.planned import Candidate
+from reconstruct.precision.instruments import NavigationErrors, expected_rig
 from reconstruct.precision.predict import Precision, predict
+from reconstruct.raster import DemGrid, tiled_raster
+from reconstruct.views.model import WorldFrame
 
 _UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _EXACT = 1e-3
+_LEVEL = "sea surface at the datum"
+_PALETTE, _COLOURS, _OPACITY = "viridis", 9, 215
 _MM, _PPM = 1e3, 1e6
 
 
@@ -55,6 +74,9 @@ def precision_report(
 ) -> tuple[str, dict[str, Any]]:
     """What a workspace's plan is predicted to give, as text and as JSON values.
 
+    Writes `precision.json` and `precision.tif`, the sigmas of heights, beside the plan, and draws
+    them in its page.
+
     Args:
         workspace: with the plan, and the calibration where there is one.
         config: the survey.
@@ -65,9 +87,10 @@ def precision_report(
         WorkspaceError: there is no plan.
         PlanError: the plan does not tie its pictures together.
     """
-    plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
+    folder = need_stage(workspace, "plan", "plan")
+    plan = read_plan(folder / "plan.json")
     rig = expected_rig(workspace, config.camera, config.water, config.imaging)
-    base = Candidate(config=config, plan=plan, rig=rig)
+    base = Candidate(config=config, made=plan, rig=rig)
     block, errors, found = base.block(), NavigationErrors.of(config.navigation), base.precision
     without = {
         "calibration": predict(block, errors, calibration=False),
@@ -90,10 +113,10 @@ def precision_report(
         options = [*single_measures(base), with_control(base)]
         text.append(_measures_text(base, options))
         data["measures"] = [_measure_json(base, one) for one in options]
+    _write(folder, base, data)
+    text.append(f"{folder}: precision.json, precision.tif, plan.html with the sigmas of heights")
     if plot is not None:
-        from reconstruct.precision.figure import draw_precision  # matplotlib is slow to import
-
-        draw_precision(plot, plan, found, without)
+        _draw(plot, plan, found, without)
     return "\n\n".join(text), data
 
 
@@ -103,7 +126,8 @@ def bend_report(workspace: Path, config: SurveyConfig, bend_m: float) -> tuple[s
     Raises:
         PlanError: no set of measures does.
     """
-    base = as_planned(config, expected_rig(workspace, config.camera, config.water, config.imaging))
+    rig = expected_rig(workspace, config.camera, config.water, config.imaging)
+    base = Candidate(config=config, rig=rig)
     found = cheapest(base, bend_m)
     plan = found.config.plan
     changed = {
@@ -180,3 +204,85 @@ def _measure_json(base: Candidate, one: Candidate) -> dict[str, Any]:
         "bend_gain_m_per_minute": None if one.with_control else gain_per_minute(base, one),
         **to_json(one.precision),
     }
+
+
+def heights_raster(found: Precision) -> tuple[Array, DemGrid]:
+    """Sigmas of heights with north up, (rows, columns), metres, NaN outside; and their grid."""
+    cell, low, high = found.cell_m, found.cells_ne.min(axis=0), found.cells_ne.max(axis=0)
+    rows, columns = (np.rint((high - low) / cell).astype(int) + 1).tolist()
+    north, west = float(high[0] + cell / 2), float(low[1] - cell / 2)
+    heights = np.full((rows, columns), np.nan)
+    row, column = np.rint((found.cells_ne - low) / cell).astype(int).T
+    heights[rows - 1 - row, column] = found.heights_m
+    return heights, DemGrid(west=west, north=north, cell=cell, rows=rows, columns=columns)
+
+
+def _write(folder: Path, base: Candidate, data: Mapping[str, Any]) -> None:
+    """Write a prediction into the folder of its plan: values, raster of heights, page with it."""
+    config, plan = base.config, base.plan
+    write_json(folder / "precision.json", data)
+    heights, grid = heights_raster(base.precision)
+    frame = WorldFrame(name="ned", datum=plan.datum, scaled=True, vertical_datum=_LEVEL)
+    text = "expected standard deviation of the height (m)"
+    with (
+        atomic_path(folder / "precision.tif") as path,
+        tiled_raster(path, grid, frame, "float32", float("nan"), text) as raster,
+    ):
+        raster.write(heights.astype(np.float32), 1)
+    with TemporaryDirectory() as scratch:
+        design, again = design_rig(config.camera, config.water), Path(scratch)
+        options = options_of(config.camera, config.plan)
+        planned = plan_survey(config, design)
+        write_planned(again, planned, design, options, config.sea, [_layer(heights, grid)])
+        if read_json(again / "plan.json") != read_json(folder / "plan.json"):
+            warn("plan.html stays without sigmas: settings differ from the plan's; run plan")
+            return
+        with atomic_path(folder / "plan.html") as page:
+            page.write_bytes((again / "plan.html").read_bytes())
+
+
+def _layer(heights: Array, grid: DemGrid) -> PictureLayer:
+    """Sigmas of heights as a layer of the plan's page."""
+    known = np.isfinite(heights)
+    low, high = (_MM * float(x) for x in (np.nanmin(heights), np.nanmax(heights)))
+    shares = (_MM * np.where(known, heights, 0.0) - low) / max(high - low, 1e-9)
+    rgba = palette_colours(_PALETTE, np.clip(shares, 0.0, 1.0))
+    rgba[..., 3] = np.where(known, _OPACITY, 0)
+    colours = palette_steps(_PALETTE, _COLOURS)
+    return picture_layer(
+        rgba, (grid.north, grid.west), grid.cell, name="heights",
+        title="Expected sigma of heights", about="After a rigid alignment.",
+        scale=Scale(label="expected sigma of heights, mm", low=low, high=high, colours=colours),
+    )  # fmt: skip
+
+
+def _draw(path: Path, plan: Plan, found: Precision, without: Mapping[str, Precision]) -> None:
+    """Draw the sigma of heights under the lines, and sigmas with one kind of error left out.
+
+    Raises:
+        ConfigError: the figure cannot be written.
+    """
+    check_figure_path(path)
+    sheet = new_figure(4.6)
+    with figure_style():
+        left, right = sheet.subplots(1, 2, width_ratios=[3, 2])
+        heights, grid = heights_raster(found)
+        south, east = grid.north_of(grid.rows), grid.east_of(grid.columns)
+        extent = (grid.west, float(east), float(south), grid.north)
+        image = left.imshow(_MM * heights, extent=extent, cmap=_PALETTE)
+        for line in plan.lines:
+            left.plot(*line.stations_ne.T[::-1], color="white", lw=0.6, alpha=0.7)
+        colour_bar(image, left, "sigma of heights, mm")
+        left.grid(False)
+        map_axes(left)
+        shown = {"all errors": found, **{f"without {name}": p for name, p in without.items()}}
+        worst = [_MM * float(np.nanmax(p.bend_m)) for p in shown.values()]
+        rms = [_MM * p.heights_rms_m for p in shown.values()]
+        at = np.arange(len(shown))
+        right.barh(at - 0.2, worst, 0.38, label="bend")
+        right.barh(at + 0.2, rms, 0.38, label="heights")
+        right.set_yticks(at, list(shown))
+        right.invert_yaxis()
+        right.set_xlabel("sigma, mm")
+        right.legend()
+    save_figure(sheet, path)

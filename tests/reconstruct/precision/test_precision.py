@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from PIL import Image
 
+from alice_survey.base.artefacts import json_values, read_json
 from alice_survey.base.config import NavigationConfig, SurveyConfig, load_config
 from alice_survey.base.errors import ConfigError, PlanError
 from alice_survey.base.executor import SERIAL
@@ -18,19 +20,18 @@ from benchmarks.precision import errors, errors_of_drawn_logs, swayed
 from camera_calib.rig import Rig, design_rig
 from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
-from missions.values.plan_file import Plan
+from missions.values.plan_file import Plan, read_plan
 from reconstruct.placing.bend import sag_weights
-from reconstruct.precision import measures
-from reconstruct.precision.calibration import usual_rig
-from reconstruct.precision.measures import (
-    as_planned,
+from reconstruct.precision import candidates
+from reconstruct.precision.candidates import (
+    Candidate,
     cheapest,
     single_measures,
+    stations_and_times,
     with_control,
     worst_bend,
 )
-from reconstruct.precision.navigation import NavigationErrors
-from reconstruct.precision.planned import Candidate, stations_and_times
+from reconstruct.precision.instruments import NavigationErrors, usual_rig
 from reconstruct.precision.predict import Precision, predict
 from reconstruct.precision.run import bend_report, length_m, precision_report
 from reconstruct.precision.tracks import ExpectedBlock, TrackModel
@@ -66,7 +67,7 @@ def plan() -> Plan:
 
 
 def block(tracks: TrackModel = TRACKS, drawn: float = 30.0, seed: int = 0) -> ExpectedBlock:
-    return Candidate(config=settings(), plan=plan(), rig=rig()).block(
+    return Candidate(config=settings(), made=plan(), rig=rig()).block(
         tracks, drawn=drawn, seed=seed
     )
 
@@ -89,7 +90,7 @@ def test_a_plan_says_how_far_surveys_err(tmp_path: Path) -> None:
         noise_px=bend_survey.NOISE_PX,
     )  # fmt: skip
     expected = predict(
-        Candidate(config=config, plan=own, rig=rig()).block(tracks),
+        Candidate(config=config, made=own, rig=rig()).block(tracks),
         errors_of_drawn_logs(np.ptp(time_s)),
     )
     said = figures(expected)[:4]
@@ -181,14 +182,14 @@ def test_four_times_the_views_halve_the_sigmas_of_a_calibration() -> None:
 
 
 def test_control_points_place_a_survey() -> None:
-    base = as_planned(settings(), rig())
+    base = Candidate(config=settings(), rig=rig())
     plain, held = base.precision.place_m, with_control(base).precision.place_m
     assert np.sqrt((plain[:, 2] ** 2).mean()) > 0.04
     assert 0.003 < np.sqrt((held**2).mean()) < 0.01
 
 
 def test_measures_are_ranked_by_what_a_minute_buys() -> None:
-    base = as_planned(settings(), rig())
+    base = Candidate(config=settings(), rig=rig())
     found = single_measures(base)
     assert {"1 more cross line", "a closing line"} <= {one.name for one in found}
     gains = [
@@ -202,9 +203,9 @@ def test_measures_are_ranked_by_what_a_minute_buys() -> None:
 def test_the_cheapest_set_reaches_the_bend_or_it_says_how_near_it_comes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(measures, "_MORE_CROSS_LINES", (1, 4))
-    monkeypatch.setattr(measures, "_MORE_OVERLAP", ())
-    base = as_planned(settings(), rig())
+    monkeypatch.setattr(candidates, "_MORE_CROSS_LINES", (1, 4))
+    monkeypatch.setattr(candidates, "_MORE_OVERLAP", ())
+    base = Candidate(config=settings(), rig=rig())
     assert cheapest(base, 1.01 * worst_bend(base.precision)) is base
     wanted = 0.8 * worst_bend(base.precision)
     found = cheapest(base, wanted)
@@ -227,6 +228,18 @@ def test_the_report_of_a_planned_workspace_draws_what_it_says(tmp_path: Path) ->
     assert 0 < data["heights_rms_m"] < 0.01
     assert 0 < data["without"]["calibration"]["scale"] < data["scale"] < 1e-3
     assert data["stations_shape_rms_m"] < data["stations_shape_worst_m"]
+    plan_folder = workspace / "plan"
+    assert read_json(plan_folder / "precision.json") == json_values(data)
+    with rasterio.open(plan_folder / "precision.tif") as raster:
+        heights, (west, south, east, north) = raster.read(1), raster.bounds
+        assert "Azimuthal_Equidistant" in raster.crs.to_wkt()
+    known = heights[np.isfinite(heights)]
+    assert np.sqrt((known**2).mean()) == pytest.approx(data["heights_rms_m"], rel=1e-4)
+    area = read_plan(plan_folder / "plan.json").area.corners_ne
+    assert np.all(area[:, :2].min(axis=0) > [south - 0.5, west - 0.5])
+    assert np.all(area[:, :2].max(axis=0) < [north + 0.5, east + 0.5])
+    assert "Expected sigma of heights" in (plan_folder / "plan.html").read_text()
+    assert "up to date" in str(run(["plan"], workspace, None, executor=SERIAL))
     with Image.open(tmp_path / "p.png") as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 50
 
