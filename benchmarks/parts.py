@@ -136,6 +136,12 @@ PARTS = (
         long=True,
     ),
     Part(
+        name="block-size",
+        module="block_size",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="reconstruct-peers",
         module="reconstruct",
         arguments=_reconstruct("peers"),

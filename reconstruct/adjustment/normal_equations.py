@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-
 from scipy.sparse import csr_matrix, identity
 
 from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices, product_of
