@@ -147,7 +147,7 @@ def reduce_parts(
     meets = csr_matrix(seen.T @ seen + identity(stations, np.int32, format="csr"))
     meets.sort_indices()
     pointers, columns = meets.indptr.astype(np.int64), meets.indices.astype(np.int64)
-    inverses = []
+    inverses: list[Array] = []
     for part in parts:
         if not inverses:
             count = part.rest.shape[2]
