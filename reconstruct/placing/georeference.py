@@ -377,8 +377,8 @@ class _NavigationTask:
         off = abs(turn) / expected
         if off > _CONTRADICTION_SIGMAS:
             warn(
-                f"headings of the navigation and its positions disagree, {np.rad2deg(turn):+.1f} "
-                f"deg where {np.rad2deg(expected):.1f} deg is likely: both count as that unsure; "
+                f"headings of the navigation and its positions disagree, {np.rad2deg(turn):+.2g} "
+                f"deg where {np.rad2deg(expected):.2g} deg is likely: both count as that unsure; "
                 "check the compass and the camera's mount (body_from_rig)"
             )
         return float(off)
