@@ -54,6 +54,8 @@ LEVER_SIGMA_M = 0.02
 """Of the measured place of a camera on its vehicle, along each axis."""
 CLOCK_SIGMA_S = 0.2
 """Of the clock of cameras against that of navigation."""
+_SIGNIFICANT = 3.0
+"""Sigmas of its own by which a sum of squares must be too large to count as such."""
 _CONTRADICTION_SIGMAS = 3.0
 """A nuisance this far from what is expected of it is reported."""
 _VAGUE_PER_M = 10.0
@@ -222,7 +224,7 @@ class _NavigationTask:
 
     def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
         """Iterate from a robust placement to the final one."""
-        epochs, sizes = self.epochs, np.zeros(self.epochs.modes.shape[2])
+        epochs, sizes, factor = self.epochs, np.zeros(self.epochs.modes.shape[2]), 1.0
         nuisances = np.zeros(PARAMETERS)
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(found.misfit, epochs.known)
@@ -246,15 +248,17 @@ class _NavigationTask:
                 found,
                 used,
                 solved_for,
-                self._extra(place, middle, sizes),
+                self._extra(place, middle, sizes, factor),
                 frame_bounds=bounds,
                 widened=widened,
             )
             place = _moved(place, got.change, middle)
             sizes = sizes + got.change[PARAMETERS:]
             nuisances = got.change[:PARAMETERS]
-            sigma = np.sqrt(np.diag(got.covariance))[settling]
-            if np.all(np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma):
+            sigma = np.sqrt(np.diag(got.covariance))
+            before, factor = factor, _mode_factor(sizes, sigma[PARAMETERS:], factor)
+            still = np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma[settling]
+            if still.all() and abs(factor - before) <= _SETTLED_SIGMAS * factor:
                 off = self._turned(nuisances[TURN], bounds, got.correlation)
                 if widened or off < _CONTRADICTION_SIGMAS:
                     break
@@ -270,13 +274,14 @@ class _NavigationTask:
                 found,
                 got.used,
                 [*stiff, SCALE],
-                self._extra(place, middle, sizes),
+                self._extra(place, middle, sizes, factor),
                 frame_bounds=bounds,
                 correlation=got.correlation,
             )
         return self._report(
-            place, middle, sizes, nuisances, got, scaled, free=solved_for, bounds=bounds
-        )
+            place, middle, sizes, nuisances, got, scaled, free=solved_for, bounds=bounds,
+            mode_factor=factor,
+        )  # fmt: skip
 
     def _report(
         self,
@@ -289,6 +294,7 @@ class _NavigationTask:
         *,
         free: Sequence[int],
         bounds: Mapping[int, float],
+        mode_factor: float,
     ) -> PlacementFit:
         epochs = self.epochs.deformed(sizes)
         kept = got.used[epochs.moment, :3].any(axis=1)
@@ -321,6 +327,7 @@ class _NavigationTask:
             time_unit="s" if epochs.timed else "stations",
             mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
             modes=sizes,
+            mode_factor=mode_factor,
             joint=got.covariance[np.ix_(joint, joint)],
             bends=self._bends(place, middle, sizes, got, free, bounds),
             nuisances=named,
@@ -402,7 +409,9 @@ class _NavigationTask:
         bound = sigma / radius if radius > sigma else 1.0
         return {TURN: bound, STRETCH: min(bound, _STRETCH)}
 
-    def _extra(self, place: Similarity, middle: Array, sizes: Array) -> Extra:
+    def _extra(
+        self, place: Similarity, middle: Array, sizes: Array, mode_factor: float = 1.0
+    ) -> Extra:
         columns = PARAMETERS + len(sizes)
         misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
         if self.levelled is not None and not self.epochs.has_tilt:
@@ -419,12 +428,12 @@ class _NavigationTask:
             misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
             rows.append(scale)
         known = np.zeros(columns)
-        known[PARAMETERS:] = 1.0
+        known[PARAMETERS:] = 1.0 / mode_factor
         known[LEVER], known[CLOCK] = 1.0 / LEVER_SIGMA_M, 1.0 / CLOCK_SIGMA_S
         if self.mount_sigma_rad > 0:
             known[MOUNT] = 1.0 / self.mount_sigma_rad
         at = np.flatnonzero(known)
-        misfits.append(np.concatenate([np.zeros(columns - len(sizes)), sizes])[at])
+        misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[at])
         rows.append(np.diag(known)[at])
         if self.control is not None:
             more = self.control(place, middle, sizes)
@@ -465,6 +474,27 @@ def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
     turn, grow = Rotation.from_rotvec(change[:3]), float(np.exp(change[SCALE]))
     shift = middle + grow * turn.apply(place.translation - middle) + change[3:6]
     return Similarity(scale=place.scale * grow, rotation=turn * place.rotation, translation=shift)
+
+
+def _mode_factor(sizes: Array, sigmas: Array, factor: float) -> float:
+    """How many times larger the model's soft modes are than its pictures say, 1 or more.
+
+    Keypoints err a little together, in ways that residuals do not show and that only the softest
+    deformations add up. The evidence for the variance of the modes that outside measurements
+    determine: their squares over the number so determined (MacKay 1992, "Bayesian interpolation").
+
+    Args:
+        sizes: (K,) of the modes, in the sigmas that the pictures give.
+        sigmas: (K,) after the fit.
+        factor: what was taken so far.
+    """
+    determined = float((1.0 - (sigmas / factor) ** 2).sum())
+    if determined < 1.0:
+        return factor
+    ratio = float(sizes @ sizes) / determined
+    if factor == 1.0 and ratio < 1.0 + _SIGNIFICANT * np.sqrt(2.0 / determined):
+        return 1.0
+    return max(1.0, float(np.sqrt(ratio)))
 
 
 def _rms(misses: Array) -> Array:

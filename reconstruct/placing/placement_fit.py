@@ -41,6 +41,8 @@ class PlacementFit:
     mount_sigma_deg: float
     modes: Array
     """(K,) sizes of the model's soft modes, in their sigmas."""
+    mode_factor: float
+    """How many times larger such modes are than the pictures' sigmas say, 1 or more."""
     joint: Array
     """(7 + K, 7 + K) covariance of the placement (as `covariance`) and the modes."""
     bends: tuple[Bend, ...]
@@ -112,6 +114,7 @@ class PlacementFit:
                 for name, (found, sigma) in self.nuisances.items()
             },
             "soft_modes": self.modes.tolist(),
+            "soft_modes_factor": self.mode_factor,
             "middle_ned_m": self.middle_ned.tolist(),
             "covariance": self.covariance.tolist(),
             "covariance_order": [

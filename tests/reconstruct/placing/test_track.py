@@ -83,8 +83,8 @@ def placed(middle: Array, covariance: Array) -> PlacementFit:
     return PlacementFit(
         ned_from_model=HERE, used=1, left_out={}, rms_m=np.zeros(3), free_scale=1.0,
         free_scale_sigma=0.0, middle_ned=middle, correlation={},
-        time_unit="s", mount_sigma_deg=0.0, modes=np.zeros(0), joint=covariance, bends=(),
-        nuisances={},
+        time_unit="s", mount_sigma_deg=0.0, modes=np.zeros(0), mode_factor=1.0,
+        joint=covariance, bends=(), nuisances={},
     )  # fmt: skip
 
 
