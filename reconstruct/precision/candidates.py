@@ -12,7 +12,7 @@ from alice_survey.base.config import PlanConfig, SurveyConfig
 from alice_survey.base.errors import PlanError, collected_by
 from alice_survey.base.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
-from missions.coverage.stations import stations_of_plan
+from missions.coverage.stations import Stations, stations_of_plan
 from missions.plan.planner import area_bathymetry, plan_survey
 from missions.plan.run import station_times_s
 from missions.plan.strength import survey_costs
@@ -24,7 +24,7 @@ from reconstruct.precision.tracks import ExpectedBlock, TrackModel, expected_blo
 
 CONTROL_SIGMA_M = 0.01
 """Of each coordinate of a control point."""
-_BETWEEN_DIVES_S = 3600.0
+BETWEEN_DIVES_S = 3600.0
 """By then slow errors of navigation are new ones."""
 _MORE_CROSS_LINES = (1, 2, 4)
 _MORE_OVERLAP = (0.1, 0.2)
@@ -87,6 +87,27 @@ class Candidate:
         Raises:
             PlanError: pictures do not show the sea floor, or share none of it.
         """
+        flown = stations_and_times(self.plan, self.rig, survey_costs(self.config))
+        return self.block_at(*flown, tracks, drawn=drawn, seed=seed)
+
+    def block_at(
+        self,
+        ned_from_body: RigidTransform,
+        time_s: Array,
+        tracks: TrackModel | None = None,
+        *,
+        drawn: float | None = None,
+        seed: int = 0,
+    ) -> ExpectedBlock:
+        """The pictures of other stations over the same sea floor, as `block`.
+
+        Args:
+            ned_from_body: (S,) stations.
+            time_s: (S,) their times.
+            tracks: as of `block`.
+            drawn: as of `block`.
+            seed: as of `block`.
+        """
         config, plan = self.config, self.plan
         bathymetry = area_bathymetry(config.area, plan.area, plan.altitude_m)
         ripple = waves(config.plan.relief_m, 2.0 * plan.altitude_m)
@@ -98,9 +119,8 @@ class Candidate:
                 mean = np.where(np.isfinite(found), found, plan.seafloor_depth_m)
             return mean + ripple(places)
 
-        poses, time_s = stations_and_times(plan, self.rig, survey_costs(config))
         return expected_block(
-            self.rig, poses, time_s, depth_at, tracks or TrackModel.of(config.reconstruct),
+            self.rig, ned_from_body, time_s, depth_at, tracks or TrackModel.of(config.reconstruct),
             drawn=drawn, seed=seed,
         )  # fmt: skip
 
@@ -112,21 +132,26 @@ def _corners(points: Array) -> list[int]:
     return [int(np.argmax(a * u / np.ptp(u) + b * v / np.ptp(v))) for a in (-1, 1) for b in (-1, 1)]
 
 
-def stations_and_times(plan: Plan, rig: Rig, costs: Costs) -> tuple[RigidTransform, Array]:
+def stations_and_times(
+    plan: Plan, rig: Rig, costs: Costs, start_s: float = 0.0
+) -> tuple[RigidTransform, Array]:
     """Poses `ned_from_body` (S,) of a plan's stations in the order of flight, and their times."""
-    stations = stations_of_plan(plan)
-    start_s, times = 0.0, list[float]()
+    times = list[float]()
     for dive in plan.dives:
         mine = [start_s + time_s for time_s in station_times_s(plan, dive, costs)]
         times += mine
-        start_s = mine[-1] + _BETWEEN_DIVES_S
+        start_s = mine[-1] + BETWEEN_DIVES_S
+    stations = stations_of_plan(plan, np.full(len(times), plan.seafloor_depth_m))
+    return ned_from_stations(stations, plan, rig), np.array(times)
+
+
+def ned_from_stations(stations: Stations, plan: Plan, rig: Rig) -> RigidTransform:
+    """Poses of the vehicle (S,) at stations over a plan's mean sea floor."""
     rotation = rotation_from_attitude(*stations.attitude_rad.T)
     front = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
     depth_m = plan.seafloor_depth_m - stations.altitude_m
-    if plan.line_depths_m:
-        depth_m = np.concatenate([np.asarray(row) for row in plan.line_depths_m])
     glass = np.column_stack([stations.glass_ne, depth_m])
-    return RigidTransform.from_components(glass - rotation.apply(front), rotation), np.array(times)
+    return RigidTransform.from_components(glass - rotation.apply(front), rotation)
 
 
 def single_measures(base: Candidate) -> list[Candidate]:

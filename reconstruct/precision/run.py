@@ -162,6 +162,15 @@ def to_json(found: Precision) -> dict[str, Any]:
     }
 
 
+def summary(found: Precision) -> str:
+    """The figures of a prediction in words."""
+    along, across, scale, heights, stations = _cells(found)
+    return (
+        f"bend {along} mm along, {across} mm across, scale {scale} ppm, heights {heights} mm, "
+        f"stations {stations} mm"
+    )
+
+
 def _rms(sigmas: Array) -> float:
     return float(np.sqrt((sigmas**2).sum(axis=1).mean()))
 

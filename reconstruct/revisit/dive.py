@@ -7,16 +7,28 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import shapely
+from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.block_solver import Flags
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.frames import Array
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, joined, stations_of_lines, stations_of_plan
 from missions.fly.refly import refly_plan
+from missions.plan.strength import survey_costs
 from missions.values.area import multipolygon
 from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.plan_file import Plan
+from reconstruct.precision.candidates import (
+    BETWEEN_DIVES_S,
+    Candidate,
+    ned_from_stations,
+    stations_and_times,
+)
+from reconstruct.precision.instruments import NavigationErrors
+from reconstruct.precision.predict import Precision
+from reconstruct.precision.predict import predict as predicted
 from reconstruct.revisit.links import cut_around, footprints, links, pieces, views_of_floor
 from reconstruct.revisit.weak import LOOSE_SHARE, Found, WeakPlace, cells_in
 
@@ -113,15 +125,18 @@ def _line(start: Array, end: Array, plan: Plan) -> Line | None:
     )  # fmt: skip
 
 
-def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], int]:
-    """What a dive, flown exactly, leaves of each weak place, and how many of its stations join.
+def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], Flags]:
+    """What a dive, flown exactly, leaves of each weak place, and which stations are in one model.
 
     Pictures that see each place, and tracks by the overlap of footprints with the tracks that this
-    survey's overlaps had. This is the one place where a prediction of sigmas is to be called.
+    survey's overlaps had.
 
     Args:
         found: the survey and its weak places.
         again: the dive.
+
+    Returns:
+        By weak place; (S + D,) of the survey's good stations and the dive's.
     """
     new = stations_of_plan(again)
     old = found.pictured.good
@@ -147,7 +162,38 @@ def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], int]:
             left = float(np.mean(~cured.at_overlap[inside])) if inside.any() else 0.0
             words = f"{1 - left:.0%} at the overlap asked for"
         found_left.append(Prediction(left=left, text=words))
-    return tuple(found_left), int((piece[len(old) :] == core).sum())
+    return tuple(found_left), piece == core
+
+
+def predict_precision(
+    found: Found, dive: Candidate, in_model: Flags
+) -> tuple[Precision, Precision | None]:
+    """Expected sigmas of the stations that now hang together, and of those that will.
+
+    Args:
+        found: the survey.
+        dive: the dive over it, as its plan.
+        in_model: (S + D,) as of `predict`.
+
+    Returns:
+        Before and after; None after a dive that does not join.
+    """
+    good, plan, rig = found.pictured.good, found.plan, dive.rig
+    poses = ned_from_stations(good, plan, rig)
+    time_s = found.pictured.numbers * (plan.station_spacing_m / plan.speed_mps)
+    new, new_s = stations_and_times(
+        dive.plan, rig, survey_costs(dive.config), float(time_s.max()) + BETWEEN_DIVES_S
+    )
+    errors = NavigationErrors.of(dive.config.navigation)
+
+    def sigmas(stations: Flags) -> Precision:
+        chosen = RigidTransform.concatenate([poses, new])[stations]
+        at = np.concatenate([time_s, new_s])[stations]
+        order = np.argsort(at, kind="stable")
+        return predicted(dive.block_at(chosen[order], at[order]), errors)
+
+    now = np.concatenate([found.piece == 0, np.zeros(len(new), bool)])
+    return sigmas(now), sigmas(in_model) if in_model[len(good) :].any() else None
 
 
 def _links_after(found: Found, both: Stations) -> Any:

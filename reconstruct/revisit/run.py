@@ -23,7 +23,10 @@ from missions.fly.refly import write_refly
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
-from reconstruct.revisit.dive import Prediction, plan_revisit, predict
+from reconstruct.precision.candidates import Candidate
+from reconstruct.precision.instruments import expected_rig
+from reconstruct.precision.run import summary, to_json
+from reconstruct.revisit.dive import Prediction, plan_revisit, predict, predict_precision
 from reconstruct.revisit.weak import Found, find_weak
 
 _COLOURS = {"overlap": "#c0392b", "surface": "#d68910", "loose": "#7d3c98"}
@@ -71,12 +74,23 @@ def revisit_report(
         except PlanError as error:
             warn(f"the weak places cannot be planned again: {error}")
         else:
-            cures, joining = predict(found, again)
+            cures, in_model = predict(found, again)
+            joining = int(in_model[len(found.pictured.good) :].sum())
+            used = expected_rig(workspace, config.camera, config.water, config.imaging)
+            before, after = predict_precision(
+                found, Candidate(config=config, rig=used, made=again), in_model
+            )
             words, dive = write_refly(
                 folder / "dive", again, rig, config.camera, config.water, config.plan
             )
-            dive["joining_stations"] = joining
+            dive |= {
+                "joining_stations": joining,
+                "expected_before": to_json(before),
+                "expected_after": None if after is None else to_json(after),
+            }
             words = _dive_text(workspace, found, dive, words, cures)
+            if after is not None:
+                words += f"\nexpected sigmas, before: {summary(before)}; after: {summary(after)}"
     elif (folder / "dive").exists():
         warn(f"{folder / 'dive'} is of an earlier revisit: nothing is weak now")
     data = {**_json(found, cures), "dive": dive}

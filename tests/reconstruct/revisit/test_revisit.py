@@ -20,7 +20,9 @@ from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.revisit.dive import plan_revisit, predict
+from reconstruct.precision.candidates import Candidate
+from reconstruct.precision.instruments import usual_rig
+from reconstruct.revisit.dive import plan_revisit, predict, predict_precision
 from reconstruct.revisit.links import cut_around, footprints, links, pieces
 from reconstruct.revisit.weak import Found, Pictured, measured, pair_sigma_m, weak_places
 from tests.oracles_coverage import area_of, lawnmower, plan_of
@@ -135,8 +137,8 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     again = dive_over(found)
 
     assert 0.1 * PLAN.stations < again.stations < 0.6 * PLAN.stations
-    cures, joining = predict(found, again)
-    assert joining == again.stations
+    cures, in_model = predict(found, again)
+    assert in_model[len(found.pictured.good) :].all()
     assert max(cure.left for cure in cures) <= 0.01
     # What is predicted happens: to coverage, and to tracks that are drawn again.
     both = joined(found.pictured.good, stations_of_plan(again))
@@ -144,6 +146,16 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     assert found.seen.share_at_overlap < 0.85
     assert after.share_at_overlap >= 0.999
     assert pieces(links(tracks(both, seed=1)), found.least_tracks).max() == 0
+    # The mended survey is as good as one that lacked nothing.
+    rig = usual_rig(CONFIG.camera, CONFIG.water, CONFIG.imaging)
+    before, mended = predict_precision(
+        found, Candidate(config=CONFIG, rig=rig, made=again), in_model
+    )
+    whole = Candidate(config=CONFIG, rig=rig, made=PLAN).precision
+    assert mended is not None
+    np.testing.assert_array_less(1.4 * mended.bend_m, before.bend_m)
+    ratios = [*mended.bend_m / whole.bend_m, mended.heights_rms_m / whole.heights_rms_m]
+    assert 0.9 < min(ratios) <= max(ratios) < 1.3
 
 
 def test_a_rough_patch_of_the_surface_is_flown_again() -> None:
