@@ -148,7 +148,8 @@ def seconds(rig: Rig, of: Block) -> dict[str, float]:
     timed("factor", lambda: equations.factor().solve(gauge.weighed[..., :1]))
     blocks = timed("stations", lambda: gauge.shape_blocks(equations))
     timed("points", lambda: equations.point_covariances(blocks))
-    modes = timed("modes", lambda: soft_modes(equations, gauge, None, state.points))
+    one = np.zeros(len(state.points), np.int64)
+    modes = timed("modes", lambda: soft_modes(equations, gauge, None, state.points, one))
     poses = RigidTransform.from_components(state.centres, Rotation.from_matrix(state.turns))
     timed(
         "navigation",

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError, warn
@@ -18,7 +18,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
-from reconstruct.adjustment.uncertainty import Uncertainty, estimate
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, estimate
 from reconstruct.mapping.arrays import frames_of, observed, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
@@ -67,9 +67,7 @@ class AdjustedSurvey:
             raise ValueError("a model of unknown shape has no modes")
         shape, modes = self.shape.knowing(left), self.shape.modes
         if self.exact is None:
-            steps, moved = modes.stations @ sizes, modes.points @ sizes
-            mapped = _moved(self.mapped, steps, moved)
-            return replace(self, mapped=mapped, shape=shape)
+            return replace(self, mapped=_moved(self.mapped, modes, sizes), shape=shape)
         fit = self.exact.fit.deformed(modes, self.shape.point_ids, sizes, left)
         exact = replace(self.exact, fit=fit)
         return replace(self, mapped=exact.on_pinholes(), rig=fit.rig, exact=exact, shape=shape)
@@ -179,16 +177,16 @@ def taken_pixels(
     return found
 
 
-def _moved(mapped: Mapped, steps: Array, points: Array) -> Mapped:
-    """A model of pinholes after steps of its stations (F, 6), and of its points (P, 3)."""
+def _moved(mapped: Mapped, modes: SoftModes, sizes: Array) -> Mapped:
+    """A model of pinholes with its soft modes (K,) of these sizes."""
     model = pycolmap.Reconstruction(mapped.model)
-    frames, ids = frames_of(model), observed(model).point_ids
+    frames, seen = frames_of(model), observed(model)
     poses = rig_poses(model, frames).inv()
-    turned = Rotation.from_rotvec(steps[:, :3]) * poses.rotation
-    stations = RigidTransform.from_components(poses.translation + steps[:, 3:], turned)
+    turns, centres, points = modes.moved(sizes, poses.translation, seen.points, slice(None))
+    stations = RigidTransform.from_components(centres, turns * poses.rotation)
     for frame, station in zip(frames.tolist(), stations, strict=True):
         model.frames[frame].rig_from_world = rigid3d(station.inv())
-    for point, step in zip(ids.tolist(), points, strict=True):
-        model.points3D[point].xyz += step
+    for point, xyz in zip(seen.point_ids.tolist(), points, strict=True):
+        model.points3D[point].xyz = xyz
     model.update_point_3d_errors()
     return replace(mapped, model=model)

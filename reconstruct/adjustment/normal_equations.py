@@ -17,11 +17,10 @@ from scipy.sparse import csr_matrix, identity
 from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices, product_of
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from reconstruct.mapping.arrays import first_of
 
 POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""
-LEAST_POINTS = 4
-"""A station that sees fewer is not determined."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,6 +53,11 @@ class LinearObservations:
         """(O,) how many observations each one's point has."""
         counts: Indices = np.diff(self.starts)
         return np.repeat(counts, counts)
+
+    @property
+    def point(self) -> Indices:
+        """(O,) index of the point."""
+        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
     def weighted(self, weights: Array) -> "LinearObservations":
         """The same observations with the squares of each weighted, (O,)."""
@@ -337,38 +341,51 @@ def _point_covariances(
 
 
 class Gauge:
-    """Motions of a whole block that pictures do not see."""
+    """Motions that pictures do not see: of each group of linked stations by itself."""
 
-    def __init__(self, centres: Array, depth: float, scale_free: bool) -> None:
-        """Take stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
-        self.middle = centres.mean(axis=0)
-        arms = centres - self.middle
-        self.motions = np.zeros((len(arms), POSE, 7 if scale_free else 6))
-        self.motions[:, :3, :3] = np.eye(3)
-        self.motions[:, 3:] = self.of_points(centres)
+    def __init__(
+        self, centres: Array, depth: float, scale_free: bool, group: Indices | None = None
+    ) -> None:
+        """Take stations at (F, 3) of groups (F,); `depth`, a usual one, weighs turns."""
+        self.group = np.zeros(len(centres), np.int64) if group is None else group
+        first = first_of(self.group)
+        self.each = 7 if scale_free else POSE
+        self.middles = np.stack([centres[self.group == g].mean(axis=0) for g in range(len(first))])
+        shifts = self.of_points(centres, self.group)
+        self.motions = np.concatenate([np.zeros_like(shifts), shifts], axis=1)
+        for axis in range(3):
+            self.motions[np.arange(len(centres)), axis, self.each * self.group + axis] = 1.0
         self.weights = np.array([depth**2] * 3 + [1.0] * 3)
         self.weighed = self.motions * self.weights[:, None]
         self.spread = np.linalg.inv(product_of(self.motions, self.weighed))
-        self.held: Flags = np.zeros((len(arms), POSE), dtype=np.bool_)
-        self.held[0] = True
-        if scale_free:
-            far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
-            self.held[far, 3 + int(np.argmax(np.abs(arms[far] - arms[0])))] = True
+        self.held: Flags = np.zeros((len(centres), POSE), dtype=np.bool_)
+        self.held[first] = True
+        for g, start in enumerate(first if scale_free else ()):
+            arms = np.where((self.group == g)[:, None], centres - centres[start], 0.0)
+            far = int(np.argmax(np.linalg.norm(arms, axis=1)))
+            self.held[far, 3 + int(np.argmax(np.abs(arms[far])))] = True
 
-    def of_points(self, points: Array) -> Array:
-        """What the same motions do to (N, 3) points, (N, 3, 6 or 7)."""
-        arms = points - self.middle
-        found = np.zeros((len(arms), 3, self.motions.shape[2]))
+    def of_points(self, points: Array, group: Indices | None = None) -> Array:
+        """What the same motions do to (N, 3) points of groups (N,), (N, 3, 6 or 7 a group)."""
+        group = np.zeros(len(points), np.int64) if group is None else group
+        arms, rows = points - self.middles[group], np.arange(len(points))
+        found = np.zeros((len(arms), 3, self.each * len(self.middles)))
         for axis in range(3):
-            found[:, :, axis] = np.cross(np.eye(3)[axis], arms)
-            found[:, axis, 3 + axis] = 1.0
-        if found.shape[2] > POSE:
-            found[:, :, POSE] = arms
+            found[rows, :, self.each * group + axis] = np.cross(np.eye(3)[axis], arms)
+            found[rows, axis, self.each * group + 3 + axis] = 1.0
+        if self.each > POSE:
+            found[rows, :, self.each * group + POSE] = arms
         return found
 
     def motion_in(self, steps: Array) -> Array:
-        """How much of each motion (6 or 7, G) steps (F, 6, G) of the stations are."""
+        """How much of each motion (6 or 7 a group, G) steps (F, 6, G) of the stations are."""
         found: Array = self.spread @ product_of(self.weighed, steps)
+        return found
+
+    def shape_weights(self, weights: Array) -> Array:
+        """Weights (F, 6) of stations' steps in a sum, those minus the motions being summed."""
+        along = np.tensordot(self.motions, weights, axes=([0, 1], [0, 1]))
+        found: Array = weights - self.weighed @ (self.spread @ along)
         return found
 
     def shape_blocks(self, equations: Equations) -> Array:

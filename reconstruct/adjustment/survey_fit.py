@@ -36,14 +36,19 @@ from reconstruct.adjustment.exact_observations import (
 )
 from reconstruct.adjustment.keypoint_bias import bias_covariance
 from reconstruct.adjustment.normal_equations import (
-    LEAST_POINTS,
     POSE,
     LinearObservations,
     PointEquations,
     reduce_parts,
 )
 from reconstruct.adjustment.uncertainty import Motions, SoftModes
-from reconstruct.mapping.arrays import Indices, frames_of
+from reconstruct.mapping.arrays import (
+    LEAST_POINTS,
+    Indices,
+    first_of,
+    frames_of,
+    linked_groups,
+)
 from reconstruct.mapping.bundle import move_points
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
@@ -113,21 +118,21 @@ class SurveyFit:
             sizes: (K,) of every mode, in its sigmas.
             left: (K, K) covariance of these.
         """
-        state, step = self.state, modes.stations @ sizes
-        rows = np.searchsorted(point_ids, self.point_ids)
+        state, rows = self.state, np.searchsorted(point_ids, self.point_ids)
+        turns, centres, points = modes.moved(sizes, state.centres, state.points, rows)
         rig, covariance = state.rig, self.covariance
         if self.parameters:
             rig = moved(rig, self.parameters, modes.calibration @ sizes)
-            gain = np.eye(len(sizes)) - left
+            gain = np.diag(modes.known) - left
             covariance = covariance - modes.calibration @ gain @ modes.calibration.T
         return replace(
             self,
             covariance=covariance,
             state=RigState(
                 rig=rig,
-                turns=Rotation.from_rotvec(step[:, :3]).as_matrix() @ state.turns,
-                centres=state.centres + step[:, 3:],
-                points=state.points + modes.points[rows] @ sizes,
+                turns=turns.as_matrix() @ state.turns,
+                centres=centres,
+                points=points,
             ),
         )
 
@@ -253,7 +258,8 @@ class SurveyProblem:
         self.left = self._spare(state) / (2 * len(pixels.station))
         seen = np.bincount(pixels.station, minlength=len(state.centres))
         self.held = seen < LEAST_POINTS
-        self.held[0] = True
+        group = linked_groups(pixels.station, pixels.point, len(seen))
+        self.held[first_of(group)] = True
         self.start = self._seen(state)
 
     def _spare(self, state: RigState) -> int:

@@ -6,7 +6,8 @@ what errors of the calibration add to it. A model of pictures has no place of it
 is stated is its shape: the covariance of what is left when all stations together are laid onto the
 truth by a rigid motion (and by a scale, where nothing fixes that) with the least squares error (the
 inner constraints of a free network; Baarda's S-transformation, 1973). Where the whole lies in the
-world is for the georeference to say.
+world is for the georeference to say. Stations that no point links make groups, and the shape is
+that of each; how a group lies to the largest is a mode of which pictures know nothing.
 
 Rig and ports are not exact: a lens that is off by its sigma bends the whole block a little, and
 every picture more does the same again. To first order stations and points move with the rig's
@@ -38,7 +39,6 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.adjustment.normal_equations import (
-    LEAST_POINTS,
     POSE,
     Gauge,
     LinearObservations,
@@ -46,9 +46,11 @@ from reconstruct.adjustment.normal_equations import (
     reduce_points,
 )
 from reconstruct.mapping.arrays import (
+    LEAST_POINTS,
     Indices,
     Observed,
     frames_of,
+    linked_groups,
     observed,
     rig_poses,
 )
@@ -90,7 +92,8 @@ class Uncertainty:
 
     def knowing(self, left: Array) -> Self:
         """The same where measurements leave the modes the covariance (K, K)."""
-        gain, modes = np.eye(len(left)) - left, self.modes
+        modes = self.modes
+        gain = np.diag(modes.known) - left
         return replace(
             self,
             frame_cov=self.frame_cov - _spread(modes.stations, gain),
@@ -98,7 +101,10 @@ class Uncertainty:
         )
 
     def moved(self, scale: float, rotation: Rotation) -> Self:
-        """The same in the world, `scale` and `rotation` being those of `world_from_model`."""
+        """The same in the world, `scale` and `rotation` being those of `world_from_model`.
+
+        Its modes are no longer to be found: they are by groups in the model.
+        """
         turn = rotation.as_matrix()
         both = np.kron(np.eye(2), turn)
         both[3:] *= scale
@@ -109,16 +115,44 @@ class Uncertainty:
             self, frame_cov=both @ self.frame_cov @ both.T, point_cov=places, point_noise=noise,
             modes=replace(
                 self.modes, stations=both @ self.modes.stations,
-                points=scale * turn @ self.modes.points,
+                points=scale * turn @ self.modes.points, groups=None,
             ),
         )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Groups:
+    """Groups of stations that no point links; the first is the largest."""
+
+    station: Indices
+    """(F,) the group of each station."""
+    point: Indices
+    """(P,) that of each point."""
+    middles: Array
+    """(N, 3) about which groups turn and grow."""
+
+    def carried(self, motions: Array, places: Array, group: Indices) -> Array:
+        """Places (M, 3) of groups (M,) that lie otherwise to the first.
+
+        Args:
+            motions: (N - 1, 6 or 7) of the other groups: turn, shift, logarithm of the scale.
+            places: to carry, in the model.
+            group: of each.
+        """
+        every = np.concatenate([np.zeros((1, motions.shape[1])), motions])[group]
+        arms = Rotation.from_rotvec(every[:, :3]).apply(places - self.middles[group])
+        grown: Array = arms * np.exp(every[:, 6:].sum(axis=1, keepdims=True))
+        return self.middles[group] + every[:, 3:6] + grown
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftModes:
     """Deformations of a block that pictures determine least, the softest first, each by a sigma.
 
-    They are independent of each other and of what else the covariance holds.
+    They are independent of each other and of what else the covariance holds. After them come
+    motions of the groups of stations that nothing links to the first: turns about the axes of the
+    model (radians), shifts and, where it is free, the logarithm of the scale. Pictures know nothing
+    of these.
     """
 
     stations: Array
@@ -127,6 +161,44 @@ class SoftModes:
     """(P, 3, K) motions of the points; in single precision, as there are many."""
     calibration: Array
     """(G, K) changes of the parameters of the rig; G is 0 where it is held."""
+    joints: int = 0
+    """How many of the K are motions of groups."""
+    groups: Groups | None = None
+    """The groups, where there are several."""
+
+    @property
+    def known(self) -> Array:
+        """(K,) of every mode 1, its variance by pictures, 0 of motions of groups: they have none.
+        """
+        count = self.stations.shape[2]
+        return (np.arange(count) < count - self.joints).astype(np.float64)
+
+    def moved(
+        self, sizes: Array, centres: Array, points: Array, rows: Indices | slice
+    ) -> tuple[Rotation, Array, Array]:
+        """Turns (F,) of the stations, and where these and the points are, with modes of a size.
+
+        Groups stay as they are in themselves, however far they turn.
+
+        Args:
+            sizes: (K,).
+            centres: (F, 3) of the stations before.
+            points: (N, 3) of some points before.
+            rows: which these are.
+        """
+        soft = sizes * self.known
+        step = self.stations @ soft
+        turns, centres = Rotation.from_rotvec(step[:, :3]), centres + step[:, 3:]
+        points = points + self.points[rows] @ soft
+        if self.groups is None:
+            return turns, centres, points
+        motions = sizes[-self.joints :].reshape(len(self.groups.middles) - 1, -1)
+        every = np.concatenate([np.zeros((1, 3)), motions[:, :3]])[self.groups.station]
+        return (
+            Rotation.from_rotvec(every) * turns,
+            self.groups.carried(motions, centres, self.groups.station),
+            self.groups.carried(motions, points, self.groups.point[rows]),
+        )
 
 
 def no_modes(stations: int, points: int) -> SoftModes:
@@ -166,13 +238,18 @@ class Motions:
         found: Indices = np.asarray(KDTree(self.places).query(points)[1])
         return found
 
-    def without(self, gauge: Gauge) -> "Motions":
-        """The same minus what a motion of the whole block does, which does not change its shape."""
+    def without(self, gauge: Gauge, group: Indices) -> "Motions":
+        """The same minus what motions of whole groups do, which do not change their shape.
+
+        Args:
+            gauge: these motions.
+            group: (P,) of the `places`.
+        """
         whole = gauge.motion_in(self.stations)
         return replace(
             self,
             stations=self.stations - gauge.motions @ whole,
-            points=self.points - gauge.of_points(self.places) @ whole,
+            points=self.points - gauge.of_points(self.places, group) @ whole,
         )
 
 
@@ -239,13 +316,15 @@ class BlockShape:
     noise: Array
     """(P, 3, 3) what the noise of a point's own keypoints does."""
     modes: SoftModes
+    gauge: Gauge
     equations: PointEquations
     """Of the stations, with nothing shared."""
     calibration: Motions | None
     """What errors of the rig do; None where they are unknown."""
 
     def variance(self, weights: Array) -> float:
-        """Variance of a sum over stations, (F, 6), that no motion of the whole block changes."""
+        """Variance of a sum over stations, (F, 6), apart from motions of whole groups."""
+        weights = self.gauge.shape_weights(weights)
         found = float((weights * self.equations.covariance_times(weights[..., None])[..., 0]).sum())
         if self.calibration is not None:
             along = product_of(weights[..., None], self.calibration.stations)[0]
@@ -273,7 +352,9 @@ def shape_of_block(
         held: whether the rig stays as it is, so that no mode may move it.
     """
     count = len(centres)
-    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free)
+    group = linked_groups(linear.station, linear.point, count)
+    group_of_point = np.maximum.reduceat(group[linear.station], linear.starts[:-1])
+    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free, group)
     loose = np.bincount(linear.station, minlength=count) < LEAST_POINTS
     equations = replace(reduce_points(linear, count), free=~(gauge.held | loose[:, None]))
     blocks = gauge.shape_blocks(equations)
@@ -282,7 +363,7 @@ def shape_of_block(
     of_stations = blocks[equations.own]
     moving = None
     if calibration is not None:
-        shape = calibration.without(gauge)
+        shape = calibration.without(gauge, group_of_point[KDTree(points).query(calibration.places)[1]])
         of_stations = of_stations + shape.of_stations()
         of_points += shape.of_points(points)
         moving = None if held else calibration
@@ -290,33 +371,38 @@ def shape_of_block(
         stations=of_stations,
         points=of_points,
         noise=equations.point_inverse,
-        modes=soft_modes(equations, gauge, moving, points),
+        gauge=gauge,
+        modes=soft_modes(equations, gauge, moving, points, group_of_point),
         equations=equations,
         calibration=calibration,
     )
 
 
 def soft_modes(
-    equations: PointEquations, gauge: Gauge, calibration: Motions | None, points: Array
+    equations: PointEquations,
+    gauge: Gauge,
+    calibration: Motions | None,
+    points: Array,
+    group: Indices,
 ) -> SoftModes:
-    """The leading eigenvectors of the covariance of the shape.
+    """The leading eigenvectors of the covariance of the shape, then motions of groups.
 
     Turns count as what they move at the usual distance, like the gauge's. A mode of the stations
     takes with it what it makes likely of the points and of the rig.
 
     Args:
         equations: of the stations, with nothing shared.
-        gauge: motions of the whole block, which are no change of its shape.
+        gauge: motions of whole groups, which are no change of their shape.
         calibration: what errors of the rig do; None without.
         points: (P, 3) in the model.
+        group: (P,) of them.
     """
     weigh = np.sqrt(gauge.weights)
     stations, width = equations.free.shape
 
     def moved(weighed: Array) -> tuple[Array, Array, Array]:
         """Covariance times (F, 6): of stations in a fixed rig, in all, and of the rig."""
-        whole = gauge.motions @ gauge.motion_in(weighed / weigh)
-        kick = weigh * (weighed - weigh * whole)
+        kick = gauge.shape_weights(weigh * weighed)
         own = equations.covariance_times(kick[..., None])[..., 0]
         if calibration is None:
             return own, own, np.zeros(0)
@@ -336,7 +422,7 @@ def soft_modes(
     start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
     values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
     kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
-    shape, rigs = [], []
+    shape, rigs, rigid = [], [], gauge.of_points(points, group)
     places = np.empty((*points.shape, len(kept)), np.float32)
     nearest = None if calibration is None else calibration.nearest(points)
     for n, k in enumerate(kept.tolist()):
@@ -347,12 +433,22 @@ def soft_modes(
         whole = gauge.motion_in(step)
         size_of = np.sqrt(values[k])
         shape.append((step - gauge.motions @ whole) / size_of)
-        places[..., n] = (place - gauge.of_points(points) @ whole) / size_of
+        places[..., n] = (place - rigid @ whole) / size_of
         rigs.append(rig / size_of)
-    return SoftModes(
+    soft = SoftModes(
         stations=np.stack(shape, axis=-1),
         points=places,
         calibration=np.stack(rigs, axis=-1),
+    )
+    joints = gauge.motions.shape[2] - gauge.each
+    if not joints:
+        return soft
+    return SoftModes(
+        stations=np.concatenate([soft.stations, gauge.motions[..., -joints:]], axis=2),
+        points=np.concatenate([places, rigid[..., -joints:].astype(np.float32)], axis=2),
+        calibration=np.pad(soft.calibration, ((0, 0), (0, joints))),
+        joints=joints,
+        groups=Groups(station=gauge.group, point=group, middles=gauge.middles),
     )
 
 

@@ -6,12 +6,16 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from reconstruct.views.model_files import keypoints_of
 
 Indices = NDArray[np.int64]
+LEAST_POINTS = 4
+"""A station that sees fewer is not determined."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,6 +68,43 @@ def rig_poses(model: pycolmap.Reconstruction, frames: Indices) -> RigidTransform
     poses: list[Any] = [model.frames[frame].rig_from_world for frame in frames.tolist()]
     turns = Rotation.from_quat(np.array([pose.rotation.quat for pose in poses]))
     return RigidTransform.from_components(np.array([pose.translation for pose in poses]), turns)
+
+
+def linked_groups(station: Indices, point: Indices, stations: int) -> Indices:
+    """Which group each station, (F,), is in: no point is seen from two of them.
+
+    The largest group is 0, of equals that with the first station; stations that see too little to
+    be determined link nothing, and count as of group 0.
+
+    Args:
+        station: (O,) of every observation.
+        point: (O,) its point.
+        stations: F, how many there are.
+    """
+    seen = np.bincount(station, minlength=stations) >= LEAST_POINTS
+    links = np.flatnonzero(seen[station])
+    size = stations + int(point.max(initial=-1)) + 1
+    ends = (station[links], stations + point[links])
+    _, label = connected_components(coo_array((np.ones(len(links)), ends), shape=(size, size)))
+    labels, first, count = np.unique(label[:stations][seen], return_index=True, return_counts=True)
+    rank = np.lexsort((first, -count))
+    group = np.zeros(stations, np.int64)
+    group[seen] = np.argsort(rank)[np.searchsorted(labels, label[:stations][seen])]
+    return group
+
+
+def model_groups(model: pycolmap.Reconstruction) -> Indices:
+    """(F,) the group of linked stations (see `linked_groups`) of each of `frames_of`."""
+    frames, seen = frames_of(model), observed(model)
+    of_picture = [model.images[number].frame_id for number in seen.pictures.tolist()]
+    station = np.repeat(np.searchsorted(frames, of_picture), np.diff(seen.starts))
+    return linked_groups(station, seen.point, len(frames))
+
+
+def first_of(group: Indices) -> Indices:
+    """Which station is the first of each group, (K,), from the groups of stations (F,)."""
+    first: Indices = np.unique(group, return_index=True)[1]
+    return first
 
 
 def first_pictures(model: pycolmap.Reconstruction, given: Array | None = None) -> dict[int, int]:

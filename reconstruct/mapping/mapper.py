@@ -3,7 +3,8 @@
 Stations of a known stereo rig are mapped all at once (`global_mapper`), everything else, and what
 that does not explain, incrementally. Adjustments run on one core, so that the same input gives
 the same bytes whatever the number of threads; only work on single pictures and pairs is spread.
-Of several models those that share stations become one, and the others are reported by name.
+Of several models those that share stations become one. Others lie apart in it where a rig gives
+them the same scale, for navigation to join; else they are left out and reported by name.
 """
 
 import shutil
@@ -26,7 +27,7 @@ from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
 from reconstruct.pictures.files import named
-from reconstruct.views.model_files import as_transform
+from reconstruct.views.model_files import as_transform, rigid3d
 
 Method = Literal["auto", "global", "incremental"]
 """How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""
@@ -54,13 +55,14 @@ disagree about where the second model lies in the first."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mapped:
-    """The largest model that the pictures gave."""
+    """What the pictures gave."""
 
     model: pycolmap.Reconstruction
+    """The largest model; on a calibrated rig also the others, wherever they lie."""
     warps: Mapping[str, PinholeWarp]
     """Each camera of the model, and its pinhole."""
     models: tuple[int, ...]
-    """Pictures in each model found, most first; all but the first were dropped."""
+    """Pictures in each model found, most first."""
     scaled: bool
     """Lengths are metres, since the rig is known."""
     baseline: float
@@ -94,7 +96,9 @@ def map_calibrated(
         name: warp.pinhole_from_cam * cam_from_rig[name] for name, warp in seen.warps.items()
     }
     found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
-    model = largest(found, seen.images)
+    model, left = largest(found, seen.images), found
+    if len(seen.cameras) > 1:
+        model, left = side_by_side(found)
     known, factor = float("nan"), 1.0
     if len(seen.cameras) > 1:
         first, second, *_ = pinhole_from_rig.values()
@@ -109,7 +113,7 @@ def map_calibrated(
         scaled=len(seen.cameras) > 1,
         baseline=known,
         rig_factor=factor,
-        notes=(*notes, *report_left_out(found)),
+        notes=(*notes, *report_left_out(left)),
     )
 
 
@@ -452,6 +456,54 @@ def second_from_first(
     return RigidTransform.from_components(place - turn.apply(middle), turn)
 
 
+def side_by_side(
+    models: Sequence[pycolmap.Reconstruction],
+) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
+    """Put models on one rig into one, apart from each other.
+
+    Args:
+        models: largest first; of the database that all were made from.
+
+    Returns:
+        The one model, and those that are not in it after the largest: they are unsound, or have
+        stations of larger ones.
+    """
+    whole, left = pycolmap.Reconstruction(models[0]), [models[0]]
+    for model in models[1:]:
+        shared = set(model.reg_frame_ids()) & set(whole.reg_frame_ids())
+        if shared or unsound(model):
+            left.append(model)
+        else:
+            _add(whole, model)
+    return whole, left
+
+
+def _add(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None:
+    """Add a model to another, in place, farther out along the first axis than all that is there."""
+    ends = [np.array([p.xyz[0] for p in m.points3D.values()]) for m in (whole, model)]
+    gap = float(np.ptp(ends[0]) + np.ptp(ends[1]))
+    apart = RigidTransform.from_translation([ends[0].max() - ends[1].min() + gap, 0.0, 0.0])
+    for number in sorted(model.reg_frame_ids()):
+        theirs = model.frames[number]
+        frame = pycolmap.Frame(frame_id=number, rig_id=theirs.rig_id)
+        for data in theirs.image_ids:
+            frame.add_data_id(data)
+        whole.add_frame(frame)
+        whole.frames[number].rig_from_world = rigid3d(_pose(model, number) * apart.inv())
+        for data in theirs.image_ids:
+            image = model.images[data.id]
+            rows = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
+            whole.add_image(
+                pycolmap.Image(
+                    name=image.name, image_id=data.id, camera_id=image.camera_id,
+                    frame_id=number, points2D=rows,
+                )
+            )  # fmt: skip
+        whole.register_frame(number)
+    for _, point in sorted(model.points3D.items()):
+        whole.add_point3D(apart.apply(point.xyz), point.track, point.color)
+
+
 def report_left_out(models: Sequence[pycolmap.Reconstruction]) -> list[str]:
     """A line for every model but the first, with its pictures; each is warned of, too."""
     notes = []
@@ -470,7 +522,11 @@ def report_left_out(models: Sequence[pycolmap.Reconstruction]) -> list[str]:
 
 def _poses(model: pycolmap.Reconstruction) -> dict[int, RigidTransform]:
     """`rig_from_world` by frame."""
-    return {f: as_transform(model.frames[f].rig_from_world) for f in sorted(model.reg_frame_ids())}
+    return {frame: _pose(model, frame) for frame in sorted(model.reg_frame_ids())}
+
+
+def _pose(model: pycolmap.Reconstruction, frame: int) -> RigidTransform:
+    return as_transform(model.frames[frame].rig_from_world)
 
 
 def _reach(model: pycolmap.Reconstruction) -> float:

@@ -20,7 +20,7 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from reconstruct.mapping.arrays import Indices, observed
+from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observed
 from reconstruct.mapping.bundle import FULLY, ROUGHLY, all_pictures, held_options
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
@@ -237,7 +237,8 @@ def refract(
 def adjust_freely(mapped: Mapped, tolerance: float | None = None) -> Mapped:
     """Adjust all poses and points.
 
-    A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
+    A rig fixes the scale, so that one station's pose is all that is held of each group that points
+    link; else two pictures are.
 
     Args:
         mapped: to adjust.
@@ -251,7 +252,8 @@ def adjust_freely(mapped: Mapped, tolerance: float | None = None) -> Mapped:
     model = pycolmap.Reconstruction(mapped.model)
     config = all_pictures(model)
     if np.isfinite(mapped.baseline):
-        config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+        for frame in frames_of(model)[first_of(model_groups(model))].tolist():
+            config.set_constant_rig_from_world_pose(frame)
     else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(

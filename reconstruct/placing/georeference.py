@@ -128,6 +128,7 @@ def fit_navigation(
     scale_sigma: float = 0.0,
     control: ExtraOf | None = None,
     modes: Array | None = None,
+    joints: int = 0,
 ) -> PlacementFit | None:
     """Fit a model to the positions and attitudes of navigation.
 
@@ -145,6 +146,7 @@ def fit_navigation(
         scale_sigma: relative, of a known scale; above 0 the scale is fitted about it.
         control: equations of control points and bars.
         modes: (N, 6, K) of the pictures by the model's soft modes; None where it is stiff.
+        joints: how many of them, the last, are motions of groups of which pictures know nothing.
 
     Returns:
         The fit; None, after a warning, where positions are too few or too close together, or have
@@ -166,6 +168,7 @@ def fit_navigation(
         scale_sigma=scale_sigma,
         mount_sigma_rad=np.deg2rad(mount_sigma_deg),
         control=control,
+        joints=joints,
     )
     near = task.robust(start, free)
     if near.scale < _SHRUNK * start.scale:
@@ -186,6 +189,7 @@ def fit_control(
     known_scale: float | None,
     scale_sigma: float,
     modes: Array | None = None,
+    joints: int = 0,
 ) -> PlacementFit:
     """Place a model by control points alone.
 
@@ -197,6 +201,7 @@ def fit_control(
         known_scale: metres in a unit of the model, or None: then the scale is fitted too.
         scale_sigma: relative, of a known scale.
         modes: as in `fit_navigation`.
+        joints: as there.
     """
     free = [0, 1, 2, 3, 4, 5]
     if known_scale is None or scale_sigma > 0:
@@ -208,6 +213,7 @@ def fit_control(
         scale_sigma=scale_sigma,
         mount_sigma_rad=0.0,
         control=control,
+        joints=joints,
     )
     return task.fit(task.robust(start, free), free)
 
@@ -221,6 +227,7 @@ class _NavigationTask:
     scale_sigma: float
     mount_sigma_rad: float
     control: ExtraOf | None
+    joints: int
 
     def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
         """Iterate from a robust placement to the final one."""
@@ -230,6 +237,7 @@ class _NavigationTask:
         used = without_gross_errors(found.misfit, epochs.known)
         bounds = self._frame_bounds()
         modes = range(PARAMETERS, PARAMETERS + len(sizes))
+        soft = len(sizes) - self.joints
         solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND), *modes]
         if epochs.has_attitude:
             solved_for += range(LEVER.start, LEVER.stop)
@@ -256,7 +264,8 @@ class _NavigationTask:
             sizes = sizes + got.change[PARAMETERS:]
             nuisances = got.change[:PARAMETERS]
             sigma = np.sqrt(np.diag(got.covariance))
-            before, factor = factor, _mode_factor(sizes, sigma[PARAMETERS:], factor)
+            before = factor
+            factor = _mode_factor(sizes[:soft], sigma[PARAMETERS:][:soft], factor)
             still = np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma[settling]
             if still.all() and abs(factor - before) <= _SETTLED_SIGMAS * factor:
                 off = self._turned(nuisances[TURN], bounds, got.correlation)
@@ -268,7 +277,7 @@ class _NavigationTask:
         scaled = got
         if SCALE not in free:
             found = equations(epochs.deformed(sizes), place, middle)
-            stiff = [p for p in solved_for if p < PARAMETERS]
+            stiff = [p for p in solved_for if p not in modes[:soft]]
             scaled = estimate(
                 epochs.time,
                 found,
@@ -347,15 +356,16 @@ class _NavigationTask:
         if got.used[:, 2].sum() < LEAST_STATIONS:
             return ()
         places = place.apply(epochs.centres)
-        modes = bend_modes(places, place)
+        modes = _VAGUE_PER_M * bend_modes(places, place)
         count = modes.shape[2]
-        found = equations(replace(epochs, modes=_VAGUE_PER_M * modes), place, middle)
+        modes = np.concatenate([modes, epochs.modes[..., len(sizes) - self.joints :]], axis=2)
+        found = equations(replace(epochs, modes=modes), place, middle)
         bent = estimate(
             epochs.time,
             found,
             got.used,
-            [*(p for p in free if p < PARAMETERS), *range(PARAMETERS, PARAMETERS + count)],
-            replace(self, control=None)._extra(place, middle, np.zeros(count)),
+            [*(p for p in free if p < PARAMETERS), *range(PARAMETERS, PARAMETERS + modes.shape[2])],
+            replace(self, control=None)._extra(place, middle, np.zeros(modes.shape[2])),
             frame_bounds=bounds,
             correlation=got.correlation,
         )
@@ -428,7 +438,7 @@ class _NavigationTask:
             misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
             rows.append(scale)
         known = np.zeros(columns)
-        known[PARAMETERS:] = 1.0 / mode_factor
+        known[PARAMETERS : columns - self.joints] = 1.0 / mode_factor
         known[LEVER], known[CLOCK] = 1.0 / LEVER_SIGMA_M, 1.0 / CLOCK_SIGMA_S
         if self.mount_sigma_rad > 0:
             known[MOUNT] = 1.0 / self.mount_sigma_rad

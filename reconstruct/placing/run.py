@@ -363,8 +363,9 @@ def _fit(
     sigma = 0.0
     if known is not None and (ties.informs_scale or not known.held):
         sigma = known.sigma
-    fit, modes = None, None
+    fit, modes, joints = None, None, 0
     if task.shape is not None:
+        joints = task.shape.modes.joints
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
@@ -383,6 +384,7 @@ def _fit(
         mount_sigma_deg=task.settings.mount_sigma_deg,
         scale_sigma=sigma,
         modes=modes,
+        joints=joints,
     )
     if task.datum is not None:
         fit = navigate(task.datum, control=ties.equations if ties.informs else None)
@@ -404,7 +406,7 @@ def _fit(
         return fit, note
     fit = fit_control(
         task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma,
-        modes=modes,
+        modes=modes, joints=joints,
     )  # fmt: skip
     return fit, None
 

@@ -188,7 +188,7 @@ def pose_covariances(
             total[i] = lever @ shape.frame_cov[row] @ lever.T
             if count:
                 modes = lever @ shape.modes.stations[row]
-                total[i] -= modes @ modes.T
+                total[i] -= shape.modes.known * modes @ modes.T
                 jacobian[i, :, PLACE:] = modes
     if fit is not None:
         total = total + jacobian @ fit.joint @ np.swapaxes(jacobian, 1, 2)

@@ -17,7 +17,7 @@ from reconstruct.adjustment.exact_observations import calibrated_parameters, exa
 from reconstruct.adjustment.normal_equations import LinearObservations, reduce_points
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
 from reconstruct.adjustment.uncertainty import BlockShape, Motions, shape_of_block
-from reconstruct.mapping.arrays import cross_matrices
+from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import sag_weights
 from reconstruct.placing.generalised_fit import Extra, estimate
@@ -108,7 +108,8 @@ def _calibration(
 ) -> Motions:
     """What is left of the errors of the calibration after the survey, and what they do."""
     found = reduce_points(linear, len(block.state.centres))
-    found.free[0] = False
+    station, point = block.pixels.station, block.pixels.point
+    found.free[first_of(linked_groups(station, point, len(found.free)))] = False
     found.shared[:-1, :-1] += inverse_of(calibrated_covariance(block.state.rig, fields))
     return motions_of(found, block.state.points, inverse_of(found.information))
 
@@ -141,7 +142,7 @@ def _placed(
     middle = state.centres.mean(axis=0)
     columns = PARAMETERS + modes.shape[2]
     known = np.zeros(columns)
-    known[PARAMETERS:] = 1.0
+    known[PARAMETERS:] = shape.modes.known
     known[LEVER], known[CLOCK] = 1.0 / LEVER_SIGMA_M, 1.0 / CLOCK_SIGMA_S
     known[TURN], known[STRETCH] = 1.0 / navigation.turn_rad, 1.0 / navigation.stretch
     rows = np.diag(known)[np.flatnonzero(known)]
@@ -180,11 +181,11 @@ def _precision(block: ExpectedBlock, shape: BlockShape, joint: Array, middle: Ar
     state, modes = block.state, shape.modes
     left = joint[PLACE:, PLACE:]
     shifts, points = modes.stations[:, 3:], modes.points.astype(np.float64)
-    rest = np.diagonal(shape.stations[:, 3:, 3:], axis1=1, axis2=2) - (shifts**2).sum(axis=2)
+    rest = np.diagonal(shape.stations[:, 3:, 3:], axis1=1, axis2=2) - shifts**2 @ modes.known
     own = np.einsum("fik,kl,fil->fi", shifts, left, shifts)
     slopes = np.concatenate([_by_place(state.centres - middle), shifts], axis=2)
     placed = np.einsum("fik,kl,fil->fi", slopes, joint, slopes)
-    heights = (shape.points - shape.noise)[:, 2, 2] - (points[:, 2] ** 2).sum(axis=1)
+    heights = (shape.points - shape.noise)[:, 2, 2] - points[:, 2] ** 2 @ modes.known
     heights += np.einsum("pk,kl,pl->p", points[:, 2], left, points[:, 2])
     cell_m = cell_of(block)
     cells_ne, variances = by_cell(state.points[:, :2], heights, cell_m)
@@ -216,7 +217,7 @@ def _sigma(shape: BlockShape, weights: Array, joint: Array, *, whole: float = 0.
     along = np.zeros(len(joint))
     along[SCALE] = whole
     along[PLACE:] = product_of(both[..., None], shape.modes.stations)[0]
-    stiff = shape.variance(both) - float(along[PLACE:] @ along[PLACE:])
+    stiff = shape.variance(both) - float(along[PLACE:] ** 2 @ shape.modes.known)
     return math.sqrt(max(stiff, 0.0) + float(along @ joint @ along))
 
 

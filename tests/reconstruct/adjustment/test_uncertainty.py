@@ -280,7 +280,7 @@ def test_a_motion_of_the_whole_block_is_no_change_of_shape() -> None:
         places=points,
         points=gauge.of_points(points) @ motion,
         covariance=np.eye(2),
-    ).without(gauge)
+    ).without(gauge, np.zeros(len(points), np.int64))
     assert np.abs(part.of_stations()).max() < 1e-20
     assert np.abs(part.of_points(points)).max() < 1e-20
 
