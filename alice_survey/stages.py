@@ -5,6 +5,7 @@ is named as `module:function` and loaded when its stage is made, so that `status
 without them.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -358,6 +359,11 @@ def _placing_summary(folder: Path) -> Summary:
         f"{found.registered} of {found.total} pictures registered, "
         f"{found.mean_reprojection_px:.2f} px; {found.scale_source}"
     )
+    if found.joints:
+        text += f"; {len(found.joints) + 1} parts that navigation alone joins, to " + " and ".join(
+            f"{math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m):.2g} m"
+            for joint in found.joints
+        )
     return text, found.to_json()
 
 

@@ -21,8 +21,7 @@ from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import sag_weights
 from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.navigation_equations import PLACE
-from reconstruct.placing.run import body_from_pinhole
+from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
 from reconstruct.placing.track import picture_modes, pose_covariances, track_rows
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform

@@ -244,6 +244,20 @@ class SimilarityRecord(JsonRecord):
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+class JointRecord(JsonRecord):
+    """How well stations that no picture links to the others are known to lie to the most of them.
+
+    Sigmas are of the vector between the middles of both, and of the turn of one to the other.
+    """
+
+    stations: int
+    sigma_north_m: float
+    sigma_east_m: float
+    sigma_depth_m: float
+    sigma_tilt_deg: float
+    sigma_heading_deg: float
+
+
 class RegistrationRecord(JsonRecord):
     """`sparse/registration.json`."""
 
@@ -252,6 +266,8 @@ class RegistrationRecord(JsonRecord):
     total: int
     stations: int = 0
     models: tuple[int, ...] = ()
+    joints: tuple[JointRecord, ...] = ()
+    """Of every part that only navigation joins to the largest."""
     points: int
     mean_reprojection_px: float
     mean_track_length: float

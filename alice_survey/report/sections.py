@@ -297,6 +297,13 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         ]
         rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
         rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+    for joint in found.joints:
+        apart = (joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m)
+        what = f"of {count(joint.stations, 'station')} that navigation alone joins to the others"
+        rows.append(
+            (f"sigma north, east and depth {what}", ", ".join(length(value) for value in apart))
+        )
+        rows.append((f"sigma of heading {what}", _degrees(joint.sigma_heading_deg)))
     notes = figures.held.frame.notes
     drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
     return Section(

@@ -121,6 +121,14 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
         bad=registered < _LEAST_REGISTERED * total,
     )
     mapping, found = figures.mapping, figures.registration
+    for joint in () if found is None else found.joints:
+        away = math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m)
+        yield Verdict(
+            level="look",
+            text=f"{count(joint.stations, 'station')} show nothing that the others show: "
+            f"navigation alone says where they lie to these, with a sigma of {length(away)}",
+            action="Fly a line across the gap to join the parts as well as their pictures can.",
+        )
     for note in () if found is None or found.acceptance is None else found.acceptance.notes:
         yield Verdict(
             level="look", text=note, action="Look at the stations that the first lines name."

@@ -141,8 +141,9 @@ class Groups:
         """
         every = np.concatenate([np.zeros((1, motions.shape[1])), motions])[group]
         arms = Rotation.from_rotvec(every[:, :3]).apply(places - self.middles[group])
-        grown: Array = arms * np.exp(every[:, 6:].sum(axis=1, keepdims=True))
-        return self.middles[group] + every[:, 3:6] + grown
+        grown = arms * np.exp(every[:, 6:].sum(axis=1, keepdims=True))
+        carried: Array = self.middles[group] + every[:, 3:6] + grown
+        return carried
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,10 +169,9 @@ class SoftModes:
 
     @property
     def known(self) -> Array:
-        """(K,) of every mode 1, its variance by pictures, 0 of motions of groups: they have none.
-        """
+        """(K,) 1 of modes with a variance by pictures, 0 of motions of groups, which have none."""
         count = self.stations.shape[2]
-        return (np.arange(count) < count - self.joints).astype(np.float64)
+        return np.repeat([1.0, 0.0], [count - self.joints, self.joints])
 
     def moved(
         self, sizes: Array, centres: Array, points: Array, rows: Indices | slice
@@ -363,7 +363,9 @@ def shape_of_block(
     of_stations = blocks[equations.own]
     moving = None
     if calibration is not None:
-        shape = calibration.without(gauge, group_of_point[KDTree(points).query(calibration.places)[1]])
+        shape = calibration.without(
+            gauge, group_of_point[KDTree(points).query(calibration.places)[1]]
+        )
         of_stations = of_stations + shape.of_stations()
         of_points += shape.of_points(points)
         moving = None if held else calibration

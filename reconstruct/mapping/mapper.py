@@ -96,9 +96,9 @@ def map_calibrated(
         name: warp.pinhole_from_cam * cam_from_rig[name] for name, warp in seen.warps.items()
     }
     found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
-    model, left = largest(found, seen.images), found
+    model, kept = largest(found, seen.images), found
     if len(seen.cameras) > 1:
-        model, left = side_by_side(found)
+        model, *_ = kept = side_by_side(found)
     known, factor = float("nan"), 1.0
     if len(seen.cameras) > 1:
         first, second, *_ = pinhole_from_rig.values()
@@ -113,7 +113,7 @@ def map_calibrated(
         scaled=len(seen.cameras) > 1,
         baseline=known,
         rig_factor=factor,
-        notes=(*notes, *report_left_out(left)),
+        notes=(*notes, *report_left_out(kept)),
     )
 
 
@@ -177,6 +177,7 @@ def _globally(
             found[0] = _sorted(grown)[0]
             adjust(found[0], options, tolerance=1e-7)
             found[0].update_point_3d_errors()
+            found = merge_models(_sorted(found), database, options)
     shutil.rmtree(scratch)
     return _sorted(found)
 
@@ -188,7 +189,7 @@ def faults_of(found: Sequence[pycolmap.Reconstruction], total: int) -> list[str]
     faults = unsound(found[0])
     lost = total - found[0].num_reg_images()
     if lost > _MOST_LOST * total:
-        faults.append(f"lost {lost} of {total} pictures")
+        faults.append(f"left {lost} of {total} pictures out of its largest model")
     return faults
 
 
@@ -456,26 +457,23 @@ def second_from_first(
     return RigidTransform.from_components(place - turn.apply(middle), turn)
 
 
-def side_by_side(
-    models: Sequence[pycolmap.Reconstruction],
-) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
+def side_by_side(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     """Put models on one rig into one, apart from each other.
 
     Args:
         models: largest first; of the database that all were made from.
 
     Returns:
-        The one model, and those that are not in it after the largest: they are unsound, or have
-        stations of larger ones.
+        The one model, and those that are not in it: they are unsound, or have stations of larger
+        ones and contradict these.
     """
-    whole, left = pycolmap.Reconstruction(models[0]), [models[0]]
+    whole, left = pycolmap.Reconstruction(models[0]), []
     for model in models[1:]:
-        shared = set(model.reg_frame_ids()) & set(whole.reg_frame_ids())
-        if shared or unsound(model):
+        if unsound(model) or set(model.reg_frame_ids()) & set(whole.reg_frame_ids()):
             left.append(model)
         else:
             _add(whole, model)
-    return whole, left
+    return [whole, *left]
 
 
 def _add(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None:

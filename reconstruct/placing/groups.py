@@ -16,10 +16,15 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import collected_by, warn
 from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
-from reconstruct.mapping.arrays import frames_of, model_groups
+from alice_survey.base.records import JointRecord
+from camera_calib.rig import Rig
+from reconstruct.adjustment.normal_equations import POSE
+from reconstruct.adjustment.uncertainty import SoftModes
+from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.pictures.files import named
 from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.navigation_equations import SCALE, body_from_pinhole
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.views.model_files import as_transform, rigid3d
 
@@ -30,19 +35,20 @@ _MOST_TURN_RAD = 0.1
 def join_groups(
     mapped: Mapped,
     records: Sequence[ImageRecord],
-    body_from_pinhole: Mapping[str, RigidTransform] | None,
+    rig: Rig | None,
     datum: Datum | None,
 ) -> Mapped:
     """Move groups of linked stations to where navigation has them, seen from the largest.
 
     Args:
-        mapped: on a rig that gives the scale; its groups may lie anywhere.
+        mapped: its groups may lie anywhere.
         records: pictures.
-        body_from_pinhole: mount of every camera; None where it is unknown.
+        rig: as calibrated; None where it is unknown.
         datum: origin of the local frame; None where no latitude and longitude are known.
 
     Returns:
-        The model without those groups that navigation does not place, which are reported.
+        The model without those groups that navigation does not place or whose scale nothing gives,
+        which are reported.
     """
     frames, groups = frames_of(mapped.model), model_groups(mapped.model)
     if not groups.any():
@@ -50,21 +56,61 @@ def join_groups(
     model, notes = pycolmap.Reconstruction(mapped.model), []
     of_name = {record.image: record for record in records}
     members = [frames[groups == group].tolist() for group in range(int(groups.max()) + 1)]
-    fits = [_placed(model, of_frames, of_name, body_from_pinhole, datum) for of_frames in members]
+    mounts = None if rig is None else body_from_pinhole(rig, mapped.warps)
+    fits = [
+        _placed(model, of_frames, of_name, mounts, datum if mapped.scaled else None)
+        for of_frames in members
+    ]
     for of_frames, fit in list(zip(members, fits, strict=True))[1:]:
         if fit is None or fits[0] is None:
             notes.append(_leave_out(model, of_frames))
         else:
             _move(model, of_frames, _rigid(fits[0]).inv() * _rigid(fit))
+            notes.append(f"{len(of_frames)} stations joined to the others by navigation alone")
+    model.tear_down()  # what is left out is no longer in it at all
     model.update_point_3d_errors()
     return replace(mapped, model=model, notes=(*mapped.notes, *notes))
+
+
+def joints_of(fit: PlacementFit, modes: SoftModes) -> tuple[JointRecord, ...]:
+    """How well each group after the first is known to lie to the first.
+
+    Args:
+        fit: of the place and the modes.
+        modes: of the model before they were found.
+    """
+    if modes.groups is None:
+        return ()
+    place, found = fit.ned_from_model, []
+    turn, middles = place.rotation.as_matrix(), place.apply(modes.groups.middles)
+    each = modes.joints // (len(middles) - 1)
+    for group in range(1, len(middles)):
+        away = middles[group] - middles[0]
+        first = len(fit.joint) - each * (len(middles) - group)
+        slopes = np.zeros((POSE, len(fit.joint)))
+        slopes[:3, :3], slopes[:3, SCALE] = -cross_matrices(away[None])[0], away
+        slopes[:3, first + 3 : first + 6] = place.scale * turn
+        slopes[3:, first : first + 3] = turn
+        sigmas = np.sqrt(np.einsum("ij,jk,ik->i", slopes, fit.joint, slopes))
+        north, east, down = sigmas[:3].tolist()
+        found.append(
+            JointRecord(
+                stations=int((modes.groups.station == group).sum()),
+                sigma_north_m=north,
+                sigma_east_m=east,
+                sigma_depth_m=down,
+                sigma_tilt_deg=float(np.rad2deg(np.sqrt((sigmas[3:5] ** 2).mean()))),
+                sigma_heading_deg=float(np.rad2deg(sigmas[5])),
+            )
+        )
+    return tuple(found)
 
 
 def _placed(
     model: pycolmap.Reconstruction,
     frames: Sequence[int],
     records: Mapping[str, ImageRecord],
-    body_from_pinhole: Mapping[str, RigidTransform] | None,
+    mounts: Mapping[str, RigidTransform] | None,
     datum: Datum | None,
 ) -> PlacementFit | None:
     """The place of a group by its own navigation; None where that leaves it loose."""
@@ -76,7 +122,7 @@ def _placed(
     centres = np.stack([pose.translation for pose in poses])
     with collected_by(lambda *_: None):  # of the whole model it is reported later
         fit = fit_navigation(
-            [records[model.images[n].name] for n in numbers], poses, body_from_pinhole, datum,
+            [records[model.images[n].name] for n in numbers], poses, mounts, datum,
             level(points, centres), known_scale=1.0,
         )  # fmt: skip
     if fit is None:

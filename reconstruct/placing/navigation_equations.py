@@ -18,6 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
+from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
 
@@ -94,6 +96,13 @@ class Epochs:
     def has_horizontal(self) -> bool:
         """Whether any north and east are known."""
         return bool(self.known[:, 0].any())
+
+
+def body_from_pinhole(rig: Rig, warps: Mapping[str, PinholeWarp]) -> dict[str, RigidTransform]:
+    """Mounts of the pinholes, metres."""
+    return {
+        name: rig.body_from_cam(name) * warp.pinhole_from_cam.inv() for name, warp in warps.items()
+    }
 
 
 def read_epochs(

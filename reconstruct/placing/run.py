@@ -26,6 +26,7 @@ from alice_survey.base.records import (
     ControlRecord,
     DomingRecord,
     GeoreferenceRecord,
+    JointRecord,
     MappingRecord,
     PicturesRecord,
     PortRecord,
@@ -54,7 +55,8 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
-from reconstruct.placing.navigation_equations import PLACE
+from reconstruct.placing.groups import join_groups, joints_of
+from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import (
@@ -137,7 +139,9 @@ def run_sparse(
     """
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
-    known = _mapped(workspace, mapping)
+    known = join_groups(_mapped(workspace, mapping), inputs.records, inputs.rig, inputs.datum)
+    left = sum(image.has_pose for image in known.model.images.values())
+    mapping = mapping.model_copy(update={"registered": left, "notes": known.notes})
     adjusted = adjust_survey(known, inputs.records, inputs.rig, mapping.distances, reconstruct)
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()
@@ -173,6 +177,7 @@ def run_sparse(
     model.export_PLY(folder / "sparse.ply")
     cameras = CamerasRecord.read(workspace / "mapping" / "cameras.json").to_json()
     cameras["cameras"] = {name: warp.to_json() for name, warp in warps.items()}
+    cameras["images"] = {name: of for name, of in cameras["images"].items() if name in poses}
     CamerasRecord.save(folder / "cameras.json", cameras)
     if adjusted.exact is not None and adjusted.exact.fit.parameters:
         PortRecord.save(folder / "port.json", adjusted.exact.fit.to_json())
@@ -200,7 +205,8 @@ def run_sparse(
     if rig is not None and adjusted.mapped.scaled:
         bends = () if placed.fit is None else placed.fit.bends
         doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum, bends)
-    _registration(model, mapping, placed, rows, doming, accepted).write(
+    joints = () if shape is None or placed.fit is None else joints_of(placed.fit, shape.modes)
+    _registration(model, mapping, placed, rows, doming, accepted, joints).write(
         folder / "registration.json"
     )
 
@@ -248,6 +254,7 @@ def _registration(
     rows: Sequence[TrackRow],
     doming: Doming | None,
     accepted: Acceptance | None,
+    joints: tuple[JointRecord, ...],
 ) -> RegistrationRecord:
     baseline = model_baseline(model)
     fit = placed.fit
@@ -256,6 +263,7 @@ def _registration(
         total=mapping.total,
         stations=len({row.station for row in rows}),
         models=mapping.models,
+        joints=joints,
         points=int(model.num_points3D()),
         mean_reprojection_px=float(model.compute_mean_reprojection_error()),
         mean_track_length=float(model.compute_mean_track_length()),
@@ -338,13 +346,6 @@ def find_place(task: Placing) -> Placed:
         control=ties if (control.points or control.lengths) and scaled else None,
         located=fit is not None and local is None,
     )
-
-
-def body_from_pinhole(rig: Rig, warps: Mapping[str, PinholeWarp]) -> dict[str, RigidTransform]:
-    """Mounts of the pinholes, metres."""
-    return {
-        name: rig.body_from_cam(name) * warp.pinhole_from_cam.inv() for name, warp in warps.items()
-    }
 
 
 def _fit(

@@ -23,8 +23,7 @@ from reconstruct.mapping.robust import cauchy_weights
 from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.navigation_equations import PLACE
-from reconstruct.placing.run import body_from_pinhole
+from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
 from reconstruct.placing.track import picture_modes
 from reconstruct.views.model_files import as_transform
 from tests.oracles_refraction import dense_normal_equations

@@ -16,8 +16,8 @@ from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
+from reconstruct.placing.navigation_equations import body_from_pinhole
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
-from reconstruct.placing.run import body_from_pinhole
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
 KNOWN = np.array(

@@ -1,6 +1,6 @@
 """Patches of a survey that no picture links, joined by navigation, against the truth."""
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,9 +19,8 @@ from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.placing.groups import _move, join_groups
-from reconstruct.placing.navigation_equations import PLACE
+from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
 from reconstruct.placing.placement_fit import PlacementFit
-from reconstruct.placing.run import body_from_pinhole
 from reconstruct.placing.track import picture_modes, pose_covariances, track_rows
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform
@@ -36,9 +35,11 @@ THREE = (range(5), range(9, 13), range(17, 20))
 TAU_S = 60.0
 
 
-def patches(steps: tuple[range, ...], seed: int, lines: int = 3) -> Scene:
+def patches(
+    steps: tuple[range, ...], seed: int, lines: int = 3, stations: int | None = None
+) -> Scene:
     """Lines over a floor of which pictures are left of these steps alone, and a log that drifts."""
-    stations = max(step.stop for step in steps)
+    stations = stations or max(step.stop for step in steps)
     scene = make_scene(
         lines=lines, stations=stations, points=150 * stations, noise_px=0.3, scale=1, seed=seed
     )
@@ -78,9 +79,7 @@ def mapped_apart(scene: Scene, folder: Path, seed: int) -> Mapped:
     """The model with every patch in a frame of its own, as a mapper leaves it."""
     seen, warps = warped_scene(scene)
     rng = np.random.default_rng([seed, 1])
-    mapped, _ = refract(
-        near_truth(scene, seen, warps, rng), seen, folder, settle=False
-    )
+    mapped, _ = refract(near_truth(scene, seen, warps, rng), seen, folder, settle=False)
     frames, groups = frames_of(mapped.model), model_groups(mapped.model)
     for group in range(int(groups.max()) + 1):
         motion = RigidTransform.from_components(rng.normal(0, 10, 3), Rotation.random(rng=rng))
@@ -125,7 +124,7 @@ class Found:
 def placed(scene: Scene, mapped: Mapped) -> Found:
     """The end of the pipeline, as `run_sparse` has it."""
     mounts = body_from_pinhole(scene.rig, mapped.warps)
-    joined = join_groups(mapped, scene.records, mounts, DATUM)
+    joined = join_groups(mapped, scene.records, scene.rig, DATUM)
     found = adjust_survey(joined, scene.records, scene.rig, DISTANCES, ReconstructConfig())
     assert found.shape is not None
     model = found.mapped.model
@@ -134,7 +133,8 @@ def placed(scene: Scene, mapped: Mapped) -> Found:
     pinholes = [as_transform(model.images[n].cam_from_world()).inv() for n in numbers]
     points = np.array([point.xyz for _, point in sorted(model.points3D.items())])
     fit = fit_navigation(
-        records, pinholes, mounts, DATUM, level(points, np.stack([p.translation for p in pinholes])),
+        records, pinholes, mounts, DATUM,
+        level(points, np.stack([pose.translation for pose in pinholes])),
         known_scale=1.0, modes=picture_modes(found.shape, records, pinholes),
         joints=found.shape.modes.joints,
     )  # fmt: skip
@@ -165,5 +165,85 @@ def _as_rigid(fit: PlacementFit) -> RigidTransform:
     return RigidTransform.from_components(place.translation, place.rotation)
 
 
-def whitened(error: Array, covariance: Array) -> Array:
-    return np.linalg.solve(np.linalg.cholesky(covariance), error)
+def rms(values: Sequence[float] | Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_patches_lie_to_each_other_as_well_as_is_stated(tmp_path: Path) -> None:
+    """Of 20 surveys the errors are 1.13 times their sigmas; shapes are as of a patch alone."""
+    ratios, whole, shapes, alone = [], [], [], []
+    for seed in range(4):
+        scene = patches(TWO, seed)
+        found = placed(scene, mapped_apart(scene, tmp_path, seed))
+        wrong, covariance = found.joint(1)
+        ratios.append(np.linalg.solve(np.linalg.cholesky(covariance), wrong))
+        sigmas = np.sqrt(np.einsum("nii->ni", found.covariances[:, :3, :3]))
+        whole.append((found.poses.translation - found.true.translation) / sigmas)
+        assert np.all(np.sqrt(np.diag(covariance))[3:] > 5e-3)
+        assert np.all(np.sqrt(np.diag(covariance))[3:] < 2.0 * SIGMA[:3])
+        shapes += [found.shape_rms_m(group) for group in (0, 1)]
+        one = patches(TWO[:1], seed, stations=TWO[-1].stop)
+        alone.append(placed(one, mapped_apart(one, tmp_path, seed)).shape_rms_m(0))
+    assert 0.7 < rms(np.array(ratios)) < 1.4
+    assert 0.5 < rms(np.concatenate(whole)) < 1.5
+    assert rms(shapes) < 1.3 * rms(alone)
+    assert 0.2e-3 < rms(shapes) < 2e-3
+
+
+def test_three_patches_are_joined(tmp_path: Path) -> None:
+    scene = patches(THREE, 1)
+    found = placed(scene, mapped_apart(scene, tmp_path, 1))
+    assert sorted(np.bincount(found.group).tolist()) == [9, 12, 15]
+    ratios = []
+    for group in (1, 2):
+        wrong, covariance = found.joint(group)
+        ratios.append(wrong / np.sqrt(np.diag(covariance)))
+    assert 0.4 < rms(np.array(ratios)) < 1.8
+    assert max(found.shape_rms_m(group) for group in range(3)) < 3e-3
+
+
+def test_a_patch_is_turned_and_not_bent(tmp_path: Path) -> None:
+    """A log whose headings are off in one dive by 4 degrees, as it says."""
+    scene = patches(TWO, 2)
+    stations = max(step.stop for step in TWO)
+    wrong = replace(scene, records=[
+        replace(
+            record, heading_deg=record.heading_deg + 4.0, sigma_heading_deg=4.0,
+        )
+        if _patch(record.station, stations, TWO) == 2
+        else record
+        for record in scene.records
+    ])  # fmt: skip
+    right, turned = (placed(one, mapped_apart(one, tmp_path, 2)) for one in (scene, wrong))
+    for group in (0, 1):
+        assert turned.shape_rms_m(group) == pytest.approx(right.shape_rms_m(group), rel=0.3)
+
+
+def test_a_patch_that_navigation_does_not_place_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = patches(TWO, 3, lines=2)
+    mapped = mapped_apart(scene, tmp_path, 3)
+    of_frame = dict(zip(frames_of(mapped.model), model_groups(mapped.model), strict=True))
+    blind = {station - 1 for station, group in of_frame.items() if group == 1}
+    silent = {"latitude_deg": np.nan, "longitude_deg": np.nan}
+    records = [replace(r, **silent) if r.station in blind else r for r in scene.records]
+    found = join_groups(mapped, records, scene.rig, DATUM)
+    left = {scene.records[n - 1].station for n, i in found.model.images.items() if i.has_pose}
+    assert left == {record.station for record in scene.records} - blind
+    assert "20 pictures make a separate model" in capsys.readouterr().err
+    assert "left/" in found.notes[-1]
+    assert not model_groups(found.model).any()
+    assert len(join_groups(mapped, records, scene.rig, None).notes) == 1
+    both = join_groups(mapped, scene.records, scene.rig, DATUM)
+    assert len(frames_of(both.model)) == 20
+
+
+def test_a_linked_survey_has_one_group(tmp_path: Path) -> None:
+    scene = patches((range(6),), 4, lines=2)
+    mapped = mapped_apart(scene, tmp_path, 4)
+    assert join_groups(mapped, scene.records, scene.rig, DATUM) is mapped
+    found = adjust_survey(mapped, scene.records, scene.rig, DISTANCES, ReconstructConfig())
+    assert found.shape is not None
+    assert found.shape.modes.joints == 0
+    assert found.shape.modes.groups is None
