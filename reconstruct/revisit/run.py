@@ -136,7 +136,7 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     ]
     if len(found.record.models) > 1:
         sizes = " and ".join(map(str, found.record.models))
-        lines.append(f"pictures that were not joined: models of {sizes} pictures")
+        lines.append(f"no picture links models of {sizes} pictures to each other")
     if not found.places:
         return "\n".join([*lines, "nothing is weak"])
     lines += [
