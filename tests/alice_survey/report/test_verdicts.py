@@ -33,6 +33,15 @@ def test_lost_pictures_are_judged(tmp_path: Path, registered: int, level: str) -
     assert level_of(found, f"{registered} of 4") == level
 
 
+def test_parts_that_navigation_alone_joins_are_named_with_their_sigma(tmp_path: Path) -> None:
+    joint = {"stations": 7, "sigma_north_m": 0.03, "sigma_east_m": 0.04, "sigma_depth_m": 0.0,
+             "sigma_tilt_deg": 0.1, "sigma_heading_deg": 0.2}  # fmt: skip
+    figures, found = judged(tiny_workspace(tmp_path, sparse={"joints": [joint]}))
+    assert level_of(found, "7 stations show nothing that the others show") == "look"
+    assert any("sigma of 5" in verdict.text for verdict in found)
+    assert "across the gap" in summary(figures, found)["What to do next"]
+
+
 @pytest.mark.parametrize(("scale", "level"), [(0.99, "look"), (0.999, "good"), (1.01, "look")])
 def test_navigation_that_contradicts_the_rig_is_judged(
     tmp_path: Path, scale: float, level: str

@@ -8,10 +8,12 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL, local_executor
+from reconstruct.mapping.arrays import model_groups
 from reconstruct.mapping.global_mapper import average_poses, station_groups
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
 from reconstruct.mapping.stations import StationLink, link_stations, stereo_points
-from tests.reconstruct.mapping.test_mapper import camera_rms, seen_by_pinholes
+from reconstruct.placing.alignment import align_rigid
+from tests.reconstruct.mapping.test_mapper import camera_rms, pupils, seen_by_pinholes
 from tests.reconstruct.scenes import Scene, make_scene
 
 
@@ -211,3 +213,25 @@ def test_pictures_without_matches_are_left_out_and_counted() -> None:
         mapped = map_calibrated(cut, scene.rig.cam_from_rig, Path(folder), 1)
     assert mapped.models[0] == 10
     assert "2 of 12" in mapped.notes[0]
+
+
+def test_models_that_no_match_links_are_kept_apart() -> None:
+    scene = make_scene(lines=1, stations=10, points=6000, noise_px=0.2)
+    seen = seen_by_pinholes(scene)
+    halves = [record.station < 6 for record in seen.images]
+    cut = replace(seen, pairs=[p for p in seen.pairs if halves[p[0]] == halves[p[1]]])
+    with TemporaryDirectory() as folder:
+        mapped = map_calibrated(cut, scene.rig.cam_from_rig, Path(folder), 1, method="global")
+    assert mapped.models == (12, 8)
+    assert not [note for note in mapped.notes if "separate model" in note]
+    groups = model_groups(mapped.model)
+    np.testing.assert_array_equal(groups, [0] * 6 + [1] * 4)
+    found, true = (np.array(p) for p in pupils(mapped, scene))
+    for group in (0, 1):
+        own = np.repeat(groups == group, 2)
+        off = align_rigid(found[own], true[own]).apply(found[own]) - true[own]
+        assert 0.05e-3 < np.sqrt((off**2).sum(axis=1).mean()) < 5e-3
+    spread = np.ptp(found[np.repeat(groups == 0, 2)], axis=0).max()
+    ends = [found[np.repeat(groups == group, 2), 0] for group in (0, 1)]
+    assert ends[1].min() - ends[0].max() > spread
+    assert mapped.model.compute_mean_reprojection_error() < 0.5
