@@ -12,7 +12,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.block_solver import inverse_of
-from alice_survey.base.config import CameraConfig, ImagingConfig, SurveyConfig, WaterConfig
+from alice_survey.base.config import (
+    CameraConfig,
+    ImagingConfig,
+    NavigationConfig,
+    ReconstructConfig,
+    WaterConfig,
+)
 from alice_survey.seafloor.board import PoolBoard, pool_poses
 from alice_survey.vehicle.navigation.sensors import CompassSpec, PressureSpec
 from camera_calib.freedom import USUAL_LENS, of_lenses, of_ports, pose_names
@@ -143,9 +149,9 @@ class NavigationErrors:
     installed: Installation = USUAL_INSTALLATION
 
     @classmethod
-    def of(cls, config: SurveyConfig) -> "NavigationErrors":
+    def of(cls, settings: NavigationConfig, placing: ReconstructConfig) -> "NavigationErrors":
         """Of the survey's instruments, as the filter of the simulated vehicle leaves them."""
-        settings, pressure, compass = config.navigation, PressureSpec(), CompassSpec()
+        pressure, compass = PressureSpec(), CompassSpec()
         bias_rad = math.radians(settings.compass_bias_deg)
         return cls(
             channels={
@@ -168,7 +174,7 @@ class NavigationErrors:
             },
             turn_rad=_TURN_SHARE * max(bias_rad, 1e-6),
             stretch=_STRETCH,
-            installed=Installation.of(config.reconstruct),
+            installed=Installation.of(placing),
         )  # fmt: skip
 
     def times(self, factor: float) -> "NavigationErrors":
