@@ -56,7 +56,7 @@ from reconstruct.placing.control_file import (
 )
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.groups import join_groups, joints_of
-from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
+from reconstruct.placing.navigation_equations import PLACE, Installation, body_from_pinhole
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import (
@@ -382,7 +382,7 @@ def _fit(
         None if task.rig is None else body_from_pinhole(task.rig, task.warps),
         levelled=levelled,
         known_scale=scale,
-        mount_sigma_deg=task.settings.mount_sigma_deg,
+        installed=Installation.of(task.settings),
         scale_sigma=sigma,
         modes=modes,
         joints=joints,
