@@ -24,7 +24,12 @@ from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.pictures.files import named
 from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.navigation_equations import SCALE, body_from_pinhole
+from reconstruct.placing.navigation_equations import (
+    SCALE,
+    USUAL_INSTALLATION,
+    Installation,
+    body_from_pinhole,
+)
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.views.model_files import as_transform, rigid3d
 
@@ -37,6 +42,7 @@ def join_groups(
     records: Sequence[ImageRecord],
     rig: Rig | None,
     datum: Datum | None,
+    installed: Installation = USUAL_INSTALLATION,
 ) -> Mapped:
     """Move groups of linked stations to where navigation has them, seen from the largest.
 
@@ -45,6 +51,7 @@ def join_groups(
         records: pictures.
         rig: as calibrated; None where it is unknown.
         datum: origin of the local frame; None where no latitude and longitude are known.
+        installed: how well it is known where the cameras are on the vehicle, and their clock.
 
     Returns:
         The model without those groups that navigation does not place or whose scale nothing gives,
@@ -58,7 +65,7 @@ def join_groups(
     members = [frames[groups == group].tolist() for group in range(int(groups.max()) + 1)]
     mounts = None if rig is None else body_from_pinhole(rig, mapped.warps)
     fits = [
-        _placed(model, of_frames, of_name, mounts, datum if mapped.scaled else None)
+        _placed(model, of_frames, of_name, mounts, datum if mapped.scaled else None, installed)
         for of_frames in members
     ]
     for of_frames, fit in list(zip(members, fits, strict=True))[1:]:
@@ -112,6 +119,7 @@ def _placed(
     records: Mapping[str, ImageRecord],
     mounts: Mapping[str, RigidTransform] | None,
     datum: Datum | None,
+    installed: Installation,
 ) -> PlacementFit | None:
     """The place of a group by its own navigation; None where that leaves it loose."""
     numbers = _pictures(model, frames)
@@ -123,7 +131,7 @@ def _placed(
     with collected_by(lambda *_: None):  # of the whole model it is reported later
         fit = fit_navigation(
             [records[model.images[n].name] for n in numbers], poses, mounts, datum,
-            level(points, centres), known_scale=1.0,
+            level(points, centres), known_scale=1.0, installed=installed,
         )  # fmt: skip
     if fit is None:
         return None

@@ -139,7 +139,10 @@ def run_sparse(
     """
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
-    known = join_groups(_mapped(workspace, mapping), inputs.records, inputs.rig, inputs.datum)
+    known = join_groups(
+        _mapped(workspace, mapping), inputs.records, inputs.rig, inputs.datum,
+        Installation.of(reconstruct),
+    )  # fmt: skip
     left = sum(image.has_pose for image in known.model.images.values())
     mapping = mapping.model_copy(update={"registered": left, "notes": known.notes})
     adjusted = adjust_survey(known, inputs.records, inputs.rig, mapping.distances, reconstruct)
