@@ -15,6 +15,7 @@ from alice_survey.base.records import RangeRecord, RegistrationRecord
 from alice_survey.survey import run
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.normal_equations import Gauge
+from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import Indices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
@@ -101,6 +102,9 @@ class Found:
     true: RigidTransform
     covariances: Array
     """(S, 6, 6) of the poses."""
+    before: Uncertainty
+    """Of the shape, before navigation."""
+    after: Uncertainty
 
     def shape_rms_m(self, group: int) -> float:
         """What is left of a group's errors when it is laid onto the truth."""
@@ -154,12 +158,15 @@ def placed(scene: Scene, mapped: Mapped) -> Found:
         if r.camera == "left"
     }
     groups = dict(zip(found.shape.stations.tolist(), model_groups(model).tolist(), strict=True))
+    assert after.shape is not None
     return Found(
         fit=fit,
         group=np.array([groups[row.station] for row in rows]),
         poses=RigidTransform.concatenate([row.world_from_cam for row in rows]),
         true=RigidTransform.concatenate([true[row.station] for row in rows]),
         covariances=pose_covariances(rows, fit, found.shape, fit.ned_from_model),
+        before=found.shape,
+        after=after.shape,
     )
 
 
@@ -197,10 +204,16 @@ def test_three_patches_are_joined(tmp_path: Path) -> None:
     scene = patches(THREE, 1)
     found = placed(scene, mapped_apart(scene, tmp_path, 1))
     assert sorted(np.bincount(found.group).tolist()) == [9, 12, 15]
+    assert found.before.modes.groups is not None
+    of_point = found.before.modes.groups.point
+    known = found.after.moved(1.0, found.fit.ned_from_model.rotation).point_cov[:, 2, 2]
     ratios = []
     for group in (1, 2):
         wrong, covariance = found.joint(group)
         ratios.append(wrong / np.sqrt(np.diag(covariance)))
+        heights = np.sqrt(known[of_point == group] / covariance[5, 5])
+        assert 0.9 < heights.min() < np.median(heights) < 1.5
+    assert 1e-4 < np.sqrt(np.median(known[of_point == 0])) < 3e-3
     assert 0.4 < rms(np.array(ratios)) < 1.8
     assert max(found.shape_rms_m(group) for group in range(3)) < 3e-3
 
