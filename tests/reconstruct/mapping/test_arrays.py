@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.arrays import LEAST_POINTS, first_of, linked_groups, observed
 from reconstruct.views import model_files
 from tests.reconstruct.mapping.test_mapper import block_mapped
 
@@ -51,3 +51,31 @@ def test_a_copy_for_which_there_was_no_room_is_named(tmp_path: Path) -> None:
         (tmp_path / "images.bin").write_bytes(whole[:length])
         with pytest.raises(OSError):
             dict(model_files._all_keypoints(tmp_path / "images.bin"))
+
+
+def test_groups_are_the_stations_that_points_link() -> None:
+    """Against spreading from station to station until nothing changes; the largest group is 0."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        station, point = rng.integers(0, 12, 70), rng.integers(0, 60, 70)
+        group = linked_groups(station, point, 13)
+        seen = np.bincount(station, minlength=13) >= LEAST_POINTS
+        shown = [set(point[station == s].tolist()) if seen[s] else set() for s in range(13)]
+        label = np.arange(13)
+        for _ in range(13):
+            for a in range(13):
+                for b in range(13):
+                    if shown[a] & shown[b]:
+                        label[a] = label[b] = min(label[a], label[b])
+        same = (label[:, None] == label)[seen][:, seen]
+        np.testing.assert_array_equal((group[:, None] == group)[seen][:, seen], same)
+        counts = np.bincount(group[seen])
+        assert np.all(np.diff(counts) <= 0)
+        assert not group[~seen].any()
+        assert first_of(group).tolist() == [group.tolist().index(g) for g in range(len(counts))]
+
+
+def test_a_station_that_sees_too_little_links_nothing() -> None:
+    station = np.array([0] * 5 + [1] * 2 + [2] * 5)
+    point = np.array([0, 1, 2, 3, 4, 4, 5, 5, 6, 7, 8, 9])
+    assert linked_groups(station, point, 3).tolist() == [0, 0, 1]
