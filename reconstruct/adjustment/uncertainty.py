@@ -222,34 +222,42 @@ class Motions:
     """(P, 3, G) motions of those points by the parameters."""
     covariance: Array
     """(G, G) covariance of the parameters."""
+    group: Indices | None = None
+    """(P,) of the `places`; None where all are of one."""
 
     def of_stations(self) -> Array:
         """Covariances (F, 6, 6) of the stations."""
         return _spread(self.stations, self.covariance)
 
-    def of_points(self, points: Array) -> Array:
+    def of_points(self, points: Array, group: Indices | None = None) -> Array:
         """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
-        given, which = np.unique(self.nearest(points), return_inverse=True)
+        given, which = np.unique(self.nearest(points, group), return_inverse=True)
         found: Array = _spread(self.points[given], self.covariance)[which]
         return found
 
-    def nearest(self, points: Array) -> Indices:
-        """(N,) which of `places` are nearest to (N, 3) points."""
-        found: Indices = np.asarray(KDTree(self.places).query(points)[1])
+    def nearest(self, points: Array, group: Indices | None = None) -> Indices:
+        """(N,) which of `places` are nearest to (N, 3) points, of groups (N,) where there are some.
+
+        A group without a place takes those of the others.
+        """
+        if group is None or self.group is None:
+            found: Indices = np.asarray(KDTree(self.places).query(points)[1])
+            return found
+        found = np.empty(len(points), np.int64)
+        for number in np.unique(group):
+            own = np.flatnonzero(self.group == number)
+            own = own if len(own) else np.arange(len(self.places))
+            mine = group == number
+            found[mine] = own[KDTree(self.places[own]).query(points[mine])[1]]
         return found
 
-    def without(self, gauge: Gauge, group: Indices) -> "Motions":
-        """The same minus what motions of whole groups do, which do not change their shape.
-
-        Args:
-            gauge: these motions.
-            group: (P,) of the `places`.
-        """
+    def without(self, gauge: Gauge) -> "Motions":
+        """The same minus what motions of whole groups do, which do not change their shape."""
         whole = gauge.motion_in(self.stations)
         return replace(
             self,
             stations=self.stations - gauge.motions @ whole,
-            points=self.points - gauge.of_points(self.places, group) @ whole,
+            points=self.points - gauge.of_points(self.places, self.group) @ whole,
         )
 
 
@@ -363,11 +371,11 @@ def shape_of_block(
     of_stations = blocks[equations.own]
     moving = None
     if calibration is not None:
-        shape = calibration.without(
-            gauge, group_of_point[KDTree(points).query(calibration.places)[1]]
-        )
+        of_place = group_of_point[KDTree(points).query(calibration.places)[1]]
+        calibration = replace(calibration, group=of_place)
+        shape = calibration.without(gauge)
         of_stations = of_stations + shape.of_stations()
-        of_points += shape.of_points(points)
+        of_points += shape.of_points(points, group_of_point)
         moving = None if held else calibration
     return BlockShape(
         stations=of_stations,
@@ -426,7 +434,7 @@ def soft_modes(
     kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
     shape, rigs, rigid = [], [], gauge.of_points(points, group)
     places = np.empty((*points.shape, len(kept)), np.float32)
-    nearest = None if calibration is None else calibration.nearest(points)
+    nearest = None if calibration is None else calibration.nearest(points, group)
     for n, k in enumerate(kept.tolist()):
         own, step, rig = moved(vectors[:, k].reshape(stations, width))
         place = equations.follow(own, np.zeros(1))

@@ -280,9 +280,27 @@ def test_a_motion_of_the_whole_block_is_no_change_of_shape() -> None:
         places=points,
         points=gauge.of_points(points) @ motion,
         covariance=np.eye(2),
-    ).without(gauge, np.zeros(len(points), np.int64))
+    ).without(gauge)
     assert np.abs(part.of_stations()).max() < 1e-20
     assert np.abs(part.of_points(points)).max() < 1e-20
+
+
+def test_points_move_like_those_of_their_own_group() -> None:
+    """Where groups lie over each other, the nearest place may be of the other one."""
+    rng = np.random.default_rng(7)
+    places, of_place = rng.uniform(0, 1, (40, 3)), rng.integers(0, 2, 40)
+    part = Motions(
+        stations=np.zeros((2, 6, 1)),
+        places=places,
+        points=np.where(of_place, 3.0, 1.0)[:, None, None] * np.ones((40, 3, 1)),
+        covariance=np.eye(1),
+        group=of_place,
+    )
+    points, group = rng.uniform(0, 1, (200, 3)), rng.integers(0, 3, 200)
+    variances = part.of_points(points, group)[:, 0, 0]
+    np.testing.assert_allclose(variances[group == 0], 1.0)
+    np.testing.assert_allclose(variances[group == 1], 9.0)
+    assert set(np.unique(variances[group == 2])) == {1.0, 9.0}
 
 
 def test_a_rig_without_covariance_adds_nothing(tmp_path: Path) -> None:
