@@ -18,7 +18,7 @@ import importlib
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -118,31 +118,40 @@ def main() -> None:
     print(_HEADER)
     figures: list[Figure] = []
     failed: list[str] = []
-    for log in options.log:
-        for case in options.cases:
-            began = time.process_time()
-            scores, refused = _scores(case, flights, rig, LOGS[log], options.adjust, options.seeds)
-            seconds = (time.process_time() - began) / options.seeds
-            name = f"{case.name}, log {log}"
-            failed += [f"{name}: {why}" for why in refused]
-            if scores:
-                row = over_seeds(scores)
-                print(_line(name, row, len(refused), seconds), flush=True)
-                figures += _figures(name, row)
+    rows = {(log, case): Outcome() for log in options.log for case in options.cases}
+    for seed in range(options.seeds):  # all cases of a flight in turn: they share its sea floor
+        for (log, case), outcome in rows.items():
+            outcome.add(seed, case, flights, rig, LOGS[log], options.adjust)
+    for (log, case), outcome in rows.items():
+        name = f"{case.name}, log {log}"
+        failed += [f"{name}: {why}" for why in outcome.refused]
+        if outcome.scores:
+            row = over_seeds(outcome.scores)
+            seconds = outcome.seconds / options.seeds
+            print(_line(name, row, len(outcome.refused), seconds), flush=True)
+            figures += _figures(name, row)
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures), failed=tuple(failed))))
 
 
-def _scores(
-    case: Case,
-    flights: Sequence[FlownTrack],
-    rig: Rig,
-    log: Logbook,
-    adjust: Adjust,
-    seeds: int,
-) -> tuple[list[Score], list[str]]:
+@dataclass
+class Outcome:
     """Scores of the seeds of a case, and why some of them gave no model."""
-    scores, refused = [], []
-    for seed in range(seeds):
+
+    scores: list[Score] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def add(
+        self,
+        seed: int,
+        case: Case,
+        flights: Sequence[FlownTrack],
+        rig: Rig,
+        log: Logbook,
+        adjust: Adjust,
+    ) -> None:
+        """Survey with one more seed."""
+        began = time.process_time()
         track = flights[seed % len(flights)]
         read = log(track, case.fault, seed).with_fault(case.fault)
         begun = start(track, rig, wrong_rig(rig, case.worse, seed), read, seed)
@@ -152,12 +161,12 @@ def _scores(
                     begun.mapped, begun.seen, rig, begun.distances, begun.datum, Path(folder)
                 )
             except AliceError as error:
-                refused.append(f"seed {seed}: {error}")
-                continue
+                self.refused.append(f"seed {seed}: {error}")
+                return
         pairs = zip(begun.scene.ned_from_cam, begun.scene.records, strict=True)
         true = [pose for pose, record in pairs if record.camera == rig.reference]
-        scores.append(score(found, RigidTransform.concatenate(true)))
-    return scores, refused
+        self.scores.append(score(found, RigidTransform.concatenate(true)))
+        self.seconds += time.process_time() - began
 
 
 def score(found: Adjusted, true: RigidTransform) -> Score:
