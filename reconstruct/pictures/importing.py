@@ -68,6 +68,8 @@ class ImportedPictures:
     """Pictures by kind of file."""
     positions: int
     """Number of pictures with a known position."""
+    readings: Mapping[str, int]
+    """Pictures by what navigation measured of them."""
     left_out: Mapping[str, int]
     """Files that were not imported, by reason."""
 
@@ -78,6 +80,8 @@ class ImportedPictures:
         of = f" of {', '.join(others)} and {last}" if others else ""
         text = f"{total} pictures ({_counted(self.kinds)}){of}"
         text += f", {self.positions} with a position"
+        for name, count in self.readings.items():
+            text += f", {count} with {name}" if count > self.positions else ""
         return text + (f"; left out: {_counted(self.left_out)}" if self.left_out else "")
 
 
@@ -246,8 +250,14 @@ def _imported(
         cameras={name: counts[name] for name in (*sides, *counts) if counts[name]},
         kinds=dict(kinds),
         positions=sum(record.has_position for record in records),
+        readings=_readings_of(records),
         left_out=dict(left_out),
     )
+
+
+def _readings_of(records: Sequence[ImageRecord]) -> Counter[str]:
+    """How many pictures navigation measured what of."""
+    return Counter(name for r in records for name, known in r.readings.items() if known)
 
 
 def _counted(counts: Mapping[str, int]) -> str:
@@ -486,7 +496,7 @@ def _place(
     else:
         records = _with_gps(records, entries)
         level = "EXIF GPS altitude"
-    counted = Counter(name for r in records for name, known in r.readings.items() if known)
+    counted = _readings_of(records)
     if not counted:
         if log is not None:
             raise ImageError(
