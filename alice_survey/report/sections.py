@@ -290,12 +290,15 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         rows += [
             (f"navigation's residual {axis}", f"{length(value)} rms")
             for axis, value in zip(axes, residuals, strict=True)
+            if value is not None
         ]
         rows += [
             (f"sigma of the whole survey, {axis}", length(value))
             for axis, value in zip(axes, sigmas, strict=True)
+            if value is not None
         ]
-        rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
+        if place.sigma_heading_deg is not None:
+            rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
         rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
     notes = figures.held.frame.notes
     drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]

@@ -264,7 +264,8 @@ def navigation_table(
             return np.full((len(logged_s), count), np.nan)
         return signal.at(logged_s, turning=turning)
 
-    angles = at_rows(dive.attitude, 3, turning=True) + [0.0, 0.0, options.declination_deg]
+    angles = at_rows(dive.attitude, 3, turning=True)
+    angles[:, 2] += options.declination_deg
     altitude = at_rows(dive.altitude, 1)
     if dive.altitude_slant:
         # The range along the body's down axis, seen upright: cos(roll) cos(pitch) is the axis' down

@@ -54,6 +54,8 @@ _UNDECODABLE = "cannot be decoded"
 _EXIF_SIGMA_M = (3.0, 6.0)
 """Horizontal and vertical sigma of the GPS in a picture's EXIF, which states none."""
 _LOGGED_LEVEL = "sea surface, as in the navigation log"
+_ABOVE_M = 0.5
+"""Depths are on the wrong side of the surface beyond waves and the zero of a sensor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -493,6 +495,8 @@ def _place(
             notes.append("picture times count from the first picture, plus the clock offset")
         records = _with_navigation(records, times, log)
         level = logged_level
+        if level == _LOGGED_LEVEL:
+            _warn_of_heights(records)
     else:
         records = _with_gps(records, entries)
         level = "EXIF GPS altitude"
@@ -517,6 +521,16 @@ def _place(
         return list(records), None, level
     datum = {"latitude_deg": first.latitude_deg, "longitude_deg": first.longitude_deg}
     return list(records), datum, level
+
+
+def _warn_of_heights(records: Sequence[ImageRecord]) -> None:
+    """Say when depths look like heights."""
+    depths = np.array([r.depth_m for r in records if r.readings["depth"]])
+    if len(depths) and np.median(depths) < -_ABOVE_M:
+        warn(
+            f"most pictures are above the sea surface, by {-np.median(depths):.1f} m: depth_m is "
+            "positive down; --vertical-datum names another level that depths count from"
+        )
 
 
 def _times(

@@ -368,7 +368,9 @@ def _fit(
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
+    if task.rig is None and any(
+        r.readings["roll and pitch"] or r.readings["heading"] for r in task.records
+    ):
         warn(
             "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
             "import the pictures with --rig, whose body_from_rig says so"

@@ -61,6 +61,9 @@ def test_exact_depths_alone_level_a_rigs_model_and_give_its_depth() -> None:
     np.testing.assert_array_equal(found.sigma_position_m[:2], 0.0)
     assert found.sigma_heading_deg == 0.0
     assert 0.0 < found.sigma_position_m[2] < 1.0
+    said = found.to_json()
+    assert [said[f"sigma_{name}"] for name in ("north_m", "east_m", "heading_deg")] == [None] * 3
+    assert said["sigma_depth_m"] == found.sigma_position_m[2]
 
 
 @pytest.mark.parametrize("sigma_m", [0.001])
@@ -95,7 +98,7 @@ def test_depths_of_a_track_without_relief_give_no_scale(
 
 
 @pytest.mark.parametrize("reading", ["depths", "positions"])
-def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
+def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> None:
     """Of a track whose depth varies by 0.4 m, over 24 seeds of white errors."""
     scene, sigma_m = make_scene(points=400), 0.01
     rng = np.random.default_rng(11)
@@ -108,7 +111,7 @@ def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
             for r, p in zip(scene.records, scene.ned_from_cam, strict=True)
         ],
     )
-    errors = []
+    errors, leans = [], []
     for seed in range(24):
         rng, truth = np.random.default_rng(seed), gauge(seed, 0.3)
         off = {s: sigma_m * rng.standard_normal(3) for s in stations}
@@ -134,4 +137,7 @@ def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
         )  # fmt: skip
         assert found is not None
         errors.append(np.log(found.ned_from_model.scale / truth.scale) / found.sigma_scale)
+        lean = (found.ned_from_model.rotation * truth.rotation.inv()).as_rotvec(degrees=True)[:2]
+        leans.append(lean / found.sigma_tilt_deg)
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
+    assert 0.6 < np.sqrt(np.mean(np.square(leans))) < 1.4
