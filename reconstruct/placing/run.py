@@ -36,6 +36,7 @@ from alice_survey.base.records import (
 from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
@@ -127,9 +128,21 @@ class _KnownScale:
 
 
 def run_sparse(
-    workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig
+    workspace: Path,
+    folder: Path,
+    executor: Executor,
+    *,
+    reconstruct: ReconstructConfig,
+    index_sigma: float,
 ) -> None:
     """Adjust the model of `mapping/` a last time, and place it in the world.
+
+    Args:
+        workspace: folder of the survey.
+        folder: to write into.
+        executor: where tasks run.
+        reconstruct: settings.
+        index_sigma: of the water's index, where the calibration did not find it in the same water.
 
     Raises:
         WorkspaceError: a file of the mapping is missing or damaged.
@@ -138,7 +151,10 @@ def run_sparse(
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
     known = _mapped(workspace, mapping)
-    adjusted = adjust_survey(known, inputs.records, inputs.rig, mapping.distances, reconstruct)
+    rig = inputs.rig
+    if rig is not None and not reconstruct.refine_port:  # that finds the index from far off
+        rig = knowing_water(rig, index_sigma)
+    adjusted = adjust_survey(known, inputs.records, rig, mapping.distances, reconstruct)
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()
         for image in adjusted.mapped.model.images.values()
