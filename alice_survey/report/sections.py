@@ -299,7 +299,8 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         ]
         if place.sigma_heading_deg is not None:
             rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
-        rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+        if place.sigma_tilt_deg is not None:
+            rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
     notes = figures.held.frame.notes
     drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
     return Section(

@@ -101,7 +101,7 @@ class PlacementFit:
             "sigma_east_m": east,
             "sigma_depth_m": down,
             "sigma_heading_deg": self.sigma_heading_deg or None,
-            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))),
+            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
             "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
             "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
             "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),

@@ -335,7 +335,12 @@ def find_place(task: Placing) -> Placed:
             factor, source = found[0], _scale_source(known, ties)
         place = replace(levelled, scale=factor, translation=factor * levelled.translation)
         scaled, vertical = known is not None or found is not None, _VERTICAL_OF_LEVEL
-        notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
+        turned = None if scaled else _turned(task, levelled)
+        if turned is not None:
+            place, note = turned
+            notes.append(f"unscaled; {note}")
+        else:
+            notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
         datum = None
     frame = WorldFrame(
         name="model" if datum is None else "ned",
@@ -384,9 +389,7 @@ def _fit(
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    if task.rig is None and any(
-        r.readings["roll and pitch"] or r.readings["heading"] for r in task.records
-    ):
+    if task.rig is None and any(_is_turned(record) for record in task.records):
         warn(
             "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
             "import the pictures with --rig, whose body_from_rig says so"
@@ -427,16 +430,35 @@ def _fit(
     return fit, None
 
 
+def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | None:
+    """Where attitudes turn a model that has no scale, and a note; None where none is of use."""
+    nan = math.nan
+    records = [
+        replace(record, latitude_deg=nan, longitude_deg=nan, depth_m=nan) for record in task.records
+    ]
+    if task.rig is None or not any(_is_turned(record) for record in records):
+        return None
+    fit = fit_navigation(
+        records, task.pinholes, body_from_pinhole(task.rig, task.warps), None, levelled=levelled,
+        known_scale=1.0, mount_sigma_deg=task.settings.mount_sigma_deg,
+    )  # fmt: skip
+    return None if fit is None else (fit.ned_from_model, _local_note(records, headed=True))
+
+
+def _is_turned(record: ImageRecord) -> bool:
+    return record.readings["roll and pitch"] or record.readings["heading"]
+
+
 def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
     """What of a place without positions is measured, and what is the model's own."""
     known = {name for record in records for name, known in record.readings.items() if known}
     axes = {
-        "levelled": bool(known & {"depth", "roll and pitch"}),
+        "level": bool(known & {"depth", "roll and pitch"}),
         "depth": "depth" in known,
         "heading": headed and "heading" in known,
     }
     measured = " and ".join(name for name, has in axes.items() if has)
-    own = " and ".join(["origin", *(name for name in ("depth", "heading") if not axes[name])])
+    own = " and ".join(["origin", *(name for name, has in axes.items() if not has)])
     return f"no latitude and longitude: {measured} by navigation, {own} the model's own; no CRS"
 
 

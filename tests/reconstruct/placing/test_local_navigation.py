@@ -1,15 +1,22 @@
 """Navigation without positions: what depths, headings and attitudes give on their own."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.records import MappingRecord, PicturesRecord
+from camera_calib.freedom import part_of_rig
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
+from reconstruct.placing.run import Placing, find_place
+from reconstruct.views.model_files import as_transform
 from tests.reconstruct.placing.test_georeference import (
     exact,
     gauge,
@@ -17,6 +24,7 @@ from tests.reconstruct.placing.test_georeference import (
     points_in_model,
 )
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.true_models import near_truth, warped_scene
 
 NAN = float("nan")
 DOWN = np.array([0.0, 0.0, 1.0])
@@ -79,6 +87,23 @@ def test_headings_and_depths_turn_a_model_to_north(sigma_m: float) -> None:
     assert found.sigma_heading_deg > 0
 
 
+def test_headings_alone_leave_the_level_of_the_sea_floor() -> None:
+    scene, truth = make_scene(points=400), gauge(8, 1.0)
+    start = level(
+        points_in_model(scene.points_ned, truth),
+        np.stack([in_model(pose, truth).translation for pose in scene.ned_from_cam]),
+    )
+    found = local_fit(scene, with_only(scene.records, "heading_deg"), truth, known=True)
+    assert found is not None
+    lean = (found.ned_from_model.rotation * start.rotation.inv()).apply(DOWN)
+    assert lean[2] == pytest.approx(1.0, abs=1e-9)
+    turn = (found.ned_from_model.rotation * truth.rotation.inv()).as_euler("ZYX", degrees=True)[0]
+    assert 1e-6 < abs(turn) < 0.3
+    said = found.to_json()
+    assert said["sigma_tilt_deg"] is None
+    assert 0.1 < said["sigma_heading_deg"] < 1.1
+
+
 def test_roll_and_pitch_alone_level_a_model() -> None:
     scene, truth = make_scene(points=400), gauge(6, 1.0)
     found = local_fit(
@@ -86,6 +111,47 @@ def test_roll_and_pitch_alone_level_a_model() -> None:
     )
     assert found is not None
     assert tilt_deg(found.ned_from_model, truth) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("readings", "lean_deg", "turn_deg"),
+    [(("heading_deg",), 5.0, 0.5), (("roll_deg", "pitch_deg", "heading_deg"), 0.2, 0.2)],
+)
+def test_attitudes_turn_a_model_of_one_camera_without_a_scale(
+    tmp_path: Path, readings: tuple[str, ...], lean_deg: float, turn_deg: float
+) -> None:
+    whole, truth = make_scene(points=400), gauge(8, 0.3)
+    mono = [i for i, r in enumerate(whole.records) if r.camera == "left"]
+    scene = replace(
+        whole,
+        rig=part_of_rig(whole.rig, ["left"]),
+        **{name: [getattr(whole, name)[i] for i in mono]
+           for name in ("records", "ned_from_cam", "pixels", "ids")},
+    )  # fmt: skip
+    seen, warps = warped_scene(scene)
+    model = near_truth(scene, seen, warps, np.random.default_rng(1), (0.0, 0.0)).model
+    back = truth.rotation.inv()
+    model.transform(pycolmap.Sim3d(
+        1 / truth.scale, pycolmap.Rotation3d(back.as_quat()),
+        -back.apply(truth.translation) / truth.scale,
+    ))  # fmt: skip
+    pinholes = [as_transform(image.cam_from_world()).inv()
+                for _, image in sorted(model.images.items())]  # fmt: skip
+    placed = find_place(
+        Placing(
+            workspace=tmp_path, model=model, records=with_only(scene.records, *readings),
+            pinholes=pinholes, warps=warps, rig=scene.rig, datum=None, mapping=MappingRecord(),
+            survey=PicturesRecord(source="imported"), settings=ReconstructConfig(), shape=None,
+        )
+    )  # fmt: skip
+    assert not placed.frame.scaled and placed.frame.datum is None and placed.fit is None
+    assert placed.world_from_model.scale == 1.0
+    off = placed.world_from_model.rotation * truth.rotation.inv()
+    down = off.apply(DOWN)
+    assert np.rad2deg(np.arccos(down[2])) < lean_deg
+    assert abs(off.as_euler("ZYX", degrees=True)[0]) < turn_deg
+    assert placed.frame.notes[-1].startswith("unscaled; no latitude and longitude: ")
+    assert "heading by navigation" in placed.frame.notes[-1]
 
 
 def test_depths_of_a_track_without_relief_give_no_scale(
