@@ -322,10 +322,11 @@ def find_place(task: Placing) -> Placed:
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
             datum = None
-            has_depth = any(math.isfinite(r.depth_m) for r in task.records)
-            vertical = str(task.survey.vertical_datum) if has_depth else _VERTICAL_OF_LEVEL
-        elif task.datum is not None:
-            vertical = str(task.survey.vertical_datum)
+        if local is not None or task.datum is not None:
+            if any(record.readings["depth"] for record in task.records):
+                vertical = str(task.survey.vertical_datum)
+            elif local is not None or not ties.used_points:
+                vertical = _VERTICAL_OF_LEVEL
         notes += [source] if datum is not None else [source, local or _LOCAL]
     else:
         found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)

@@ -10,12 +10,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import MappingRecord, PicturesRecord
 from camera_calib.freedom import part_of_rig
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
-from reconstruct.placing.run import Placing, find_place
+from reconstruct.placing.run import Placed, Placing, find_place
 from reconstruct.views.model_files import as_transform
 from tests.reconstruct.placing.test_georeference import (
     exact,
@@ -113,14 +114,11 @@ def test_roll_and_pitch_alone_level_a_model() -> None:
     assert tilt_deg(found.ned_from_model, truth) < 0.01
 
 
-@pytest.mark.parametrize(
-    ("readings", "lean_deg", "turn_deg"),
-    [(("heading_deg",), 5.0, 0.5), (("roll_deg", "pitch_deg", "heading_deg"), 0.2, 0.2)],
-)
-def test_attitudes_turn_a_model_of_one_camera_without_a_scale(
-    tmp_path: Path, readings: tuple[str, ...], lean_deg: float, turn_deg: float
-) -> None:
-    whole, truth = make_scene(points=400), gauge(8, 0.3)
+def placed_by_one_camera(
+    workspace: Path, truth: Similarity, readings: tuple[str, ...], datum: Datum | None
+) -> Placed:
+    """A model of the left camera's pictures, in a gauge, with some of the readings."""
+    whole = make_scene(points=400)
     mono = [i for i, r in enumerate(whole.records) if r.camera == "left"]
     scene = replace(
         whole,
@@ -137,13 +135,38 @@ def test_attitudes_turn_a_model_of_one_camera_without_a_scale(
     ))  # fmt: skip
     pinholes = [as_transform(image.cam_from_world()).inv()
                 for _, image in sorted(model.images.items())]  # fmt: skip
-    placed = find_place(
+    return find_place(
         Placing(
-            workspace=tmp_path, model=model, records=with_only(scene.records, *readings),
-            pinholes=pinholes, warps=warps, rig=scene.rig, datum=None, mapping=MappingRecord(),
-            survey=PicturesRecord(source="imported"), settings=ReconstructConfig(), shape=None,
+            workspace=workspace, model=model, records=with_only(scene.records, *readings),
+            pinholes=pinholes, warps=warps, rig=scene.rig, datum=datum, mapping=MappingRecord(),
+            survey=PicturesRecord(source="imported", vertical_datum="the sea"),
+            settings=ReconstructConfig(), shape=None,
         )
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("readings", "level"),
+    [(("latitude_deg", "longitude_deg"), "mean plane of the sea floor in the pictures"),
+     (("latitude_deg", "longitude_deg", "depth_m"), "the sea")],
+)  # fmt: skip
+def test_heights_count_from_depths_only_where_there_are_depths(
+    tmp_path: Path, readings: tuple[str, ...], level: str
+) -> None:
+    placed = placed_by_one_camera(tmp_path, gauge(9, 0.3), readings, DATUM)
+    assert (placed.frame.name, placed.frame.datum) == ("ned", DATUM)
+    assert placed.frame.vertical_datum == level
+
+
+@pytest.mark.parametrize(
+    ("readings", "lean_deg", "turn_deg"),
+    [(("heading_deg",), 5.0, 0.5), (("roll_deg", "pitch_deg", "heading_deg"), 0.2, 0.2)],
+)
+def test_attitudes_turn_a_model_of_one_camera_without_a_scale(
+    tmp_path: Path, readings: tuple[str, ...], lean_deg: float, turn_deg: float
+) -> None:
+    truth = gauge(8, 0.3)
+    placed = placed_by_one_camera(tmp_path, truth, readings, None)
     assert not placed.frame.scaled and placed.frame.datum is None and placed.fit is None
     assert placed.world_from_model.scale == 1.0
     off = placed.world_from_model.rotation * truth.rotation.inv()
