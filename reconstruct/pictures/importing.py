@@ -180,7 +180,7 @@ def import_images(
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
         name="images",
-        version=1,
+        version=2,
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),

@@ -68,7 +68,7 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
     ]
     stage = Stage(
         name="images",
-        version=1,
+        version=2,
         settings={"joined": len(dives)},
         inputs=[*inputs, *([rig] if rig else [])],
     )
@@ -147,7 +147,7 @@ def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
         whole = _with_lines(whole, plan)
     stage = Stage(
         name="plan",
-        version=1,
+        version=2,
         settings={"refly_of": whole.name},
         inputs=[folder / "plan.json" for folder in folders],
     )
