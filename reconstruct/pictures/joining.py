@@ -147,7 +147,7 @@ def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
         whole = _with_lines(whole, plan)
     stage = Stage(
         name="plan",
-        version=2,
+        version=1,
         settings={"refly_of": whole.name},
         inputs=[folder / "plan.json" for folder in folders],
     )
