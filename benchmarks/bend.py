@@ -68,6 +68,9 @@ CASES = (
     Case(name="heading off by 3 deg", fault=Fault(heading_deg=3.0)),
     Case(name="depth drifts by 0.2 m", fault=Fault(depth_m=0.2)),
     Case(name="positions stretched by 0.5 %", fault=Fault(stretch=0.005)),
+    Case(name="two dives, 1 m apart by their fixes", fault=Fault(jump_m=1.0)),
+    Case(name="white noise 3 times larger", fault=Fault(white=3.0)),
+    Case(name="correlation 3 times longer", fault=Fault(tau=3.0)),
     Case(name="sigmas stated 3 times too large", fault=Fault(sigmas=3.0)),
     Case(name="sigmas stated 3 times too small", fault=Fault(sigmas=1.0 / 3.0)),
 )
@@ -141,7 +144,7 @@ def _scores(
     scores, refused = [], []
     for seed in range(seeds):
         track = flights[seed % len(flights)]
-        read = log(track, case.fault.clock_s, seed).with_fault(case.fault)
+        read = log(track, case.fault, seed).with_fault(case.fault)
         begun = start(track, rig, wrong_rig(rig, case.worse, seed), read, seed)
         with TemporaryDirectory() as folder:
             try:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.kit.figure import figure_style, new_figure, save_figure
-from benchmarks.bend_survey import FlownTrack, fly, logged, records_of
+from benchmarks.bend_survey import Fault, FlownTrack, fly, logged, records_of
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import design_rig
@@ -49,7 +49,7 @@ def shown_bend(track: FlownTrack, sag_m: float) -> Bend:
     depth_m = np.full(len(places), track.config.area.seafloor_depth_m)
     floor = np.column_stack([places[:, :2], depth_m])
     fit = fit_navigation(
-        records_of(track, [rig.reference], logged(track, 0.0, 0)),
+        records_of(track, [rig.reference], logged(track, Fault(), 0)),
         list(bent),
         {rig.reference: mount},
         track.datum,

@@ -51,6 +51,7 @@ port_tilt_deg = [2, 0]
 MATCHED = 0.5
 """Share of the pictures that show a point in which it is matched: the demo's tracks have 4.9 views
 where 8.2 pictures show a point."""
+_BETWEEN_DIVES_S = 1800.0
 _MARGIN_M = 1.5
 """Around the track, where points lie."""
 _FAR = 1.6
@@ -198,12 +199,20 @@ class Fault:
     """Of horizontal positions about the first one."""
     sigmas: float = 1.0
     """Factor on what the log states."""
+    jump_m: float = 0.0
+    """By which positions jump between two dives that the survey is flown in, if not zero."""
+    white: float = 1.0
+    """Factor on the white errors of a drawn log."""
+    tau: float = 1.0
+    """Factor on the correlation time of a drawn log's depths."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Readings:
     """What a log has at the stations."""
 
+    time_s: Array
+    """(S,) times that the pictures state."""
     ned: Array
     """(S, 3) positions of the body, metres."""
     angles_deg: Array
@@ -212,24 +221,30 @@ class Readings:
     """(S, 4) of horizontal position and depth, metres, and of tilt and heading, degrees."""
 
     def with_fault(self, fault: Fault) -> "Readings":
-        """The same with all of a fault but the clock's."""
+        """The same with all of a fault but the clock's and the statistics'."""
         share = np.linspace(0.0, 1.0, len(self.ned))
         ned, angles = self.ned.copy(), self.angles_deg.copy()
         ned[:, :2] += fault.stretch * (ned[:, :2] - ned[0, :2])
         ned[:, 2] += fault.depth_m * share
         angles[:, 2] += fault.heading_deg
-        return Readings(ned=ned, angles_deg=angles, sigmas=fault.sigmas * self.sigmas)
+        second = (share > 0.5) & (fault.jump_m != 0.0)
+        ned[second, 0] += fault.jump_m
+        time_s = self.time_s + _BETWEEN_DIVES_S * second
+        return Readings(
+            time_s=time_s, ned=ned, angles_deg=angles, sigmas=fault.sigmas * self.sigmas
+        )
 
 
-def logged(track: FlownTrack, clock_s: float, _: int) -> Readings:
+def logged(track: FlownTrack, fault: Fault, _: int) -> Readings:
     """The log of the simulated flight."""
     assert track.log is not None
-    columns = track.log.at(track.taken_s + clock_s)
+    columns = track.log.at(track.taken_s + fault.clock_s)
 
     def rows(*names: str) -> Array:
         return np.column_stack([columns[name] for name in names])
 
     return Readings(
+        time_s=track.taken_s,
         ned=track.datum.ned_from_geodetic(rows("latitude_deg", "longitude_deg", "depth_m")),
         angles_deg=rows("roll_deg", "pitch_deg", "heading_deg"),
         sigmas=rows("sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg",
@@ -237,7 +252,7 @@ def logged(track: FlownTrack, clock_s: float, _: int) -> Readings:
     )  # fmt: skip
 
 
-def drawn(track: FlownTrack, clock_s: float, seed: int) -> Readings:
+def drawn(track: FlownTrack, fault: Fault, seed: int) -> Readings:
     """A log with errors of the same instruments as the simulated one, drawn for each seed.
 
     Depth has a constant, a slow and a white error, as a pressure sensor's; north and east are
@@ -245,11 +260,11 @@ def drawn(track: FlownTrack, clock_s: float, seed: int) -> Readings:
     attitude has a constant and a white error.
     """
     rng = np.random.default_rng([seed, _LOG])
-    time_s = track.taken_s + clock_s
+    time_s = track.taken_s + fault.clock_s
     bodies, count = track.at(time_s), len(time_s)
     place = bodies.translation
-    depth_off = rng.normal(0, DEPTH_CONSTANT_M) + rng.normal(0, DEPTH_WHITE_M, count)
-    depth_off += DEPTH_SLOW_M * _gauss_markov(rng, time_s, DEPTH_SLOW_S)
+    depth_off = rng.normal(0, DEPTH_CONSTANT_M) + fault.white * rng.normal(0, DEPTH_WHITE_M, count)
+    depth_off += DEPTH_SLOW_M * _gauss_markov(rng, time_s, fault.tau * DEPTH_SLOW_S)
     away = place[:, :2] - place[0, :2]
     turn_rad = np.deg2rad(rng.normal(0, HEADING_DEG))
     walk = rng.normal(size=(count, 2)) * np.sqrt(np.diff(time_s, prepend=time_s[0]))[:, None]
@@ -258,14 +273,15 @@ def drawn(track: FlownTrack, clock_s: float, seed: int) -> Readings:
         + rng.normal(0, STRETCH) * away
         + turn_rad * np.column_stack([-away[:, 1], away[:, 0]])
         + WALK_M * np.cumsum(walk, axis=0)
-        + rng.normal(0, LEVEL_WHITE_M, (count, 2))
+        + fault.white * rng.normal(0, LEVEL_WHITE_M, (count, 2))
     )
     constant = np.array([*rng.normal(0, TILT_DEG, 2), np.rad2deg(turn_rad)])
     return Readings(
+        time_s=track.taken_s,
         ned=place + np.column_stack([level_off, depth_off]),
         angles_deg=np.rad2deg(attitude_from_rotation(bodies.rotation))
         + constant
-        + rng.normal(0, ATTITUDE_WHITE_DEG, (count, 3)),
+        + fault.white * rng.normal(0, ATTITUDE_WHITE_DEG, (count, 3)),
         sigmas=np.tile(
             [np.hypot(FIX_M, STRETCH * np.ptp(away)), DEPTH_CONSTANT_M,
              np.hypot(TILT_DEG, ATTITUDE_WHITE_DEG), HEADING_DEG],
@@ -274,8 +290,8 @@ def drawn(track: FlownTrack, clock_s: float, seed: int) -> Readings:
     )  # fmt: skip
 
 
-Logbook = Callable[[FlownTrack, float, int], Readings]
-"""From a flight, the clock's error in seconds and a seed."""
+Logbook = Callable[[FlownTrack, Fault, int], Readings]
+"""From a flight, what is wrong and a seed; of a fault the clock's and the statistics'."""
 LOGS: dict[str, Logbook] = {"flown": logged, "drawn": drawn}
 
 
@@ -379,7 +395,7 @@ def records_of(track: FlownTrack, cameras: Sequence[str], read: Readings) -> lis
             sigma_attitude_deg=float(sigma[2]), sigma_heading_deg=float(sigma[3]),
         )
         for station, (time_s, place, angles, sigma) in enumerate(
-            zip(track.taken_s, places, read.angles_deg, read.sigmas, strict=True)
+            zip(read.time_s, places, read.angles_deg, read.sigmas, strict=True)
         )
         for camera in cameras
     ]  # fmt: skip

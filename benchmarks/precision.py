@@ -29,7 +29,7 @@ from alice_survey.base.trajectory import Trajectory
 from benchmarks import bend_survey
 from benchmarks.bend import score
 from benchmarks.bend_pipeline import adjusted
-from benchmarks.bend_survey import FlownTrack, calibrated_rig, drawn, start, wrong_rig
+from benchmarks.bend_survey import Fault, FlownTrack, calibrated_rig, drawn, start, wrong_rig
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import Rig
@@ -149,7 +149,10 @@ def swayed(plan: Plan, rig: Rig, config: SurveyConfig, seed: int) -> FlownTrack:
 
 def errors(track: FlownTrack, rig: Rig, cell_m: float, seed: int) -> Array:
     """Sag along and across, scale, and rms of heights, of one reconstructed survey; metres."""
-    read, true_rig = drawn(track, 0.0, seed), wrong_rig(rig, 1.0, seed, bias_px=_KEYPOINT_BIAS_PX)
+    read, true_rig = (
+        drawn(track, Fault(), seed),
+        wrong_rig(rig, 1.0, seed, bias_px=_KEYPOINT_BIAS_PX),
+    )
     begun = start(track, rig, true_rig, read, seed)
     with TemporaryDirectory() as folder:
         found = adjusted(begun.mapped, begun.seen, rig, begun.distances, begun.datum, Path(folder))

@@ -323,6 +323,8 @@ class ReconstructConfig(Config):
     working_range_m: float | None = Field(None, gt=0, le=100)
     mapper: Literal["auto", "global", "incremental"] = "auto"
     mount_sigma_deg: float = Field(0.0, ge=0, le=20)
+    lever_sigma_m: float = Field(0.02, gt=0, le=10)
+    clock_sigma_s: float = Field(0.2, gt=0, le=3600)
     refine_port: bool = False
     refine_rig: Literal["auto", "on", "off"] = "auto"
     dense_scale: float | None = Field(None, gt=0.05, le=1)

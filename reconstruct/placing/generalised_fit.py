@@ -3,9 +3,10 @@
 Errors of navigation are correlated: weights that take readings as independent give sigmas that are
 far too small. Here every group of channels (horizontal position, depth, tilt, heading) has the
 marginal sigma that navigation states, and a correlation time and white and constant shares that the
-misfit between navigation and the model gives, the model being stiff. They are found by restricted
-maximum likelihood (Patterson & Thompson 1971), which counts what the placement itself has absorbed,
-and the covariance of the placement is averaged over all that are likely.
+misfit between navigation and the model gives, the model being stiff. Whether errors begin anew with
+a dive, and how far the constants of dives are apart, is found in the same way. They are found by
+restricted maximum likelihood (Patterson & Thompson 1971), which counts what the placement itself
+has absorbed, and the covariance of the placement is averaged over all that are likely.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,10 @@ from reconstruct.placing.navigation_equations import (
 _WHITE = (LEAST_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
 _CONSTANT = (0.0, 0.5, 0.75, 0.9)
 """The varying part's variance goes down by halves: what is not known of a variance is its size."""
+_JUMPS = (4.0, 16.0, 64.0, 256.0)
+"""Constant errors of dives over what stated sigmas allow, tried where dives contradict."""
+_SURFACED_S, _SURFACED_STEPS = 300.0, 20.0
+"""A gap between stations is one between dives from these times on, in seconds and usual steps."""
 _TAUS = 10
 _SHORTEST_STEPS, _LONGEST_SPANS = 0.2, 30.0
 """Correlation times tried: from this many median time steps to this many lengths of the survey."""
@@ -58,6 +63,8 @@ class Correlation:
     """Share of all variance that one constant error has."""
     factor: float = 1.0
     """Factor by which the stated sigmas are too small."""
+    restart: float = 0.0
+    """Constant error of each dive over what the constant share allows; 0: errors outlast gaps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,7 +124,7 @@ def estimate(
     """
     problem = _PlacementProblem(
         time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds,
-        widened=widened or {},
+        widened=widened or {}, dives=dives_of(time),
     )  # fmt: skip
     used = used & np.isfinite(found.misfit)
     if correlation is not None:
@@ -146,21 +153,30 @@ def frame_sigma(bound: float, time: Array, how: Correlation) -> float:
     return max(bound * how.factor * float(np.sqrt(share)), 1e-9)
 
 
-def without_gross_errors(misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Leave out readings far from the median misfit of their channel, all of a group together.
+def dives_of(time: Array) -> NDArray[np.int64]:
+    """(M,) number of the dive of each of the times (M,), from 0: long gaps lie between dives."""
+    steps = np.diff(time)
+    usual = np.median(steps[steps > 0]) if np.any(steps > 0) else 0.0
+    surfaced = steps > max(_SURFACED_S, _SURFACED_STEPS * float(usual))
+    return np.concatenate([[0], np.cumsum(surfaced)]).astype(np.int64)
 
-    A frame that is off as a whole (a constant error) leaves nothing out.
+
+def without_gross_errors(time: Array, misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Leave out readings far from their channel's median misfit in a dive, all of a group together.
+
+    A frame that is off as a whole in a dive (a constant error) leaves nothing out.
     """
-    used = known.copy()
+    used, dives = known.copy(), dives_of(time)
     for group in GROUPS:
         channels = _channels(group)
         for channel in channels:
-            rows = known[:, channel]
-            if rows.sum() < 3:
-                continue
-            off = np.abs(misfit[:, channel] - np.median(misfit[rows, channel]))
-            spread = max(1.0, MAD_TO_SIGMA * float(np.median(off[rows])))
-            used[rows & (off > _GROSS_SIGMAS * spread), min(channels)] = False
+            for dive in range(dives[-1] + 1):
+                rows = known[:, channel] & (dives == dive)
+                if rows.sum() < 3:
+                    continue
+                off = np.abs(misfit[:, channel] - np.median(misfit[rows, channel]))
+                spread = max(1.0, MAD_TO_SIGMA * float(np.median(off[rows])))
+                used[rows & (off > _GROSS_SIGMAS * spread), min(channels)] = False
         used[:, channels] &= used[:, [min(channels)]]
     return used
 
@@ -200,15 +216,16 @@ class _PlacementProblem:
     extra: Extra
     frame_bounds: Mapping[int, float]
     widened: Mapping[str, float]
+    dives: NDArray[np.int64]
     cache: dict[Any, _Normal] = field(default_factory=dict)
 
     def group(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
         """Normal equations of one group.
 
-        A constant error of variance c adds `c 1 1'` to the covariance matrix: its inverse is that
-        of the varying part minus a product (Sherman & Morrison 1950).
+        Constant errors of variance 1 with columns C add `C C'` to the covariance matrix: its
+        inverse is that of the varying part minus a product (Woodbury 1950).
         """
-        key = (group, used.tobytes(), correlation.tau, correlation.white, correlation.constant)
+        key = group, used.tobytes(), replace(correlation, factor=1.0)
         if key not in self.cache:
             self.cache[key] = self._unscaled(group, used, correlation)
         found, square = self.cache[key], correlation.factor**2
@@ -230,14 +247,15 @@ class _PlacementProblem:
             if not rows.any():
                 continue
             product, log_det, count = self._products(channel, rows, correlation)
-            ones = product[-1]
-            kept = product - np.outer(ones, ones) / (1.0 + ones[-1])
+            matrix, steady = product[: size + 1, : size + 1], product[: size + 1, size + 1 :]
+            inner = np.eye(steady.shape[1]) + product[size + 1 :, size + 1 :]
+            kept = matrix - steady @ np.linalg.solve(inner, steady.T)
             total = total.plus(
                 _Normal(
-                    matrix=kept[:-2, :-2],
-                    vector=kept[:-2, -2],
-                    square=float(kept[-2, -2]),
-                    log_det=log_det + float(np.log1p(ones[-1])),
+                    matrix=kept[:-1, :-1],
+                    vector=kept[:-1, -1],
+                    square=float(kept[-1, -1]),
+                    log_det=log_det + float(np.linalg.slogdet(inner)[1]),
                     rows=count,
                 )
             )
@@ -246,27 +264,49 @@ class _PlacementProblem:
     def _products(
         self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
     ) -> tuple[Array, float, int]:
-        """Products of all white columns, the last that of a constant error; log det; readings."""
-        varying, constant = self.shares(channel, rows, correlation)
-        columns = np.column_stack(
-            [self.found.jacobian[:, channel][:, self.free], self.found.misfit[:, channel], constant]
+        """Products of all white columns, the last those of constant errors; log det; readings."""
+        varying, constants = self.shares(channel, rows, correlation)
+        misfit = self.found.misfit[:, channel]
+        columns = np.column_stack([self.found.jacobian[:, channel][:, self.free], misfit])
+        even, log_det = self.whitened(
+            channel, rows, correlation, varying, np.column_stack([columns, constants])
         )
+        return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
+
+    def whitened(
+        self,
+        channel: int,
+        rows: NDArray[np.bool_],
+        how: Correlation,
+        varying: Array,
+        columns: Array,
+    ) -> tuple[Array, float]:
+        """Columns (M, C) over the stated sigma, made white; log det of what is used."""
         columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
         sigma = varying * self.found.sigma[:, channel]
-        even, log_det = whiten(self.time, sigma, rows, columns, correlation.tau, correlation.white)
-        return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
+        return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)
+
+    def times(self, how: Correlation) -> Array:
+        """(M,) times; dives after which errors begin anew lie too far apart for any correlation."""
+        if not how.restart:
+            return self.time
+        apart = 100.0 * how.tau + float(np.ptp(self.time))
+        return self.time + apart * self.dives
 
     def shares(
         self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
     ) -> tuple[Array, Array]:
-        """Sigmas of the varying and of the constant part over the stated one, (M,) each.
+        """Sigmas of the varying (M,) and the constant parts (M, D) over the stated one.
 
         The constant part is as large as the least of the stated sigmas allows.
         """
         sigma = self.found.sigma[:, channel]
         constant = np.sqrt(correlation.constant) * sigma[rows].min() / sigma
         constant = np.minimum(constant, np.sqrt(correlation.constant))
-        return np.sqrt(1.0 - constant**2), constant
+        own = np.ones((len(sigma), 1))
+        if correlation.restart:
+            own = correlation.restart * np.eye(self.dives[-1] + 1)[self.dives]
+        return np.sqrt(1.0 - constant**2), constant[:, None] * own
 
     def rest(self, correlation: Mapping[str, Correlation]) -> _Normal:
         """Normal equations of what is not navigation, and of the turn of navigation's frame."""
@@ -293,7 +333,8 @@ def _channels(group: str) -> list[int]:
     return [k for k, name in enumerate(GROUP_OF) if name == group]
 
 
-def _grid(time: Array) -> list[Correlation]:
+def _grid(problem: _PlacementProblem) -> list[Correlation]:
+    time = problem.time
     steps = np.diff(np.unique(time))
     if not len(steps):
         return [Correlation(tau=1.0, white=0.1)]
@@ -301,10 +342,22 @@ def _grid(time: Array) -> list[Correlation]:
         _SHORTEST_STEPS * float(np.median(steps)), _LONGEST_SPANS * float(np.ptp(time)), _TAUS
     )
     return [
-        Correlation(tau=float(tau), white=white, constant=constant)
+        Correlation(tau=float(tau), white=white, constant=constant, restart=restart)
         for tau in taus
         for white in _WHITE
         for constant in _CONSTANT
+        for restart in ((0.0, 1.0) if problem.dives[-1] else (0.0,))
+    ]
+
+
+def _choices(grid: Sequence[Correlation], now: Correlation) -> list[Correlation]:
+    """What is tried with the present factor, and with the present jumps where dives contradict."""
+    if now.restart <= 1.0:
+        return [replace(how, factor=now.factor) for how in grid]
+    return [
+        replace(how, factor=now.factor, restart=now.restart)
+        for how in grid
+        if how.restart and how.constant
     ]
 
 
@@ -313,17 +366,38 @@ def _likeliest(
 ) -> dict[str, Correlation]:
     """The likeliest correlation of every group, one after the other, in several rounds."""
     now = {group: how for group, how in correlation.items() if used[:, _channels(group)].any()}
-    grid = _grid(problem.time)
+    grid = _grid(problem)
     for _ in range(_SWEEPS):
         before = dict(now)
         for group in now:
-            choices = [replace(how, factor=now[group].factor) for how in grid]
+            choices = _choices(grid, now[group])
             scores = _scores(problem, used, now, group, choices)
             now[group] = choices[int(np.argmax(scores))]
+            if problem.dives[-1]:
+                now[group] = _with_jumps(problem, used, now, group)
             now[group] = replace(now[group], factor=_factor(problem, used, now, group))
         if now == before:
             break
     return now
+
+
+def _with_jumps(
+    problem: _PlacementProblem,
+    used: NDArray[np.bool_],
+    now: Mapping[str, Correlation],
+    group: str,
+) -> Correlation:
+    """A group's correlation with dives apart as far as they contradict each other, if they do."""
+    present = replace(now[group], restart=min(now[group].restart, 1.0))
+    jumps = [
+        replace(present, restart=jump, constant=constant)
+        for jump in _JUMPS
+        for constant in _CONSTANT[1:]
+    ]
+    scores = _scores(problem, used, now, group, [present, *jumps])
+    best = int(np.argmax(scores[1:]))
+    contradicted = scores[1 + best] > scores[0] + 0.5 * _CHI_SIGMAS**2
+    return jumps[best] if contradicted else present
 
 
 def _scores(
@@ -388,14 +462,15 @@ def _without_contradicted(
             rows = used[:, channel]
             jacobian = problem.found.jacobian[:, channel][:, problem.free]
             misfit = problem.found.misfit[:, channel] + jacobian @ change
-            varying, constant = problem.shares(channel, rows, how)
+            varying, constants = problem.shares(channel, rows, how)
             sigma = varying * problem.found.sigma[:, channel]
-            both = np.column_stack([misfit / how.factor, constant]) / varying[:, None]
-            both = np.where(rows[:, None], both, 0.0)
-            value, one = whiten(problem.time, sigma, rows, both, how.tau, how.white)[0].T
-            steady = float(one @ value) / (1.0 + float(one @ one))
-            off = both[:, 0] - steady * both[:, 1]
-            off = np.abs(standard_residuals(problem.time, sigma, rows, off, how.tau, how.white))
+            both = np.column_stack([misfit / how.factor, constants])
+            even = problem.whitened(channel, rows, how, varying, both)[0]
+            inner = np.eye(constants.shape[1]) + even[:, 1:].T @ even[:, 1:]
+            steady = np.linalg.solve(inner, even[:, 1:].T @ even[:, 0])
+            off = np.where(rows, (both[:, 0] - constants @ steady) / varying, 0.0)
+            off = standard_residuals(problem.times(how), sigma, rows, off, how.tau, how.white)
+            off = np.abs(off)
             worst = np.maximum(worst, np.where(rows, off, 0.0))
         if np.count_nonzero(worst) < 3:
             continue
@@ -415,10 +490,10 @@ def _averaged(
     The covariance is the mean of those of the single ways and the scatter of their solutions.
     """
     rng = np.random.default_rng(0)  # any draws will do; the same bytes each time
-    grid = _grid(problem.time)
+    grid = _grid(problem)
     draws: dict[str, list[Correlation]] = {}
     for group, how in correlation.items():
-        choices = [replace(g, factor=how.factor) for g in grid]
+        choices = _choices(grid, how)
         scores = _scores(problem, used, correlation, group, choices)
         weights = np.exp(scores - scores.max())
         picked = rng.choice(len(choices), size=_DRAWS, p=weights / weights.sum())

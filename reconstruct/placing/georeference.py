@@ -31,7 +31,9 @@ from reconstruct.placing.navigation_equations import (
     SCALE,
     STRETCH,
     TURN,
+    USUAL_INSTALLATION,
     Epochs,
+    Installation,
     equations,
     read_epochs,
     without_navigation,
@@ -50,10 +52,6 @@ _SETTLED_SIGMAS = 0.01
 _LEAST_BOUND = 1e-9
 _SHRUNK = 1e-6
 """Share of its first scale below which a model has shrunk to a point."""
-LEVER_SIGMA_M = 0.02
-"""Of the measured place of a camera on its vehicle, along each axis."""
-CLOCK_SIGMA_S = 0.2
-"""Of the clock of cameras against that of navigation."""
 _SIGNIFICANT = 3.0
 """Sigmas of its own by which a sum of squares must be too large to count as such."""
 _CONTRADICTION_SIGMAS = 3.0
@@ -65,18 +63,13 @@ _STRETCH = 0.005
 `vehicle.navigation.sensors`)."""
 
 
+_LEVERS = ("lever_forward_m", "lever_right_m", "lever_down_m")
 _NUISANCES = {
     "turn_deg": (TURN, float(np.rad2deg(1.0))),
     "stretch": (STRETCH, 1.0),
-    "lever_forward_m": (LEVER.start, 1.0),
-    "lever_right_m": (LEVER.start + 1, 1.0),
-    "lever_down_m": (LEVER.start + 2, 1.0),
+    **{name: (LEVER.start + k, 1.0) for k, name in enumerate(_LEVERS)},
     "clock_s": (CLOCK, 1.0),
 }
-_EXPECTED = {
-    "lever_forward_m": LEVER_SIGMA_M, "lever_right_m": LEVER_SIGMA_M,
-    "lever_down_m": LEVER_SIGMA_M, "clock_s": CLOCK_SIGMA_S,
-}  # fmt: skip
 
 
 def level(points: Array, centres: Array) -> Similarity:
@@ -124,7 +117,7 @@ def fit_navigation(
     levelled: Similarity,
     *,
     known_scale: float | None,
-    mount_sigma_deg: float = 0.0,
+    installed: Installation = USUAL_INSTALLATION,
     scale_sigma: float = 0.0,
     control: ExtraOf | None = None,
     modes: Array | None = None,
@@ -141,7 +134,7 @@ def fit_navigation(
         levelled: `level` of the model; where no attitude is known it keeps the model from turning
             about a straight track, with a sigma of 10 degrees.
         known_scale: metres in a unit of the model, or None: then the scale is fitted too.
-        mount_sigma_deg: of the rotation of the mount about each axis of the body.
+        installed: how well it is known where the cameras are on the vehicle, and their clock.
         scale_sigma: relative, of a known scale; above 0 the scale is fitted about it.
         control: equations of control points and bars.
         modes: (N, 6, K) of the pictures by the model's soft modes; None where it is stiff.
@@ -164,7 +157,7 @@ def fit_navigation(
         levelled=levelled,
         known_scale=known_scale,
         scale_sigma=scale_sigma,
-        mount_sigma_rad=np.deg2rad(mount_sigma_deg),
+        installed=installed,
         control=control,
     )
     near = task.robust(start, free)
@@ -206,7 +199,7 @@ def fit_control(
         levelled=None,
         known_scale=known_scale,
         scale_sigma=scale_sigma,
-        mount_sigma_rad=0.0,
+        installed=USUAL_INSTALLATION,
         control=control,
     )
     return task.fit(task.robust(start, free), free)
@@ -219,7 +212,7 @@ class _NavigationTask:
     """The levelled model; None where control holds the model level."""
     known_scale: float | None
     scale_sigma: float
-    mount_sigma_rad: float
+    installed: Installation
     control: ExtraOf | None
 
     def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
@@ -227,13 +220,13 @@ class _NavigationTask:
         epochs, sizes, factor = self.epochs, np.zeros(self.epochs.modes.shape[2]), 1.0
         nuisances = np.zeros(PARAMETERS)
         found = equations(epochs, place, self._middle(place))
-        used = without_gross_errors(found.misfit, epochs.known)
+        used = without_gross_errors(epochs.time, found.misfit, epochs.known)
         bounds = self._frame_bounds()
         modes = range(PARAMETERS, PARAMETERS + len(sizes))
         solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND), *modes]
         if epochs.has_attitude:
             solved_for += range(LEVER.start, LEVER.stop)
-            if self.mount_sigma_rad > 0:
+            if self.installed.mount_rad > 0:
                 solved_for += range(MOUNT.start, MOUNT.stop)
         if epochs.timed and len(epochs.time) > 1:
             solved_for.append(CLOCK)
@@ -309,11 +302,13 @@ class _NavigationTask:
             for name, (at, unit) in _NUISANCES.items()
             if at in free
         }
-        for name, expected in _EXPECTED.items():
-            if name in named and abs(named[name][0]) > _CONTRADICTION_SIGMAS * expected:
+        self._warn_of_installation(named)
+        for group, how in got.correlation.items():
+            if how.restart > 1.0:
+                off = how.restart * how.factor * np.sqrt(how.constant)
                 warn(
-                    f"navigation fits the pictures with {name} = {named[name][0]:+.3g}, where "
-                    f"{expected:g} is likely: correct it, for the place is as unsure as that"
+                    f"dives disagree on {group}, by {off:.0f} times the stated sigmas: the place "
+                    "is as unsure as that; correct the log of one, or add control points"
                 )
         return PlacementFit(
             ned_from_model=place,
@@ -325,13 +320,31 @@ class _NavigationTask:
             middle_ned=middle,
             correlation=got.correlation,
             time_unit="s" if epochs.timed else "stations",
-            mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
+            installed=self.installed,
             modes=sizes,
             mode_factor=mode_factor,
             joint=got.covariance[np.ix_(joint, joint)],
             bends=self._bends(place, middle, sizes, got, free, bounds),
             nuisances=named,
         )
+
+    def _warn_of_installation(self, found: Mapping[str, tuple[float, float]]) -> None:
+        """Name what is off by more than is likely, and what may be off in its place."""
+        settings = [
+            *((name, "lever_sigma_m", self.installed.lever_m) for name in _LEVERS),
+            ("clock_s", "clock_sigma_s", self.installed.clock_s),
+        ]
+        off = [
+            (abs(found[name][0]) / sigma, f"{name} = {found[name][0]:+.3g} ({setting} = {sigma:g})")
+            for name, setting, sigma in settings
+            if name in found
+        ]
+        if off and max(off)[0] > _CONTRADICTION_SIGMAS:
+            likely = ", ".join(text for sigmas, text in sorted(off, reverse=True) if sigmas > 1.0)
+            warn(
+                f"navigation fits the pictures with {likely}: correct the log or the rig's mount, "
+                "or state a larger sigma, for the place is as unsure as that"
+            )
 
     def _bends(
         self,
@@ -427,11 +440,8 @@ class _NavigationTask:
             scale[0, SCALE] = 1.0 / self.scale_sigma
             misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
             rows.append(scale)
-        known = np.zeros(columns)
+        known = self.installed.weights(columns)
         known[PARAMETERS:] = 1.0 / mode_factor
-        known[LEVER], known[CLOCK] = 1.0 / LEVER_SIGMA_M, 1.0 / CLOCK_SIGMA_S
-        if self.mount_sigma_rad > 0:
-            known[MOUNT] = 1.0 / self.mount_sigma_rad
         at = np.flatnonzero(known)
         misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[at])
         rows.append(np.diag(known)[at])

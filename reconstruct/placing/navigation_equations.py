@@ -9,6 +9,7 @@ that of the clock (seconds by which pictures are later than navigation has them)
 the sizes of the model's soft modes, in their sigmas.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.mapping.arrays import cross_matrices
@@ -36,6 +38,37 @@ _SIGMA_DEPTH_M = 3.0
 _SIGMA_ATTITUDE_DEG = 2.0
 _SIGMA_HEADING_DEG = 5.0
 """Used where navigation states no sigma."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Installation:
+    """Sigmas of where and when cameras are against navigation's sensors."""
+
+    mount_rad: float
+    """Of the mount's rotation about each axis of the body; 0: exact."""
+    lever_m: float
+    """Of the lever arm along each axis."""
+    clock_s: float
+
+    @classmethod
+    def of(cls, settings: ReconstructConfig) -> "Installation":
+        """As a survey states them."""
+        return cls(
+            mount_rad=math.radians(settings.mount_sigma_deg),
+            lever_m=settings.lever_sigma_m,
+            clock_s=settings.clock_sigma_s,
+        )
+
+    def weights(self, columns: int) -> Array:
+        """(columns,) one over the sigma of each parameter, 0 where it has none."""
+        found = np.zeros(columns)
+        found[LEVER], found[CLOCK] = 1.0 / self.lever_m, 1.0 / self.clock_s
+        if self.mount_rad > 0:
+            found[MOUNT] = 1.0 / self.mount_rad
+        return found
+
+
+USUAL_INSTALLATION = Installation.of(ReconstructConfig())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,5 +1,6 @@
 """A model placed by navigation or control, and how well: `georeference.json`."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from alice_survey.base.frames import Array
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import Bend
 from reconstruct.placing.generalised_fit import Correlation
-from reconstruct.placing.navigation_equations import PLACE, SCALE
+from reconstruct.placing.navigation_equations import PLACE, SCALE, Installation
 
 _METHOD = (
     "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
@@ -38,7 +39,7 @@ class PlacementFit:
     correlation: Mapping[str, Correlation]
     """For each group, how navigation's errors are correlated."""
     time_unit: str
-    mount_sigma_deg: float
+    installed: Installation
     modes: Array
     """(K,) sizes of the model's soft modes, in their sigmas."""
     mode_factor: float
@@ -109,7 +110,9 @@ class PlacementFit:
             "sigma_scale": self.sigma_scale,
             "scale_of_navigation": self.free_scale,
             "scale_of_navigation_sigma": self.free_scale_sigma,
-            "mount_sigma_deg": self.mount_sigma_deg,
+            "mount_sigma_deg": math.degrees(self.installed.mount_rad),
+            "lever_sigma_m": self.installed.lever_m,
+            "clock_sigma_s": self.installed.clock_s,
             "nuisances": {
                 name: {"value": found, "sigma": sigma}
                 for name, (found, sigma) in self.nuisances.items()
@@ -128,6 +131,7 @@ class PlacementFit:
                     "white_share": how.white,
                     "constant_share": how.constant,
                     "sigma_factor": how.factor,
+                    "dive_constants": how.restart,
                 }
                 for group, how in self.correlation.items()
             },

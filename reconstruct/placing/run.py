@@ -55,7 +55,7 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
-from reconstruct.placing.navigation_equations import PLACE
+from reconstruct.placing.navigation_equations import PLACE, Installation
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import (
@@ -402,7 +402,7 @@ def _fit(
         None if task.rig is None else body_from_pinhole(task.rig, task.warps),
         levelled=levelled,
         known_scale=scale,
-        mount_sigma_deg=task.settings.mount_sigma_deg,
+        installed=Installation.of(task.settings),
         scale_sigma=sigma,
         modes=modes,
     )
@@ -441,7 +441,7 @@ def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | Non
         return None
     fit = fit_navigation(
         records, task.pinholes, body_from_pinhole(task.rig, task.warps), None, levelled=levelled,
-        known_scale=1.0, mount_sigma_deg=task.settings.mount_sigma_deg,
+        known_scale=1.0, installed=Installation.of(task.settings),
     )  # fmt: skip
     return None if fit is None else (fit.ned_from_model, _local_note(records, headed=True))
 

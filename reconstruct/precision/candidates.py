@@ -69,7 +69,7 @@ class Candidate:
         points = block.state.points
         return predict(
             block,
-            NavigationErrors.of(self.config.navigation),
+            NavigationErrors.of(self.config.navigation, self.config.reconstruct),
             control=points[_corners(points)] if self.with_control else None,
             control_sigma_m=CONTROL_SIGMA_M,
         )

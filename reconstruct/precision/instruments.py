@@ -12,7 +12,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.block_solver import inverse_of
-from alice_survey.base.config import CameraConfig, ImagingConfig, NavigationConfig, WaterConfig
+from alice_survey.base.config import (
+    CameraConfig,
+    ImagingConfig,
+    NavigationConfig,
+    ReconstructConfig,
+    WaterConfig,
+)
 from alice_survey.seafloor.board import PoolBoard, pool_poses
 from alice_survey.vehicle.navigation.sensors import CompassSpec, PressureSpec
 from camera_calib.freedom import USUAL_LENS, knowing_water, of_lenses, of_ports, pose_names
@@ -22,6 +28,7 @@ from reconstruct.adjustment.exact_observations import Pixels, RigState, exact_ob
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.correlated_errors import LEAST_WHITE
 from reconstruct.placing.generalised_fit import Correlation
+from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
 
 CORNER_PX = 0.01
 """Sigma of a corner's coordinate in a calibration that is yet to be made; rendered pools of the
@@ -107,6 +114,8 @@ class ChannelErrors:
     slow_s: float
     """Correlation time of the slow one."""
     white: float
+    by_dive: bool = False
+    """Whether every dive has errors of its own, as after a fix at the surface."""
 
     @property
     def sigma(self) -> float:
@@ -121,14 +130,17 @@ class ChannelErrors:
             tau=self.slow_s,
             white=max((self.white / varying) ** 2, LEAST_WHITE),
             constant=(self.constant / self.sigma) ** 2,
+            restart=float(self.by_dive),
         )
 
     def times(self, factor: float) -> "ChannelErrors":
         """All of it so many times as large."""
-        return ChannelErrors(
-            constant=factor * self.constant, slow=factor * self.slow, slow_s=self.slow_s,
+        return replace(
+            self,
+            constant=factor * self.constant,
+            slow=factor * self.slow,
             white=factor * self.white,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +151,10 @@ class NavigationErrors:
     turn_rad: float
     """Of the frame of horizontal positions."""
     stretch: float
+    installed: Installation = USUAL_INSTALLATION
 
     @classmethod
-    def of(cls, settings: NavigationConfig) -> "NavigationErrors":
+    def of(cls, settings: NavigationConfig, placing: ReconstructConfig) -> "NavigationErrors":
         """Of the survey's instruments, as the filter of the simulated vehicle leaves them."""
         pressure, compass = PressureSpec(), CompassSpec()
         bias_rad = math.radians(settings.compass_bias_deg)
@@ -149,7 +162,7 @@ class NavigationErrors:
             channels={
                 "horizontal": ChannelErrors(
                     constant=max(settings.gps_bias_m, 1e-3), slow=_LEVEL_SLOW_M,
-                    slow_s=_LEVEL_SLOW_S, white=_LEVEL_WHITE_M,
+                    slow_s=_LEVEL_SLOW_S, white=_LEVEL_WHITE_M, by_dive=True,
                 ),
                 "depth": ChannelErrors(
                     constant=pressure.bias_sigma_m, slow=_DEPTH_SLOW_M, slow_s=_DEPTH_SLOW_S,
@@ -166,11 +179,13 @@ class NavigationErrors:
             },
             turn_rad=_TURN_SHARE * max(bias_rad, 1e-6),
             stretch=_STRETCH,
+            installed=Installation.of(placing),
         )  # fmt: skip
 
     def times(self, factor: float) -> "NavigationErrors":
         """All of it so many times as large."""
-        return NavigationErrors(
+        return replace(
+            self,
             channels={name: errors.times(factor) for name, errors in self.channels.items()},
             turn_rad=factor * self.turn_rad,
             stretch=factor * self.stretch,

@@ -21,11 +21,8 @@ from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import sag_weights
 from reconstruct.placing.generalised_fit import Extra, estimate
-from reconstruct.placing.georeference import CLOCK_SIGMA_S, LEVER_SIGMA_M
 from reconstruct.placing.navigation_equations import (
-    CLOCK,
     GROUP_OF,
-    LEVER,
     PARAMETERS,
     PLACE,
     SCALE,
@@ -140,9 +137,8 @@ def _placed(
     place = Similarity(scale=1.0, rotation=Rotation.identity(), translation=np.zeros(3))
     middle = state.centres.mean(axis=0)
     columns = PARAMETERS + modes.shape[2]
-    known = np.zeros(columns)
+    known = navigation.installed.weights(columns)
     known[PARAMETERS:] = 1.0
-    known[LEVER], known[CLOCK] = 1.0 / LEVER_SIGMA_M, 1.0 / CLOCK_SIGMA_S
     known[TURN], known[STRETCH] = 1.0 / navigation.turn_rad, 1.0 / navigation.stretch
     rows = np.diag(known)[np.flatnonzero(known)]
     if control is not None:
@@ -151,7 +147,7 @@ def _placed(
         known_at = np.zeros((len(at), 3, columns))
         known_at[:, :, :PLACE], known_at[:, :, PARAMETERS:] = _by_place(at - middle), motions
         rows = np.concatenate([rows, known_at.reshape(-1, columns) / control_sigma_m])
-    free = [*range(6), TURN, STRETCH, *range(LEVER.start, LEVER.stop), CLOCK]
+    free = [*range(6), TURN, STRETCH, *np.flatnonzero(navigation.installed.weights(columns))]
     if not np.isfinite(state.rig.baseline_m):
         free.append(SCALE)
     found = estimate(

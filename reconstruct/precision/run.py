@@ -91,7 +91,11 @@ def precision_report(
     plan = read_plan(folder / "plan.json")
     rig = expected_rig(workspace, config.camera, config.water, config.imaging)
     base = Candidate(config=config, made=plan, rig=rig)
-    block, errors, found = base.block(), NavigationErrors.of(config.navigation), base.precision
+    block, errors, found = (
+        base.block(),
+        NavigationErrors.of(config.navigation, config.reconstruct),
+        base.precision,
+    )
     without = {
         "calibration": predict(block, errors, calibration=False),
         "navigation": predict(block, errors.times(_EXACT)),

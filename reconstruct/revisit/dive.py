@@ -184,7 +184,7 @@ def predict_precision(
     new, new_s = stations_and_times(
         dive.plan, rig, survey_costs(dive.config), float(time_s.max()) + BETWEEN_DIVES_S
     )
-    errors = NavigationErrors.of(dive.config.navigation)
+    errors = NavigationErrors.of(dive.config.navigation, dive.config.reconstruct)
 
     def sigmas(stations: Flags) -> Precision:
         chosen = RigidTransform.concatenate([poses, new])[stations]

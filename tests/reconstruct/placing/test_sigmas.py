@@ -10,6 +10,7 @@ from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.correlated_errors import correlated_share, standard_residuals, whiten
 from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
 from reconstruct.placing.placement_fit import PlacementFit
 from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
@@ -71,7 +72,10 @@ def flown(
 
 
 def place(
-    body: RigidTransform, records: list[ImageRecord], seed: int, **options: float | None
+    body: RigidTransform,
+    records: list[ImageRecord],
+    seed: int,
+    **options: float | Installation | None,
 ) -> tuple[PlacementFit, Array, Array]:
     """Fit a model that is the truth moved; errors and sigmas: N, E, D, turn about each, scale.
 
@@ -172,13 +176,36 @@ def test_the_mount_adds_its_sigma_and_a_turning_vehicle_shows_it() -> None:
     body = flight()
     records = flown(body, 2, 1.0)
     plain, _, exact = place(body, records, 1)
-    mounted, _, loose = place(body, records, 1, mount_sigma_deg=2.0)
-    assert (plain.mount_sigma_deg, mounted.mount_sigma_deg) == (0.0, 2.0)
+    installed = replace(USUAL_INSTALLATION, mount_rad=np.deg2rad(2.0))
+    mounted, _, loose = place(body, records, 1, installed=installed)
+    assert plain.to_json()["mount_sigma_deg"] == 0.0
+    assert mounted.to_json()["mount_sigma_deg"] == pytest.approx(2.0)
     # Heading: its mount error is the same on all lines, only positions determine it.
     assert loose[5] > 1.5 * exact[5]
     # Tilt: lines flown to and fro show it, and depths do.
     assert np.all(loose[3:5] < np.deg2rad(0.5))
     np.testing.assert_allclose(np.rad2deg(loose[3:5]), np.rad2deg(exact[3:5]), atol=0.5)
+
+
+def test_a_clock_that_is_off_by_more_than_stated_is_named_with_its_setting(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    body = flight(6, 14)
+    headings = body.rotation.as_euler("ZYX")[:, 0]
+    errors = SIGMA * gauss_markov(np.random.default_rng(5), len(body), 1.0)
+    a_second_ahead_m = 0.5 / STEP_S
+    errors[:, :2] += a_second_ahead_m * np.column_stack([np.cos(headings), np.sin(headings)])
+    late = [  # 20 s for a turn between lines
+        replace(r, time_s=r.time_s + 20.0 * (r.station // 14))
+        for r in records_of(body, errors, SIGMA)
+    ]
+    place(body, late, 2)
+    assert "clock_sigma_s" in capsys.readouterr().err
+    loose = replace(USUAL_INSTALLATION, clock_s=2.0)
+    fit, _, _ = place(body, late, 2, installed=loose)
+    assert "clock_sigma_s" not in capsys.readouterr().err
+    value, sigma = fit.nuisances["clock_s"]
+    assert abs(abs(value) - 1.0) < 4 * sigma < 1.0
 
 
 def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:

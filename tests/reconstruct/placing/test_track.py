@@ -15,7 +15,7 @@ from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotat
 from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, no_modes
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.navigation_equations import attitude_axes
+from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, attitude_axes
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import (
     SIGMAS,
@@ -83,7 +83,7 @@ def placed(middle: Array, covariance: Array) -> PlacementFit:
     return PlacementFit(
         ned_from_model=HERE, used=1, left_out={}, rms_m=np.zeros(3), free_scale=1.0,
         free_scale_sigma=0.0, middle_ned=middle, correlation={},
-        time_unit="s", mount_sigma_deg=0.0, modes=np.zeros(0), mode_factor=1.0,
+        time_unit="s", installed=USUAL_INSTALLATION, modes=np.zeros(0), mode_factor=1.0,
         joint=covariance, bends=(), nuisances={},
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ import rasterio
 from PIL import Image
 
 from alice_survey.base.artefacts import json_values, read_json
-from alice_survey.base.config import NavigationConfig, SurveyConfig, load_config
+from alice_survey.base.config import NavigationConfig, ReconstructConfig, SurveyConfig, load_config
 from alice_survey.base.errors import ConfigError, PlanError
 from alice_survey.base.executor import SERIAL
 from alice_survey.survey import run
@@ -77,7 +77,7 @@ def figures(found: Precision) -> np.ndarray:
     return np.array([*found.bend_m, found.scale, found.heights_rms_m, shape])
 
 
-NAVIGATION = NavigationErrors.of(NavigationConfig())
+NAVIGATION = NavigationErrors.of(NavigationConfig(), ReconstructConfig())
 
 
 def test_a_plan_says_how_far_surveys_err(tmp_path: Path) -> None:
