@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.block_solver import Flags, Indices, inverse_of
@@ -189,6 +190,24 @@ def part_of_rig(rig: Rig, names: Sequence[str]) -> Rig:
     matrix = np.array(list(slopes.values())).reshape(len(slopes), len(known))
     covariance = matrix @ rig.covariance.matrix @ matrix.T
     return replace(part, covariance=Covariance(parameters=tuple(slopes), matrix=covariance))
+
+
+def knowing_water(rig: Rig, sigma: float) -> Rig:
+    """The rig with its water's index known to a sigma, apart from all else that is calibrated.
+
+    A covariance that holds the index already stays: the calibration was in the same water. So does
+    a rig that has none, because its cameras do not refract.
+    """
+    wet = [f"{name}{_ONE_WATER}" for name, camera in rig.cameras.items() if camera.refracts]
+    if not wet or sigma == 0.0 or not rig.sigmas.keys().isdisjoint(wet):
+        return rig
+    water = Prior.around(rig, dict.fromkeys(wet, sigma))
+    known = rig.covariance or Covariance(parameters=(), matrix=np.zeros((0, 0)))
+    both = Covariance(
+        parameters=(*known.parameters, *water.parameters),
+        matrix=block_diag(known.matrix, water.covariance),
+    )
+    return replace(rig, covariance=both)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

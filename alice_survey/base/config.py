@@ -18,7 +18,7 @@ from pydantic import (
 
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import GREEN_NM, n_water
+from alice_survey.base.seawater import GREEN_NM, n_water, n_water_sigma
 
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 Latitude = Annotated[float, Field(ge=-85, le=85)]
@@ -171,6 +171,7 @@ class WaterConfig(Config):
     """
 
     n_water: float = Field(1.34, ge=1, le=1.4)
+    n_water_sigma: float | None = Field(None, ge=0, le=0.1, exclude_if=lambda s: s is None)
     jerlov: Jerlov = "II"
     temperature_c: float | None = Field(None, ge=-2, le=35)
     salinity_psu: float | None = Field(None, ge=0, le=43)
@@ -183,6 +184,15 @@ class WaterConfig(Config):
         if self.wavelength_nm is not None and self.temperature_c is None:
             raise ValueError("wavelength_nm needs temperature_c and salinity_psu")
         return self
+
+    @property
+    def index_sigma(self) -> float:
+        """Sigma of the index: as set, or as temperature and salinity leave it."""
+        if self.n_water_sigma is not None:
+            return self.n_water_sigma
+        if self.temperature_c is None or self.salinity_psu is None:
+            return n_water_sigma()
+        return n_water_sigma(self.temperature_c, self.salinity_psu, self.wavelength_nm or GREEN_NM)
 
 
 class PlanConfig(Config):

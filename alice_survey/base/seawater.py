@@ -9,6 +9,7 @@ Research 37(12), 1909-1926), good to 8e-5 at 11 km; pressure follows from depth 
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,9 @@ from alice_survey.base.errors import ConfigError, warn
 
 GREEN_NM = 530.0
 """Wavelength that stands for a whole camera when none is named: the middle of green."""
+
+_KNOWN_C, _KNOWN_PSU, _FIT_SIGMA = 1.0, 1.0, 4e-5
+"""Sigmas of temperature, salinity and formula behind an index that nobody measured."""
 
 _FIT = {
     "temperature_c": (0.0, 30.0, "C"),
@@ -84,16 +88,22 @@ def n_water(
             )
     t, s = values["temperature_c"], values["salinity_psu"]
     nm = values["wavelength_nm"]
-    at_surface = (
-        1.31405
-        + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2) * s
-        - 2.02e-6 * t**2
-        + (15.868 + 0.01155 * s - 0.00423 * t) / nm
-        - 4382.0 / nm**2
-        + 1.1455e6 / nm**3
-    )
-    index: NDArray[np.float64] = at_surface + _by_pressure(t, s, pressure_dbar(depth_m), nm)
-    return index
+    index: NDArray[np.float64] = _at_surface(t, s, nm)
+    return index + _by_pressure(t, s, pressure_dbar(depth_m), nm)
+
+
+def n_water_sigma(
+    temperature_c: float = 20.0, salinity_psu: float = 35.0, wavelength_nm: float = GREEN_NM
+) -> float:
+    """Sigma of an index that follows from a water's temperature and salinity as divers know them.
+
+    These are taken as known to 1 degree and 1 psu; their effects follow from the slopes of Quan and
+    Fry's formula, which itself is good to 4e-5.
+    """
+    t, s, nm = np.float64(temperature_c), np.float64(salinity_psu), np.float64(wavelength_nm)
+    warmer = _at_surface(t + _KNOWN_C, s, nm) - _at_surface(t - _KNOWN_C, s, nm)
+    saltier = _at_surface(t, s + _KNOWN_PSU, nm) - _at_surface(t, s - _KNOWN_PSU, nm)
+    return math.hypot(warmer / 2, saltier / 2, _FIT_SIGMA)
 
 
 def pressure_dbar(depth_m: ArrayLike) -> NDArray[np.float64]:
@@ -107,6 +117,18 @@ def pressure_dbar(depth_m: ArrayLike) -> NDArray[np.float64]:
     depth = np.asarray(depth_m, dtype=np.float64)
     pressure: NDArray[np.float64] = ((1 - c1) - np.sqrt((1 - c1) ** 2 - 4 * c2 * depth)) / (2 * c2)
     return pressure
+
+
+def _at_surface(t: Any, s: Any, nm: Any) -> Any:
+    """Index at the surface: Quan and Fry (1995), equation 3."""
+    return (
+        1.31405
+        + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2) * s
+        - 2.02e-6 * t**2
+        + (15.868 + 0.01155 * s - 0.00423 * t) / nm
+        - 4382.0 / nm**2
+        + 1.1455e6 / nm**3
+    )
 
 
 def _by_pressure(

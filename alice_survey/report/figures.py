@@ -74,7 +74,9 @@ class Figures:
 
     @property
     def place_sigma_m(self) -> float:
-        """Horizontal sigma of a camera on the Earth: root mean square."""
+        """Horizontal sigma of a camera on the Earth, root mean square; NaN of a model elsewhere."""
+        if self.held.frame.datum is None:
+            return np.nan
         level = self.camera_sigmas[:, :2]
         known = np.isfinite(level).all(axis=1)
         return float(np.sqrt((level[known] ** 2).sum(axis=1).mean())) if known.any() else np.nan

@@ -21,13 +21,14 @@ def camera_sigmas(figures: Figures) -> Figure | None:
     if not rows:
         return None
     order = np.array([number(row, "station") for row in rows])
+    where = "in the survey" if figures.held.frame.datum is None else "on the Earth"
     misses = {r["image"]: r for r in figures.held.rows("evaluation/cameras.csv")}
 
     def paint(axes: Sequence[Any]) -> None:
         for axis, ink, mark in zip(("north", "east", "depth"), INKS, MARKS, strict=False):
             sigma = [1e2 * number(row, f"sigma_{axis}_m") for row in rows]
             axes[0].plot(order, sigma, mark, ms=3, color=ink, label=axis)
-        axes[0].set(xlabel="station", ylabel="sigma on the Earth, cm", ylim=(0, None))
+        axes[0].set(xlabel="station", ylabel=f"sigma {where}, cm", ylim=(0, None))
         axes[0].legend()
         if misses:
             for axis, ink, mark in zip(("north", "east", "down"), INKS, MARKS, strict=False):

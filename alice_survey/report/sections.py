@@ -290,13 +290,17 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         rows += [
             (f"navigation's residual {axis}", f"{length(value)} rms")
             for axis, value in zip(axes, residuals, strict=True)
+            if value is not None
         ]
         rows += [
             (f"sigma of the whole survey, {axis}", length(value))
             for axis, value in zip(axes, sigmas, strict=True)
+            if value is not None
         ]
-        rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
-        rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+        if place.sigma_heading_deg is not None:
+            rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
+        if place.sigma_tilt_deg is not None:
+            rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
     for joint in found.joints:
         apart = (joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m)
         what = f"of {count(joint.stations, 'station')} that navigation alone joins to the others"

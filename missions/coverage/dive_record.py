@@ -20,7 +20,13 @@ from alice_survey.base.manifest import read_manifest
 from alice_survey.base.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.stations import MOST_ALTITUDES, Stations
-from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation, utc_date
+from missions.logs.navigation_csv import (
+    POSITION,
+    NavigationLog,
+    find_zone,
+    read_navigation,
+    utc_date,
+)
 from missions.values.plan_file import Plan
 
 _ALIKE_RAD = math.radians(45.0)
@@ -119,12 +125,24 @@ def read_dive_record(
 
 
 def _read_log(path: Path) -> NavigationLog:
-    """A log that spans some time.
+    """The rows with positions of a log that spans some time.
 
     Raises:
-        NavigationError: it cannot be used, or has one row.
+        NavigationError: it cannot be used, holds no positions, or has one row.
     """
-    nav = read_navigation(path, find_zone("UTC"))
+    nav = read_navigation(path, find_zone("UTC"), ())
+    nothing = np.full(len(nav.time_s), np.nan)
+    located = np.isfinite(sum(nav.columns.get(name, nothing) for name in POSITION[:2]))
+    if not located.any():
+        raise NavigationError(
+            f"{path}: no row with a latitude and a longitude: without positions a log does not say "
+            "where a dive was; 'alice-survey reconstruct' needs none"
+        )
+    nav = NavigationLog(
+        time_s=nav.time_s[located],
+        columns={name: column[located] for name, column in nav.columns.items()},
+        start_utc=nav.start_utc,
+    )
     if len(nav.time_s) < 2:
         raise NavigationError(
             f"{path}: fewer than 2 rows in order of time: give a log whose time increases"
@@ -228,10 +246,19 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     left_out: dict[str, int] = {}
     notes: list[str] = []
     beyond = (triggers.time_s < nav.time_s[0]) | (triggers.time_s > nav.time_s[-1])
-    lost = ~np.isfinite(at["latitude_deg"] + at["longitude_deg"] + at["depth_m"])
+    lost = ~np.isfinite(at["latitude_deg"] + at["longitude_deg"])
     _count(left_out, f"beyond the log ({nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s)", beyond)
     _count(left_out, f"in a gap of the log over {nav.longest_gap_s:.1f} s", lost & ~beyond)
-    kept = np.flatnonzero(~lost)
+    nothing = np.full(len(lost), np.nan)
+    at = {"depth_m": nothing, "altitude_m": nothing} | at
+    range_unknown = ~lost & np.isnan(at["depth_m"]) & np.isnan(at["altitude_m"])
+    _count(left_out, "without a depth or an altitude", range_unknown)
+    kept = np.flatnonzero(~(lost | range_unknown))
+    if range_unknown.any() and not len(kept):
+        raise NavigationError(
+            f"{path}: neither depth_m nor altitude_m at any of {int(range_unknown.sum())} triggers "
+            "with a position: how far away the sea floor was is not known"
+        )
     if not len(kept):
         raise NavigationError(
             f"{path}: the log has no position at any of {len(triggers.time_s)} triggers "
@@ -240,13 +267,13 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         )
     at = {name: values[kept] for name, values in at.items()}
     time_s = triggers.time_s[kept]
-    geodetic = np.column_stack([at["latitude_deg"], at["longitude_deg"], at["depth_m"]])
+    geodetic = np.nan_to_num([at[name] for name in POSITION]).T
     body_ned = plan.datum.ned_from_geodetic(geodetic)
     attitude = _attitude(nav, at, time_s, plan, notes)
     lever = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
     glass_ned = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
     glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
-    altitude = at.get("altitude_m", np.full(len(kept), np.nan)).copy()
+    altitude = at["altitude_m"].copy()
     unknown = ~np.isfinite(altitude)
     if unknown.any():
         altitude[unknown] = plan.seafloor_depth_m - glass_ned[unknown, 2]

@@ -16,7 +16,14 @@ import numpy as np
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array, Datum
 from missions.logs.dataflash import LogTable, Mask, read_dataflash
-from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
+from missions.logs.dive import (
+    DATED_AFTER_S,
+    ROLES,
+    LoggedDive,
+    Signal,
+    cleaned,
+    usable_positions,
+)
 from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, read_tlog
 
 _GPS_EPOCH_S = 315964800.0
@@ -251,25 +258,22 @@ def _dive(
             notes.append(note)
         return found
 
-    position = signal("navigation")
-    if position is None:
-        names = ", ".join(source.message for source in sources["navigation"])
-        raise NavigationError(
-            f"{path}: no row holds a position: none of {names}; it has {', '.join(present)}. "
-            "Without GPS, USBL or a DVL the vehicle does not know where it is"
-        )
+    found = {role: signal(role) for role in sources}
+    if not any(found[role] for role in ROLES):
+        names = ", ".join(dict.fromkeys(s.message for role in ROLES for s in sources[role]))
+        raise NavigationError(f"{path}: none of {names}; it has {', '.join(present)}")
     return LoggedDive(
         kind=kind,
         clock=clock,
         dated=dated,
-        position=usable_positions(position, str(path), lost),
-        depth=signal("depth"),
-        attitude=signal("attitude"),
-        altitude=signal("altitude"),
+        position=usable_positions(found["navigation"], lost),
+        depth=found["depth"],
+        attitude=found["attitude"],
+        altitude=found["altitude"],
         altitude_slant=True,
-        velocity_ned=signal("velocity"),
-        rates=signal("rates"),
-        pwm=signal("pwm"),
+        velocity_ned=found["velocity"],
+        rates=found["rates"],
+        pwm=found["pwm"],
         declination_in_log_deg=declination_in_log_deg,
         lost=dict(lost),
         notes=tuple(notes),
@@ -376,14 +380,12 @@ def _declination(parameters: LogTable | None) -> float | None:
 
 def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
     """The system that reports its place most."""
-    for name in ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "ATTITUDE"):
-        if name in tables:
-            systems, counts = np.unique(tables[name].columns[SYSTEM], return_counts=True)
-            return float(systems[np.argmax(counts)])
-    raise NavigationError(
-        f"{path}: no row holds a position: no GLOBAL_POSITION_INT or GPS_RAW_INT; it has "
-        f"{', '.join(present)}"
-    )
+    names = ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "ATTITUDE", *sorted(tables))
+    name = next((name for name in names if name in tables), None)
+    if name is None:
+        raise NavigationError(f"{path}: no message of a vehicle; it has {', '.join(present)}")
+    systems, counts = np.unique(tables[name].columns[SYSTEM], return_counts=True)
+    return float(systems[np.argmax(counts)])
 
 
 def _tlog_times(table: LogTable) -> Array:

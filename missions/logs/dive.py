@@ -3,12 +3,11 @@
 import bisect
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array
 from missions.logs.navigation_csv import interpolated
 
@@ -55,7 +54,7 @@ class LoggedDive:
     """Whose clock the times are, in words."""
     dated: bool
     """Whether times are seconds since 1970, UTC, and not of a separate clock."""
-    position: Signal
+    position: Signal | None = None
     """(N, 2) latitude and longitude."""
     depth: Signal | None = None
     """(N, 1) depth below the surface, metres."""
@@ -84,6 +83,24 @@ class LoggedDive:
     lost: Mapping[str, int] = field(default_factory=dict)
     """How many rows or bytes were left out, by reason."""
     notes: tuple[str, ...] = ()
+
+    @property
+    def row_times(self) -> Array:
+        """(M,) times of positions, and of depths where there are no positions.
+
+        Without both they are those of attitudes, else of altitudes.
+        """
+        if self.position is None and self.depth is None:
+            one = self.attitude or self.altitude
+            return np.empty(0) if one is None else one.time_s
+        times = np.empty(0)
+        for signal in (self.position, self.depth):
+            if signal is not None:
+                lacking = np.isnan(
+                    interpolated(times, np.zeros(len(times)), signal.time_s, turning=False)
+                )
+                times = np.union1d(times, signal.time_s[lacking])
+        return times
 
 
 def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:
@@ -140,31 +157,23 @@ def _increasing(time_s: Array) -> NDArray[np.intp]:
     return np.array(rows[::-1])
 
 
-def usable_positions(position: Signal | None, source: str, lost: Counter[str]) -> Signal:
-    """The rows of a position signal that can be a place; what is left out is counted.
-
-    Raises:
-        NavigationError: none is left.
-    """
-    if position is not None:
-        latitude, longitude = position.values.T
-        with np.errstate(invalid="ignore"):
-            known = np.isfinite(latitude) & np.isfinite(longitude)
-            inside = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
-        nowhere = known & (latitude == 0) & (longitude == 0)
-        for reason, rows in (
-            ("the position is not a number", ~known),
-            ("the position is beyond the range of latitude and longitude", known & ~inside),
-            ("the position is 0, 0: no fix", nowhere),
-        ):
-            if rows.any():
-                lost[f"{position.source}: {reason}"] += int(rows.sum())
-        good = known & inside & ~nowhere
-        if good.any():
-            return Signal(
-                source=position.source, time_s=position.time_s[good], values=position.values[good]
-            )
-    reasons = "; ".join(f"{count} times {reason}" for reason, count in sorted(lost.items()))
-    raise NavigationError(
-        f"{source}: no row holds a position" + (f" ({reasons})" if reasons else "")
-    )
+def usable_positions(position: Signal | None, lost: Counter[str]) -> Signal | None:
+    """The rows of a position signal that can be a place; what is left out is counted."""
+    if position is None:
+        return None
+    latitude, longitude = position.values.T
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(latitude) & np.isfinite(longitude)
+        inside = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
+    nowhere = known & (latitude == 0) & (longitude == 0)
+    for reason, rows in (
+        ("the position is not a number", ~known),
+        ("the position is beyond the range of latitude and longitude", known & ~inside),
+        ("the position is 0, 0: no fix", nowhere),
+    ):
+        if rows.any():
+            lost[f"{position.source}: {reason}"] += int(rows.sum())
+    good = known & inside & ~nowhere
+    if not good.any():
+        return None
+    return replace(position, time_s=position.time_s[good], values=position.values[good])

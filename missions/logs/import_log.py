@@ -16,7 +16,7 @@ from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
-from missions.logs.navigation_csv import longest_gap_s, utc_date
+from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
@@ -36,7 +36,7 @@ class ImportOptions:
     """Offset added to times."""
     start_s: float | None = None
     end_s: float | None = None
-    """Seconds from the first position: what is before or after is left out."""
+    """Seconds from the first position, else the first row: what is before or after is left out."""
     topics: Sequence[str] = ()
     """`ROLE=NAME`, roles as in `dive.ROLES`: which topic or message to use."""
     datum_deg: tuple[float, float] | None = None
@@ -83,7 +83,8 @@ def import_log(
         A report as text, and as JSON values.
 
     Raises:
-        NavigationError: the log cannot be read, holds no position, or an option does not fit it.
+        NavigationError: the log cannot be read, holds nothing of use, or an option does not fit
+            it.
     """
     options = options or ImportOptions()
     written = [file for file in (out, options.vehicle_log) if file is not None]
@@ -96,31 +97,35 @@ def import_log(
         dive = _dated(dive, options.start_utc)
     tide = read_tide(options.tide, dated=dated)
     _warn_of_declination(dive, options.declination_deg)
-    dive = _trimmed(dive, options.start_s, options.end_s)
-    time_s, columns = navigation_table(dive, options, tide)
-    complete = np.isfinite(columns["latitude_deg"] + columns["depth_m"])
+    logged_s = _stretch(dive, options.start_s, options.end_s)
+    time_s, columns = navigation_table(dive, logged_s, options, tide)
+    useful = np.any([np.isfinite(columns[name]) for name in READINGS], axis=0)
     lost = Counter(dict(dive.lost))
-    if not complete.all():
-        reason = "positions without a depth" + (
-            " or an attitude for the lever arm" if any(options.lever_body_m) else ""
-        )
-        lost[reason] += int((~complete).sum())
-    if not complete.any():
-        raise NavigationError(
-            f"{path}: {len(time_s)} positions, none with a depth"
-            + (" at its time" if dive.depth is not None else ": the log holds none")
-        )
-    time_s = time_s[complete]
-    columns = {name: column[complete] for name, column in columns.items()}
+    if not useful.any():
+        raise NavigationError(_nothing_of_use(path, dive, lost))
+    if not useful.all():
+        lost["rows without any reading"] += int((~useful).sum())
+    logged_s, time_s = logged_s[useful], time_s[useful]
+    columns = {name: column[useful] for name, column in columns.items()}
     try:
         texts = [_date(t) if dated else f"{t:.6f}" for t in time_s.tolist()]
         write_navigation_rows(out, texts, columns, "time_utc" if dated else "time_s")
         if options.vehicle_log is not None:
-            _write_vehicle_log(options.vehicle_log, dive, options)
+            _write_vehicle_log(options.vehicle_log, dive, logged_s, options)
     except OSError as error:
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     tidal = isinstance(tide, Signal) or tide != 0.0
     return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
+
+
+def _nothing_of_use(path: Path, dive: LoggedDive, lost: Mapping[str, int]) -> str:
+    why = "; ".join(f"{count} times {reason}" for reason, count in sorted(lost.items()))
+    text = f"{path}: no row holds a position, depth, attitude or altitude"
+    if why:
+        text += f" ({why})"
+    if dive.altitude is not None and dive.altitude_slant:
+        text += f"; ranges of {dive.altitude.source} are of use with an attitude only"
+    return text
 
 
 def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
@@ -184,7 +189,7 @@ def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
         raise NavigationError(
             f"--start-utc {start_utc!r} is not a date such as 2024-05-01T12:00:00Z"
         ) from None
-    shift = start_s - float(dive.position.time_s[0])
+    shift = start_s - _first_s(dive)
     signals = {field.name: getattr(dive, field.name) for field in fields(dive)}
     moved: dict[str, Any] = {
         name: _later(signal, shift)
@@ -199,21 +204,25 @@ def _later(signal: Signal, by_s: float) -> Signal:
     return replace(signal, time_s=signal.time_s + by_s)
 
 
-def _trimmed(dive: LoggedDive, start_s: float | None, end_s: float | None) -> LoggedDive:
-    """The positions of a stretch, counted from the first."""
-    position = dive.position
-    since = position.time_s - position.time_s[0]
-    first = 0.0 if start_s is None else start_s
+def _first_s(dive: LoggedDive) -> float:
+    """Time of the first position, else of the first row; 0 without rows."""
+    times = dive.row_times if dive.position is None else dive.position.time_s
+    return float(times[0]) if len(times) else 0.0
+
+
+def _stretch(dive: LoggedDive, start_s: float | None, end_s: float | None) -> Array:
+    """(N,) times of rows in a stretch, which is counted from the first position."""
+    times = dive.row_times
+    since = times - _first_s(dive)
+    first = -math.inf if start_s is None else start_s
     last = math.inf if end_s is None else end_s
     keep = (since >= first) & (since <= last)
-    if not keep.any():
+    if len(times) and not keep.any():
         raise NavigationError(
             f"--start {first:g} and --end {last:g} leave nothing of {since[-1]:.1f} s"
         )
-    return replace(
-        dive,
-        position=replace(position, time_s=position.time_s[keep], values=position.values[keep]),
-    )
+    kept: Array = times[keep]
+    return kept
 
 
 def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
@@ -230,15 +239,16 @@ def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
 
 
 def navigation_table(
-    dive: LoggedDive, options: ImportOptions, tide: float | Signal
+    dive: LoggedDive, logged_s: Array, options: ImportOptions, tide: float | Signal
 ) -> tuple[Array, dict[str, Array]]:
-    """Times, (N,), and the columns of the navigation CSV, (N,) each, at the positions' times.
+    """Times, (N,), and the columns of the navigation CSV, (N,) each.
 
-    What is not known is NaN. Everything else than the position is interpolated onto its times, but
-    not across gaps. Depth is from the level that the tide counts from.
+    What is not known is NaN. Readings are interpolated onto the rows, but not across gaps. Depth
+    is from the level that the tide counts from.
 
     Args:
         dive: as logged.
+        logged_s: (N,) times of rows as logged.
         options: what to correct.
         tide: height of the water above the level that depths are to count from, metres; or (N, 1)
             of it on the clock of the log after the offset.
@@ -247,23 +257,25 @@ def navigation_table(
         NavigationError: the lever arm needs an attitude that the log lacks, or the tide does not
             cover the dive.
     """
-    logged_s = dive.position.time_s
     time_s = logged_s + options.clock_offset_s
-    nothing = np.full((len(time_s), 1), np.nan)
-    depth = nothing if dive.depth is None else dive.depth.at(logged_s)
-    angles = np.full((len(time_s), 3), np.nan)
-    if dive.attitude is not None:
-        angles = dive.attitude.at(logged_s, turning=True)
-        angles[:, 2] += options.declination_deg
-    altitude = nothing if dive.altitude is None else dive.altitude.at(logged_s)
+
+    def at_rows(signal: Signal | None, count: int, *, turning: bool = False) -> Array:
+        if signal is None:
+            return np.full((len(logged_s), count), np.nan)
+        return signal.at(logged_s, turning=turning)
+
+    angles = at_rows(dive.attitude, 3, turning=True)
+    angles[:, 2] += options.declination_deg
+    altitude = at_rows(dive.altitude, 1)
     if dive.altitude_slant:
         # The range along the body's down axis, seen upright: cos(roll) cos(pitch) is the axis' down
         # component (Fossen 2011, 2.18). Without an attitude it is not known.
         altitude = altitude * np.cos(np.deg2rad(angles[:, :2])).prod(axis=1, keepdims=True)
-    place = _at_origin(dive, np.hstack([dive.position.values, depth]), angles, options.lever_body_m)
+    place = np.hstack([at_rows(dive.position, 2, turning=True), at_rows(dive.depth, 1)])
+    place = _at_origin(dive, place, angles, options.lever_body_m)
     values = [
         place[:, 0],
-        place[:, 1],
+        (place[:, 1] + 180.0) % 360.0 - 180.0,
         place[:, 2] - _tide_at(time_s, tide),
         (angles[:, 0] + 180.0) % 360.0 - 180.0,
         angles[:, 1],
@@ -272,8 +284,7 @@ def navigation_table(
     ]
     columns = dict(zip(COLUMNS, values, strict=False))
     for name in COLUMNS[len(values) :]:
-        signal = dive.sigmas.get(name)
-        columns[name] = nothing[:, 0] if signal is None else signal.at(logged_s)[:, 0]
+        columns[name] = at_rows(dive.sigmas.get(name), 1)[:, 0]
     return time_s, columns
 
 
@@ -287,12 +298,15 @@ def _at_origin(
     if dive.attitude is None:
         raise NavigationError("a lever arm needs an attitude, and the log has none")
     moved = np.full_like(place, np.nan)
-    good = np.isfinite(place).all(axis=1) & np.isfinite(angles_deg).all(axis=1)
-    if good.any():
-        datum = Datum(*(float(value) for value in place[good][0, :2]))
-        rotation = rotation_from_attitude(*np.deg2rad(angles_deg[good]).T)
-        ned = datum.ned_from_geodetic(place[good]) - rotation.apply(lever)
-        moved[good] = datum.geodetic_from_ned(ned)
+    upright = np.isfinite(angles_deg).all(axis=1)
+    arms = rotation_from_attitude(*np.deg2rad(angles_deg[upright]).T).apply(lever)
+    moved[upright, 2] = place[upright, 2] - arms[:, 2]
+    located = np.isfinite(place[upright, :2]).all(axis=1)
+    good = np.flatnonzero(upright)[located]
+    if len(good):
+        datum = Datum(*(float(value) for value in place[good[0], :2]))
+        ned = datum.ned_from_geodetic(np.nan_to_num(place[good])) - arms[located]
+        moved[good, :2] = datum.geodetic_from_ned(ned)[:, :2]
     return moved
 
 
@@ -362,15 +376,14 @@ def moment(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _write_vehicle_log(path: Path, dive: LoggedDive, options: ImportOptions) -> None:
-    """The vehicle log (docs/vehicle-logs.md) at the positions' times, from the first position."""
+def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: ImportOptions) -> None:
+    """The vehicle log (docs/vehicle-logs.md) at the rows' times, (N,) as logged, from the first."""
     from scipy.spatial.transform import Rotation
 
     from alice_survey.vehicle.log import vehicle_log, write_vehicle_log
 
     # Depths of the log, not of the chart: a vehicle's log knows of no tide.
-    time_s, columns = navigation_table(dive, options, 0.0)
-    at_s = dive.position.time_s
+    time_s, columns = navigation_table(dive, at_s, options, 0.0)
     place = np.stack([columns[name] for name in COLUMNS[:3]], axis=1)
     known = np.isfinite(place).all(axis=1)
     position = np.full(place.shape, np.nan)
@@ -418,19 +431,20 @@ def _report(
     tidal: bool,
 ) -> tuple[str, dict[str, Any]]:
     """What was read, from where, and what is missing; warns of what was left out and of gaps."""
-    gaps = _gaps(time_s)
+    filled = {name: int(np.isfinite(column).sum()) for name, column in columns.items()}
+    leading = next(name for name in READINGS if filled[name])
+    gaps = _gaps(time_s[np.isfinite(columns[leading])])
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:
         spans = ", ".join(f"{length:.1f} s from {moment(start)}" for start, length in gaps[:_NAMED])
         more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
-        warn(f"{path}: {len(gaps)} gaps in the positions: {spans}{more}")
+        warn(f"{path}: {len(gaps)} gaps in {leading}: {spans}{more}")
     sources = {
         "position": dive.position, "depth": dive.depth, "attitude": dive.attitude,
         "altitude": dive.altitude,
     }  # fmt: skip
     named = {role: signal.source for role, signal in sources.items() if signal is not None}
-    filled = {name: int(np.isfinite(column).sum()) for name, column in columns.items()}
     steps = np.diff(time_s)
     data: dict[str, Any] = {
         "log": str(path),

@@ -12,7 +12,7 @@ import numpy as np
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError
 from missions.logs.dive import LoggedDive, cleaned, usable_positions
-from missions.logs.navigation_csv import find_zone, utc_date
+from missions.logs.navigation_csv import READINGS, find_zone, utc_date
 
 _TIME = "Timestamp"
 _PLACE = ("gps.lat", "gps.lon")
@@ -34,7 +34,7 @@ def read_qgc_csv(path: Path, requested: Mapping[str, str], time_zone: str) -> Lo
         time_zone: of the PC.
 
     Raises:
-        NavigationError: it is not such a file, or holds no position.
+        NavigationError: it is not such a file.
     """
     wrong = [role for role in requested if role not in ("depth", "altitude")]
     if wrong:
@@ -46,13 +46,12 @@ def read_qgc_csv(path: Path, requested: Mapping[str, str], time_zone: str) -> Lo
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise NavigationError(f"{path}: cannot be read: {error}") from None
     header = [name.strip() for name in header]
-    if "latitude_deg" in header and _TIME not in header:
+    if set(READINGS) & set(header) and _TIME not in header:
         raise NavigationError(
             f"{path}: a navigation CSV already: give it to import-images --navigation"
         )
-    missing = [name for name in (_TIME, *_PLACE) if name not in header]
-    if missing:
-        raise NavigationError(f"{path}: not QGroundControl's CSV: column {missing[0]} is missing")
+    if _TIME not in header:
+        raise NavigationError(f"{path}: not QGroundControl's CSV: column {_TIME} is missing")
     lost: Counter[str] = Counter()
     whole = [row for row in rows if len(row) == len(header)]
     if len(whole) < len(rows):
@@ -70,7 +69,10 @@ def read_qgc_csv(path: Path, requested: Mapping[str, str], time_zone: str) -> Lo
         return name or next((column for column in usual if column in columns), None)
 
     depth, altitude = chosen("depth", _DEPTH), chosen("altitude", *_ALTITUDES)
-    have_angles = all(name in columns for name in _ANGLES)
+    have_place, have_angles = (
+        all(name in columns for name in names) for names in (_PLACE, _ANGLES)
+    )
+    place = cleaned("gps.lat, gps.lon", time_s, numbers(*_PLACE), lost) if have_place else None
     nothing: Counter[str] = Counter()
     heights = None if altitude is None else numbers(altitude)
     if heights is not None:
@@ -79,9 +81,7 @@ def read_qgc_csv(path: Path, requested: Mapping[str, str], time_zone: str) -> Lo
         kind="a CSV of QGroundControl",
         clock=f"the PC's clock, {time_zone}",
         dated=True,
-        position=usable_positions(
-            cleaned("gps.lat, gps.lon", time_s, numbers(*_PLACE), lost), str(path), lost
-        ),
+        position=usable_positions(place, lost),
         depth=None if depth is None else cleaned(depth, time_s, -numbers(depth), nothing),
         attitude=cleaned("roll, pitch, heading", time_s, numbers(*_ANGLES), nothing)
         if have_angles

@@ -112,9 +112,10 @@ def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) 
             topic for topic in present
             if topic.kind == FIX and topic.name.rsplit("/", 1)[-1] in _ORIGIN
         ]  # fmt: skip
-        if chosen["navigation"].kind == ODOMETRY and datum is None and not origin:
+        navigation = chosen.get("navigation")
+        if navigation is not None and navigation.kind == ODOMETRY and not (datum or origin):
             raise NavigationError(
-                f"{path}: {chosen['navigation'].name} counts from an origin that the bag does not "
+                f"{path}: {navigation.name} counts from an origin that the bag does not "
                 "hold: give --datum LATITUDE LONGITUDE"
             )
         joints = [topic for topic in present if topic.kind == JOINTS]
@@ -214,10 +215,10 @@ def _choose(
                 f"{path}: {name} is {topic.kind}; {role} can come from {', '.join(_TAKES[role])}"
             )
         chosen[role] = topic
-    if "navigation" not in chosen:
-        chosen["navigation"] = _navigation(path, present)
-    kind = chosen["navigation"].kind
-    if kind == FIX:
+    if "navigation" not in chosen and (navigation := _navigation(path, present)) is not None:
+        chosen["navigation"] = navigation
+    kind = chosen["navigation"].kind if "navigation" in chosen else None
+    if kind in (FIX, None):
         for role, kinds in (("depth", (PRESSURE,)), ("attitude", (IMU,))):
             found = [t for t in present if t.kind in kinds]
             if role not in chosen and len(found) == 1:
@@ -226,11 +227,6 @@ def _choose(
                 raise NavigationError(
                     f"{path}: {_listed(found)} could give {role}: choose with --topic {role}=NAME"
                 )
-        if "depth" not in chosen:
-            raise NavigationError(
-                f"{path}: {chosen['navigation'].name} gives no depth, and no topic of "
-                f"{PRESSURE} does: choose one with --topic depth=NAME; it has {_listed(present)}"
-            )
     if "altitude" not in chosen and kind != NAV_STS:
         ranges = [
             t for t in present
@@ -238,11 +234,17 @@ def _choose(
         ]  # fmt: skip
         if len(ranges) == 1:
             chosen["altitude"] = ranges[0]
+    if not chosen:
+        known = dict.fromkeys(kind for kinds in _TAKES.values() for kind in kinds)
+        raise NavigationError(
+            f"{path}: no one topic of {', '.join(known)}; it has {_listed(present)}: "
+            "choose with --topic ROLE=NAME"
+        )
     return chosen
 
 
-def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic:
-    """The one topic that navigation comes from when none is requested."""
+def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic | None:
+    """The one topic that navigation comes from when none is requested; None without one."""
     for kind in _TAKES["navigation"]:
         found = [
             t for t in present
@@ -258,9 +260,7 @@ def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic:
                 f"{path}: {_listed(found)} could all be navigation: choose one with "
                 "--topic navigation=NAME"
             )
-    raise NavigationError(
-        f"{path}: no topic of {', '.join(_TAKES['navigation'])}; it has {_listed(present)}"
-    )
+    return None
 
 
 def _listed(topics: Sequence[_Topic]) -> str:
@@ -348,16 +348,17 @@ class _BagReading:
 
     def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:
         """Everything that the bag holds."""
-        navigation = self.series[self.chosen["navigation"]]
-        if navigation.topic.kind == ODOMETRY:
+        navigation = self._of("navigation")
+        if navigation is not None and navigation.topic.kind == ODOMETRY:
             self._add_geodetic(self._datum(origin))
-        position = usable_positions(self._signal(navigation, PLACE), str(self.path), self.lost)
+        position = usable_positions(self._signal(navigation, PLACE), self.lost)
+        times = np.concatenate([self.series[topic].time_s for topic in self.chosen.values()])
         ranged = self.chosen.get("altitude")
         rpm, thrusters = self._rpm(joints)
         return LoggedDive(
             kind="a bag of ROS",
             clock="the times of the message headers",
-            dated=bool(position.time_s[0] > DATED_AFTER_S),
+            dated=bool(np.median(times) > DATED_AFTER_S) if len(times) else False,
             position=position,
             depth=self._depth(),
             attitude=self._attitude(),
@@ -374,9 +375,11 @@ class _BagReading:
             notes=tuple(self.notes),
         )
 
-    def _signal(self, series: _Series, names: Sequence[str], scale: float = 1.0) -> Signal | None:
-        """A signal of columns, None where the topic lacks them or is empty."""
-        if not len(series.time_s) or any(name not in series.columns for name in names):
+    def _signal(
+        self, series: _Series | None, names: Sequence[str], scale: float = 1.0
+    ) -> Signal | None:
+        """A signal of columns, None where there is no topic, or it lacks them or is empty."""
+        if series is None or not len(series.time_s) or not set(names) <= set(series.columns):
             return None
         values = scale * np.stack([series.columns[name] for name in names], axis=1)
         return self._cleaned(series, values)
@@ -387,8 +390,9 @@ class _BagReading:
         self._counted.add(series.topic)
         return cleaned(series.topic.name, series.time_s, values, lost)
 
-    def _of(self, role: str) -> _Series:
-        return self.series[self.chosen.get(role, self.chosen["navigation"])]
+    def _of(self, role: str) -> _Series | None:
+        topic = self.chosen.get(role, self.chosen.get("navigation"))
+        return None if topic is None else self.series[topic]
 
     def _datum(self, origin: Sequence[_Topic]) -> Datum:
         if self.datum is not None:
@@ -411,7 +415,7 @@ class _BagReading:
 
     def _depth(self) -> Signal | None:
         series = self._of("depth")
-        if series.topic.kind != PRESSURE:
+        if series is None or series.topic.kind != PRESSURE:
             return self._signal(series, ("number",)) or self._signal(series, ("depth",))
         self.notes.append(
             f"depth is pressure minus {_SURFACE_PA:g} Pa, in water of {_DENSITY_KG_M3:g} kg/m^3"
@@ -422,10 +426,8 @@ class _BagReading:
 
     def _attitude(self) -> Signal | None:
         series = self._of("attitude")
-        if ANGLES[0] in series.columns:
+        if series is None or QUATERNION[0] not in series.columns:
             return self._signal(series, ANGLES, scale=float(np.rad2deg(1.0)))
-        if QUATERNION[0] not in series.columns:
-            return None
         xyzw = np.stack([series.columns[name] for name in QUATERNION], axis=1)
         good = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < _UNIT
         given = np.isfinite(xyzw).all(axis=1)
@@ -440,21 +442,24 @@ class _BagReading:
 
     def _altitude(self) -> Signal | None:
         series = self._of("altitude")
-        name = "number" if "number" in series.columns else "altitude"
-        if name not in series.columns:
+        if series is None:
             return None
-        values = series.columns[name]
+        values = series.columns.get("number", series.columns.get("altitude"))
+        if values is None:
+            return None
         with np.errstate(invalid="ignore"):
             absent = values <= 0
         if absent.any():
             self.lost[f"{series.topic.name}: altitudes not above 0: no bottom"] += int(absent.sum())
         return self._cleaned(series, np.where(absent, np.nan, values))
 
-    def _sigmas(self, series: _Series) -> dict[str, Signal]:
+    def _sigmas(self, series: _Series | None) -> dict[str, Signal]:
         """Standard deviations; a variance that is not positive is not known."""
-        sigmas = {}
+        sigmas: dict[str, Signal] = {}
+        if series is None:
+            return sigmas
         for column, (names, scale) in _SIGMAS.items():
-            if any(name not in series.columns for name in names):
+            if not set(names) <= set(series.columns):
                 continue
             variance = np.mean([series.columns[name] for name in names], axis=0)
             with np.errstate(invalid="ignore"):

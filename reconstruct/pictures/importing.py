@@ -54,6 +54,8 @@ _UNDECODABLE = "cannot be decoded"
 _EXIF_SIGMA_M = (3.0, 6.0)
 """Horizontal and vertical sigma of the GPS in a picture's EXIF, which states none."""
 _LOGGED_LEVEL = "sea surface, as in the navigation log"
+_ABOVE_M = 0.5
+"""Depths are on the wrong side of the surface beyond waves and the zero of a sensor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +70,8 @@ class ImportedPictures:
     """Pictures by kind of file."""
     positions: int
     """Number of pictures with a known position."""
+    readings: Mapping[str, int]
+    """Pictures by what navigation measured of them."""
     left_out: Mapping[str, int]
     """Files that were not imported, by reason."""
 
@@ -78,6 +82,8 @@ class ImportedPictures:
         of = f" of {', '.join(others)} and {last}" if others else ""
         text = f"{total} pictures ({_counted(self.kinds)}){of}"
         text += f", {self.positions} with a position"
+        for name, count in self.readings.items():
+            text += f", {count} with {name}" if count > self.positions else ""
         return text + (f"; left out: {_counted(self.left_out)}" if self.left_out else "")
 
 
@@ -174,7 +180,7 @@ def import_images(
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
         name="images",
-        version=1,
+        version=2,
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),
@@ -246,8 +252,14 @@ def _imported(
         cameras={name: counts[name] for name in (*sides, *counts) if counts[name]},
         kinds=dict(kinds),
         positions=sum(record.has_position for record in records),
+        readings=_readings_of(records),
         left_out=dict(left_out),
     )
+
+
+def _readings_of(records: Sequence[ImageRecord]) -> Counter[str]:
+    """How many pictures navigation measured what of."""
+    return Counter(name for r in records for name, known in r.readings.items() if known)
 
 
 def _counted(counts: Mapping[str, int]) -> str:
@@ -483,10 +495,12 @@ def _place(
             notes.append("picture times count from the first picture, plus the clock offset")
         records = _with_navigation(records, times, log)
         level = logged_level
+        if level == _LOGGED_LEVEL:
+            _warn_of_heights(records)
     else:
         records = _with_gps(records, entries)
         level = "EXIF GPS altitude"
-    counted = Counter(name for r in records for name, known in r.readings.items() if known)
+    counted = _readings_of(records)
     if not counted:
         if log is not None:
             raise ImageError(
@@ -507,6 +521,16 @@ def _place(
         return list(records), None, level
     datum = {"latitude_deg": first.latitude_deg, "longitude_deg": first.longitude_deg}
     return list(records), datum, level
+
+
+def _warn_of_heights(records: Sequence[ImageRecord]) -> None:
+    """Say when depths look like heights."""
+    depths = np.array([r.depth_m for r in records if r.readings["depth"]])
+    if len(depths) and np.median(depths) < -_ABOVE_M:
+        warn(
+            f"most pictures are above the sea surface, by {-np.median(depths):.1f} m: depth_m is "
+            "positive down; --vertical-datum names another level that depths count from"
+        )
 
 
 def _times(

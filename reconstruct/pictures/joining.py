@@ -50,13 +50,17 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
     folders = [need_stage(dive, "images", "import-images") for dive in dives]
     rig = _same_rig(dives)
     surveys = [PicturesRecord.read(folder / "survey.json") for folder in folders]
-    levels = {s.vertical_datum for s in surveys if s.datum is not None}
+    rows = [read_manifest(folder / "manifest.csv") for folder in folders]
+    levels = {
+        survey.vertical_datum
+        for survey, records in zip(surveys, rows, strict=True)
+        if any(record.readings["depth"] for record in records)
+    }
     if len(levels) > 1:
         raise ImageError(
             f"depths of the dives count from different levels ({', '.join(map(repr, levels))}): "
             "import them with one --vertical-datum"
         )
-    rows = [read_manifest(folder / "manifest.csv") for folder in folders]
     inputs = [
         folder / name
         for folder, records in zip(folders, rows, strict=True)
@@ -64,7 +68,7 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
     ]
     stage = Stage(
         name="images",
-        version=1,
+        version=2,
         settings={"joined": len(dives)},
         inputs=[*inputs, *([rig] if rig else [])],
     )
@@ -82,9 +86,10 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
             write_rig(partial / "rig.json", read_rig(rig))
         first = next((s for s in surveys if s.datum is not None), surveys[0])
         notes = tuple(dict.fromkeys(note for s in surveys for note in s.notes))
-        first.model_copy(update={"source": "imported", "notes": notes}).write(
-            partial / "survey.json"
-        )
+        level = next(iter(levels), first.vertical_datum)
+        first.model_copy(
+            update={"source": "imported", "notes": notes, "vertical_datum": level}
+        ).write(partial / "survey.json")
 
     _join_plans(workspace, dives)
     run_stage(workspace, stage, work)

@@ -15,10 +15,11 @@ _RELIEF_SIGMAS = 3.0
 def observable(epochs: Epochs) -> list[int]:
     """Parameters of rotation and shift that some reading depends on.
 
-    Without positions north and east are the model's own, without headings too its heading, and
-    without depths its level is that of the sea floor: by choice, and so without a sigma.
+    Without positions north and east are the model's own, without headings too its heading; without
+    depths its depth is the sea floor's, and where headings are all that is known, its level too: by
+    choice, and so without a sigma.
     """
-    free = [0, 1]
+    free = [0, 1] if epochs.known[:, :5].any() else []
     if epochs.has_horizontal or epochs.known[:, 5].any():
         free.append(2)
     if epochs.has_horizontal:

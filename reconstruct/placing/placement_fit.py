@@ -86,7 +86,8 @@ class PlacementFit:
         """What `georeference.json` says."""
         tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
         axis = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
-        north, east, down = self.sigma_position_m.tolist()
+        # What is the model's own by choice has no sigma.
+        north, east, down = (sigma or None for sigma in self.sigma_position_m.tolist())
         return {
             "format": "alice-survey georeference",
             "version": 1,
@@ -100,8 +101,8 @@ class PlacementFit:
             "sigma_north_m": north,
             "sigma_east_m": east,
             "sigma_depth_m": down,
-            "sigma_heading_deg": self.sigma_heading_deg,
-            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))),
+            "sigma_heading_deg": self.sigma_heading_deg or None,
+            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
             "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
             "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
             "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),

@@ -37,6 +37,7 @@ from alice_survey.base.records import (
 from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
@@ -129,9 +130,21 @@ class _KnownScale:
 
 
 def run_sparse(
-    workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig
+    workspace: Path,
+    folder: Path,
+    executor: Executor,
+    *,
+    reconstruct: ReconstructConfig,
+    index_sigma: float,
 ) -> None:
     """Adjust the model of `mapping/` a last time, and place it in the world.
+
+    Args:
+        workspace: folder of the survey.
+        folder: to write into.
+        executor: where tasks run.
+        reconstruct: settings.
+        index_sigma: of the water's index, where the calibration did not find it in the same water.
 
     Raises:
         WorkspaceError: a file of the mapping is missing or damaged.
@@ -145,7 +158,10 @@ def run_sparse(
     )  # fmt: skip
     left = sum(image.has_pose for image in known.model.images.values())
     mapping = mapping.model_copy(update={"registered": left, "notes": known.notes})
-    adjusted = adjust_survey(known, inputs.records, inputs.rig, mapping.distances, reconstruct)
+    rig = inputs.rig
+    if rig is not None and not reconstruct.refine_port:  # that finds the index from far off
+        rig = knowing_water(rig, index_sigma)
+    adjusted = adjust_survey(known, inputs.records, rig, mapping.distances, reconstruct)
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()
         for image in adjusted.mapped.model.images.values()
@@ -317,10 +333,11 @@ def find_place(task: Placing) -> Placed:
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
             datum = None
-            has_depth = any(math.isfinite(r.depth_m) for r in task.records)
-            vertical = str(task.survey.vertical_datum) if has_depth else _VERTICAL_OF_LEVEL
-        elif task.datum is not None:
-            vertical = str(task.survey.vertical_datum)
+        if local is not None or task.datum is not None:
+            if any(record.readings["depth"] for record in task.records):
+                vertical = str(task.survey.vertical_datum)
+            elif local is not None or not ties.used_points:
+                vertical = _VERTICAL_OF_LEVEL
         notes += [source] if datum is not None else [source, local or _LOCAL]
     else:
         found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
@@ -330,7 +347,12 @@ def find_place(task: Placing) -> Placed:
             factor, source = found[0], _scale_source(known, ties)
         place = replace(levelled, scale=factor, translation=factor * levelled.translation)
         scaled, vertical = known is not None or found is not None, _VERTICAL_OF_LEVEL
-        notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
+        turned = None if scaled else _turned(task, levelled)
+        if turned is not None:
+            place, note = turned
+            notes.append(f"unscaled; {note}")
+        else:
+            notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
         datum = None
     frame = WorldFrame(
         name="model" if datum is None else "ned",
@@ -373,7 +395,7 @@ def _fit(
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    if task.rig is None and any(math.isfinite(r.roll_deg) for r in task.records):
+    if task.rig is None and any(_is_turned(record) for record in task.records):
         warn(
             "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
             "import the pictures with --rig, whose body_from_rig says so"
@@ -415,16 +437,35 @@ def _fit(
     return fit, None
 
 
+def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | None:
+    """Where attitudes turn a model that has no scale, and a note; None where none is of use."""
+    nan = math.nan
+    records = [
+        replace(record, latitude_deg=nan, longitude_deg=nan, depth_m=nan) for record in task.records
+    ]
+    if task.rig is None or not any(_is_turned(record) for record in records):
+        return None
+    fit = fit_navigation(
+        records, task.pinholes, body_from_pinhole(task.rig, task.warps), None, levelled=levelled,
+        known_scale=1.0, installed=Installation.of(task.settings),
+    )  # fmt: skip
+    return None if fit is None else (fit.ned_from_model, _local_note(records, headed=True))
+
+
+def _is_turned(record: ImageRecord) -> bool:
+    return record.readings["roll and pitch"] or record.readings["heading"]
+
+
 def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
     """What of a place without positions is measured, and what is the model's own."""
     known = {name for record in records for name, known in record.readings.items() if known}
     axes = {
-        "levelled": bool(known & {"depth", "roll and pitch"}),
+        "level": bool(known & {"depth", "roll and pitch"}),
         "depth": "depth" in known,
         "heading": headed and "heading" in known,
     }
     measured = " and ".join(name for name, has in axes.items() if has)
-    own = " and ".join(["origin", *(name for name in ("depth", "heading") if not axes[name])])
+    own = " and ".join(["origin", *(name for name, has in axes.items() if not has)])
     return f"no latitude and longitude: {measured} by navigation, {own} the model's own; no CRS"
 
 

@@ -21,7 +21,7 @@ from alice_survey.base.config import (
 )
 from alice_survey.seafloor.board import PoolBoard, pool_poses
 from alice_survey.vehicle.navigation.sensors import CompassSpec, PressureSpec
-from camera_calib.freedom import USUAL_LENS, of_lenses, of_ports, pose_names
+from camera_calib.freedom import USUAL_LENS, knowing_water, of_lenses, of_ports, pose_names
 from camera_calib.rig import Covariance, Rig, design_rig
 from missions.fly.check import rig_of
 from reconstruct.adjustment.exact_observations import Pixels, RigState, exact_observations
@@ -47,9 +47,14 @@ _STRETCH = 0.002
 def expected_rig(
     workspace: Path, camera: CameraConfig, water: WaterConfig, imaging: ImagingConfig
 ) -> Rig:
-    """The rig of the workspace's calibration, else the designed one with a usual covariance."""
+    """The rig of the workspace's calibration, else the designed one with a usual covariance.
+
+    Its water's index is known as well as that of a reconstruction.
+    """
     rig = rig_of(workspace, camera, water)
-    return usual_rig(camera, water, imaging) if rig.covariance is None else rig
+    if rig.covariance is None:
+        rig = usual_rig(camera, water, imaging)
+    return knowing_water(rig, water.index_sigma)
 
 
 def usual_rig(camera: CameraConfig, water: WaterConfig, imaging: ImagingConfig) -> Rig:

@@ -145,7 +145,7 @@ def find_weak(
     if model.frame.datum is None:
         raise ReconstructionError(
             f"{sparse}: the model has no place in the world, so that no line can be planned over "
-            "it: give a navigation log (import-images --navigation) or control points"
+            "it: give navigation with positions (import-images --navigation) or control points"
         )
     shift_ne = plan.datum.ned_from_geodetic(model.frame.datum.geodetic_from_ned(np.zeros((1, 3))))
     records = read_manifest(images / "manifest.csv")

@@ -18,7 +18,7 @@ from alice_survey.base.config import (
     parse_health,
 )
 from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import n_water
+from alice_survey.base.seawater import n_water, n_water_sigma
 
 
 def fault(settings: dict[str, Any]) -> str:
@@ -108,8 +108,11 @@ def test_the_index_of_water_follows_from_temperature_salinity_and_depth() -> Non
             "x",
         )
         assert config.water.n_water == float(n_water(24.0, 35.0, depth_m, wavelength_nm))
+        assert config.water.index_sigma == n_water_sigma(24.0, 35.0, wavelength_nm)
         assert SurveyConfig.model_validate(config.model_dump(mode="json")) == config
     assert parse_config({}, "x").water.n_water == 1.34
+    assert parse_config({}, "x").water.index_sigma == n_water_sigma()
+    assert parse_config({"water": {"n_water_sigma": 1e-3}}, "x").water.index_sigma == 1e-3
 
 
 @pytest.mark.parametrize(

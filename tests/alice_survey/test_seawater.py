@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import n_water, pressure_dbar
+from alice_survey.base.seawater import GREEN_NM, n_water, n_water_sigma, pressure_dbar
 from tests.oracles_water import (
     fresh_density_kg_m3,
     n_air,
@@ -126,3 +126,18 @@ def test_arguments_broadcast() -> None:
 def test_absurd_water_is_refused(arguments: tuple[float, ...], named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         n_water(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("temperature_c", "salinity_psu"), [(20.0, 35.0), (4.0, 0.0), (30.0, 39.0)]
+)
+def test_the_sigma_of_an_index_is_that_of_water_known_to_a_degree_and_a_psu(
+    temperature_c: float, salinity_psu: float
+) -> None:
+    """Derivatives of Quan and Fry's formula, written out."""
+    t, s, nm = temperature_c, salinity_psu, GREEN_NM
+    by_t = (-1.05e-6 + 3.2e-8 * t) * s - 4.04e-6 * t - 0.00423 / nm
+    by_s = 1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2 + 0.01155 / nm
+    expected = math.hypot(by_t, by_s, 4e-5)
+    assert n_water_sigma(t, s) == pytest.approx(expected, rel=1e-6)
+    assert 1.8e-4 < expected < 2.4e-4

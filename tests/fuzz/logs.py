@@ -22,7 +22,7 @@ def read_any_log(path: Path) -> object:
     options = ImportOptions(lever_body_m=(0.1, 0.0, 0.2))
     dive = read_dive(log, options)
     lever = options.lever_body_m if dive.attitude is not None else (0.0, 0.0, 0.0)
-    return navigation_table(dive, ImportOptions(lever_body_m=lever), 0.0)
+    return navigation_table(dive, dive.row_times, ImportOptions(lever_body_m=lever), 0.0)
 
 
 def _bag(folder: Path, version: int, storage: str = "MCAP") -> None:

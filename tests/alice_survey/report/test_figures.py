@@ -29,6 +29,13 @@ def test_place_on_earth_is_the_rms_of_the_cameras_level_sigmas(figures: Figures)
     assert (figures.registered, figures.total, figures.stations) == (4, 4, 2)
 
 
+def test_a_model_without_positions_is_nowhere_on_earth(tmp_path: Path) -> None:
+    local = tiny_workspace(tmp_path, frame={"name": "model", "datum": None})
+    found = Figures(held=Held.of(local))
+    assert np.isfinite(found.camera_sigmas).all()
+    assert np.isnan(found.place_sigma_m)
+
+
 def test_an_empty_workspace_holds_nothing(tmp_path: Path) -> None:
     figures = Figures(held=Held.of(tmp_path))
     assert figures.surface is None

@@ -172,6 +172,32 @@ def test_a_log_without_altitude_uses_depth_and_sea_floor(
     assert capsys.readouterr().err == ""
 
 
+def test_a_log_without_depth_uses_altitude(
+    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, triggers, flown = dive
+    assert_alike(
+        record_of(edited(log, tmp_path / "a.csv", {"depth_m": ""}), triggers=triggers).stations,
+        flown,
+        place_m=1e-3,  # a degree is shorter at depth
+    )
+    assert capsys.readouterr().err == ""
+    blind = edited(log, tmp_path / "b.csv", {"depth_m": "", "altitude_m": ""})
+    assert "neither depth_m nor altitude_m" in refusal(blind, triggers=triggers)
+    half = edited(log, tmp_path / "c.csv", {"depth_m": "", "altitude_m": ""}, slice(0, 9))
+    record = record_of(half, triggers=triggers)
+    assert record.left_out == {"without a depth or an altitude": 9}
+
+
+def test_a_log_without_positions_does_not_say_what_a_dive_saw(
+    dive: tuple[Path, Path, Stations], tmp_path: Path
+) -> None:
+    bare = edited(dive[0], tmp_path / "bare.csv", {"longitude_deg": ""})
+    assert "no row with a latitude and a longitude" in refusal(bare)
+    (tmp_path / "depth.csv").write_text("time_s,depth_m\n0,5\n1,6\n")
+    assert "no row with a latitude and a longitude" in refusal(tmp_path / "depth.csv")
+
+
 def test_a_log_without_attitude_is_level_along_its_track(
     dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -223,9 +223,47 @@ def test_one_of_several_depth_sensors_must_be_chosen(tmp_path: Path) -> None:
         imported(tmp_path, log, topics=("depth=SONAR",))
 
 
-def test_a_log_without_positions_lists_its_messages(tmp_path: Path) -> None:
-    log = bin_log(tmp_path, (m for m in dive_messages() if m[0] in ("ATT", "RFND")))
-    with pytest.raises(NavigationError, match="ATT, RFND"):
+@pytest.mark.parametrize(
+    ("messages", "known"),
+    [
+        (("XKF1",), {"depth_m"}),
+        (("XKF1", "ATT"), {"depth_m", "roll_deg", "pitch_deg", "heading_deg"}),
+        (("ATT",), {"roll_deg", "pitch_deg", "heading_deg"}),
+        (("ATT", "RFND"), {"roll_deg", "pitch_deg", "heading_deg", "altitude_m"}),
+    ],
+)
+def test_a_vehicle_without_positions_logs_what_it_measures(
+    tmp_path: Path, messages: tuple[str, ...], known: set[str]
+) -> None:
+    """A BlueROV2 without GPS: the filter has a depth, but no origin to count north and east from.
+
+    Without an ATT, XKF1 would give attitudes too: its angles are left out of the log here.
+    """
+    kept = [
+        (*m[:3], *([math.nan] * 3 if "ATT" not in messages else m[3:6]), *m[6:])
+        if m[0] == "XKF1"
+        else m
+        for m in dive_messages()
+        if m[0] in messages
+    ]
+    log = tmp_path / "dive.log"
+    log.write_text(dataflash_text(kept))
+    data = imported(tmp_path, log)
+    assert {name for name, count in data["filled"].items() if count} == known
+    read = read_navigation(tmp_path / "n.csv", UTC, ())
+    if "depth_m" in known:
+        np.testing.assert_allclose(read.columns["depth_m"], 9.0)
+    if "heading_deg" in known:
+        at = read.at(np.array([BOOT_US * 1e-6 + 1.5]))
+        assert at["heading_deg"][0] == pytest.approx(359.5, abs=0.02)
+
+
+def test_a_log_without_readings_lists_its_messages(tmp_path: Path) -> None:
+    log = bin_log(tmp_path, (m for m in dive_messages() if m[0] in ("RCOU", "IMU")))
+    with pytest.raises(NavigationError, match="IMU, RCOU"):
+        imported(tmp_path, log)
+    log = bin_log(tmp_path, (m for m in dive_messages() if m[0] == "RFND"))
+    with pytest.raises(NavigationError, match="RFND are of use with an attitude only"):
         imported(tmp_path, log)
 
 
@@ -316,16 +354,19 @@ def test_telemetry_of_other_systems_and_damage_are_counted(tmp_path: Path) -> No
 
 def test_telemetry_without_a_position(tmp_path: Path) -> None:
     log = tmp_path / "dive.tlog"
-    log.write_bytes(tlog(r for r in telemetry() if r[1].msgname in ("HEARTBEAT", "ATTITUDE")))
-    with pytest.raises(NavigationError, match="ATTITUDE, HEARTBEAT"):
+    log.write_bytes(tlog(r for r in telemetry() if r[1].msgname == "HEARTBEAT"))
+    with pytest.raises(NavigationError, match="it has HEARTBEAT"):
         imported(tmp_path, log)
+    log.write_bytes(tlog(r for r in telemetry() if r[1].msgname in ("HEARTBEAT", "ATTITUDE")))
+    assert imported(tmp_path, log)["sources"] == {"attitude": "ATTITUDE"}
     zero = [
         (t, mavlink.MAVLink_global_position_int_message(i, 0, 0, 0, -1000, 0, 0, 0, 0))
         for i, (t, _) in enumerate(telemetry(3))
     ]
     log.write_bytes(tlog(zero))
-    with pytest.raises(NavigationError, match="0, 0"):
-        imported(tmp_path, log)
+    data = imported(tmp_path, log)
+    assert data["left_out"] == {"GLOBAL_POSITION_INT: the position is 0, 0: no fix": len(zero)}
+    np.testing.assert_allclose(numbers(tmp_path / "n.csv", "depth_m"), 1.0)
 
 
 QGC_HEADER = (
@@ -358,11 +399,21 @@ def test_a_csv_of_qgroundcontrol(tmp_path: Path) -> None:
     assert math.isnan(read.columns["altitude_m"][2])
 
 
+def test_a_csv_of_qgroundcontrol_without_gps(tmp_path: Path) -> None:
+    log = tmp_path / "dive.csv"
+    log.write_text(
+        "Timestamp,altitudeRelative\n2024-05-01 14:00:00,-3.0\n2024-05-01 14:00:01,-3.5\n"
+    )
+    assert imported(tmp_path, log)["sources"] == {"depth": "altitudeRelative"}
+    np.testing.assert_allclose(numbers(tmp_path / "n.csv", "depth_m")[:, 0], [3.0, 3.5])
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
         ("a.txt", "hello"),
         ("nav.csv", "time_s,latitude_deg,longitude_deg,depth_m\n"),
+        ("diver.csv", "time_utc,depth_m\n"),
         ("empty.csv", ""),
         ("dive.BIN", ""),
         ("a.tlog", "not a log at all, but long enough to be looked at"),
@@ -398,9 +449,9 @@ def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -
             assert "\n" not in str(error)
             outcomes.append(0)
         else:
-            read = read_navigation(tmp_path / "n.csv", UTC)
+            read = read_navigation(tmp_path / "n.csv", UTC, ())
             assert len(read.time_s) == report["rows"]
-            assert report["rows"] <= 20
+            assert report["rows"] <= 21  # of ATT, where all else is lost
             outcomes.append(report["rows"])
     # Damage is local: most of the rows of most logs are still there.
     assert np.median(outcomes) >= 15

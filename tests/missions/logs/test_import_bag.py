@@ -196,18 +196,22 @@ def plain_bag() -> Bag:
 def test_plain_sensors_are_brought_together(tmp_path: Path) -> None:
     data = imported(plain_bag(), tmp_path)
 
-    # The last fix says that it is none.
-    assert data["rows"] == 20
+    # The last fix says that it is none; ten depths come after the one before.
+    assert data["rows"] == 30
     assert data["left_out"] == {"/gps/fix: the position is not a number": 1}
-    depth = numbers(tmp_path / "n.csv", "depth_m")[:, 0]
+    assert data["filled"]["latitude_deg"] == 20
+    read = read_navigation(tmp_path / "n.csv", UTC, ())
+    np.testing.assert_allclose(read.time_s[20:], 19.1 + 0.1 * np.arange(10), atol=1e-6)
+    np.testing.assert_allclose(read.columns["depth_m"][20:], 3.91 + 0.01 * np.arange(10), atol=1e-4)
+    depth = numbers(tmp_path / "n.csv", "depth_m")[:20, 0]
     np.testing.assert_allclose(depth, 2.0 + 0.1 * np.arange(20), atol=1e-4)
     angles = numbers(tmp_path / "n.csv", "roll_deg", "pitch_deg", "heading_deg")
-    np.testing.assert_allclose(angles, [[30, -10, np.rad2deg(0.5)]] * 20, atol=1e-5)
+    np.testing.assert_allclose(angles, [[30, -10, np.rad2deg(0.5)]] * 30, atol=1e-5)
     altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
     expected = 4.0 * np.cos(np.deg2rad(30)) * np.cos(np.deg2rad(10))
     np.testing.assert_allclose(altitude, expected, atol=1e-5)
     # Variances 4 and 16: their mean is 10.
-    sigma = numbers(tmp_path / "n.csv", "sigma_horizontal_m")[:, 0]
+    sigma = numbers(tmp_path / "n.csv", "sigma_horizontal_m")[:20, 0]
     np.testing.assert_allclose(sigma, np.sqrt(10.0), atol=1e-6)
 
 
@@ -241,12 +245,22 @@ def test_gaps_wild_times_and_missing_values_are_reported(
 
 
 def test_values_are_not_carried_across_gaps(tmp_path: Path) -> None:
-    """Pressure stops for 8 s: the positions there have no depth, and are left out by number."""
-    bag = plain_bag()
-    bag.rows = [row for row in bag.rows if row[1] != "/pressure" or not 5e9 < row[0] - START < 13e9]
-    data = imported(bag, tmp_path)
-    assert data["left_out"]["positions without a depth"] == 7
-    assert data["rows"] == 13
+    """Pressure stops for 8 s: positions stay. Fixes stop for 8 s: depths stay."""
+    whole = plain_bag()
+    lost = np.array([6.5, 7.0, 11.0])
+    for topic, gone, left in (
+        ("/pressure", "depth_m", "latitude_deg"),
+        ("/gps/fix", "latitude_deg", "depth_m"),
+    ):
+        bag = Bag(2)
+        bag.rows = [row for row in whole.rows if row[1] != topic or not 5e9 < row[0] - START < 13e9]
+        import_log(bag.write(tmp_path / gone), tmp_path / "n.csv")
+        read = read_navigation(tmp_path / "n.csv", UTC, ())
+        at = read.at(np.append(lost, 3.5))
+        expected = {"latitude_deg": 41.0 + 1e-6 * lost, "depth_m": 2.0 + 0.1 * lost}
+        np.testing.assert_allclose(at[left][:3], expected[left], atol=1e-4, rtol=0)
+        assert np.all(np.isnan(at[gone][:3]))
+        assert np.isfinite(at[gone][3])
 
 
 def test_several_candidates_need_a_choice(tmp_path: Path) -> None:
@@ -271,7 +285,7 @@ def test_several_candidates_need_a_choice(tmp_path: Path) -> None:
 def test_a_bag_without_positions_lists_its_topics(tmp_path: Path) -> None:
     bag = Bag(2)
     bag.add_range(START, "/sonar", 3.0)
-    with pytest.raises(NavigationError, match="/sonar"):
+    with pytest.raises(NavigationError, match="/sonar are of use with an attitude only"):
         imported(bag, tmp_path)
 
 

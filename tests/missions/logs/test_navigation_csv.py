@@ -137,3 +137,22 @@ def test_any_one_reading_is_enough_where_none_is_needed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.columns["heading_deg"], [np.nan, 90.0, np.nan])
     with pytest.raises(NavigationError, match="none of the columns latitude_deg"):
         read_navigation(log_file(tmp_path, "0,1", header="time_s,sigma_depth_m"), UTC, ())
+
+
+def test_each_reading_has_gaps_of_its_own(tmp_path: Path) -> None:
+    """Depths every second; fixes every 8 s, then none for two minutes."""
+    fixes = {8 * k: 60.0 + 0.08 * k for k in (*range(12), *range(27, 33))}
+    rows = [f"{t},{fixes.get(t, '')},{5 if t in fixes else ''},{0.1 * t}" for t in range(260)]
+    header = "time_s,latitude_deg,longitude_deg,depth_m"
+    found = read_navigation(log_file(tmp_path, *rows, header=header), UTC, ()).at(
+        np.array([12.5, 150.0, 220.0])
+    )
+    np.testing.assert_allclose(found["latitude_deg"], [60.125, np.nan, 62.2])
+    np.testing.assert_allclose(found["depth_m"], [1.25, 15.0, 22.0])
+
+
+def test_fixes_at_both_ends_of_a_dive_give_no_position_between(tmp_path: Path) -> None:
+    rows = [f"{t},{60 if t in (0, 600) else ''},{5 if t in (0, 600) else ''},4" for t in range(601)]
+    header = "time_s,latitude_deg,longitude_deg,depth_m"
+    log = read_navigation(log_file(tmp_path, *rows, header=header), UTC, ())
+    assert np.isnan(log.at(np.array([300.0]))["latitude_deg"][0])

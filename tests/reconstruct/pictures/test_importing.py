@@ -341,6 +341,78 @@ def test_the_level_of_logged_depths_is_stated(
     assert [r.depth_m for r in records] == pytest.approx([10.0, 11.0])
 
 
+PART_LOGS = {
+    "depth": ("depth_m", "depth"),
+    "depth and heading": ("depth_m,heading_deg", "depth", "heading"),
+    "altitude": ("altitude_m", "altitude"),
+    "heading": ("heading_deg", "heading"),
+}
+
+
+@pytest.mark.parametrize("log", PART_LOGS)
+def test_a_log_of_any_one_reading_is_taken(
+    tmp_path: Path, several: Several, log: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns, *readings = PART_LOGS[log]
+    source = several(3, dated=True)
+    rows = [[f"2024-07-01T12:00:{s:02d}Z", *[10 + s] * len(readings)] for s in range(9)]
+    nav = navigation(tmp_path / "nav.csv", rows, f"time_utc,{columns}")
+    done = import_images(tmp_path / "w", [source], navigation=nav)
+    assert dict(done.readings) == dict.fromkeys(readings, 3)
+    assert all(f"3 with {name}" in str(done) for name in readings)
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    for name in columns.split(","):
+        assert [getattr(r, name) for r in records] == pytest.approx([10.0, 11.0, 12.0])
+    assert read_json(tmp_path / "w" / "images" / "survey.json")["datum"] is None
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_pictures_in_a_gap_of_positions_keep_their_depth(tmp_path: Path, draw: Draw) -> None:
+    for minute in range(4):
+        draw(tmp_path / "in" / f"{minute}.jpg", minute, time=f"2024:07:01 12:0{minute}:30")
+    rows = [
+        [f"2024-07-01T12:{s // 60:02d}:{s % 60:02d}Z",
+         *([60 + 1e-5 * s, 5.0] if s < 60 or s >= 180 else ["", ""]), 0.1 * s]
+        for s in range(240)
+    ]  # fmt: skip
+    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
+    done = import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav)
+    assert (done.positions, done.readings["depth"]) == (2, 4)
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert [r.has_horizontal for r in records] == [True, False, False, True]
+    assert [r.depth_m for r in records] == pytest.approx([3.0, 9.0, 15.0, 21.0])
+
+
+def test_depths_in_the_air_are_warned_of(
+    tmp_path: Path, several: Several, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = several(3, dated=True)
+    rows = [[f"2024-07-01T12:00:{s:02d}Z", -12 - s] for s in range(9)]
+    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,depth_m")
+    import_images(tmp_path / "w", [source], navigation=nav)
+    assert "above the sea surface, by 13.0 m: depth_m is positive down" in capsys.readouterr().err
+    import_images(tmp_path / "v", [source], navigation=nav, vertical_datum="lake")
+    assert "sea surface" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("rows", "named"),
+    [
+        ([[f"2024-07-01T12:00:{s:02d}Z", ""] for s in range(9)], "no row with a time"),
+        ([["2024-07-01T12:00:07Z", 10 + s] for s in range(9)], "log at 0.0 to 0.0 s"),
+        ([[f"2024-07-01T11:00:{s:02d}Z", 10] for s in range(9)], "--clock-offset"),
+    ],
+)
+def test_a_depth_log_of_no_use_is_one_line(
+    tmp_path: Path, several: Several, rows: list[list[Any]], named: str
+) -> None:
+    source = several(2, dated=True)
+    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,depth_m")
+    with pytest.raises(AliceError, match=named) as caught:
+        import_images(tmp_path / "w", [source], navigation=nav)
+    assert "\n" not in str(caught.value)
+
+
 def test_masks_come_along(tmp_path: Path, several: Several) -> None:
     several(3, suffix=".png")
     near, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)

@@ -25,10 +25,24 @@ RIG = design_rig(CameraConfig(), WaterConfig())
 PLAN = plan_of(area_of(shapely.box(0, 0, 4, 3)), lawnmower(4.0, 3.0, 1.0, 0.46))
 
 
-def dive(folder: Path, stations: int, *, level: str = "sea surface", plan: Plan = PLAN) -> Path:
+def dive(
+    folder: Path,
+    stations: int,
+    *,
+    level: str = "sea surface",
+    plan: Plan = PLAN,
+    depth_m: float = 5.0,
+    placed: bool = True,
+) -> Path:
     """A workspace with pictures, each of bytes of its own, a rig and a plan."""
     records = [
-        ImageRecord(image=f"{camera}/{s}.png", camera=camera, station=s, time_s=10.0 + 2 * s)
+        ImageRecord(
+            image=f"{camera}/{s}.png",
+            camera=camera,
+            station=s,
+            time_s=10.0 + 2 * s,
+            depth_m=depth_m,
+        )
         for s in range(stations)
         for camera in ("left", "right")
     ]
@@ -39,7 +53,7 @@ def dive(folder: Path, stations: int, *, level: str = "sea surface", plan: Plan 
             (part / record.image).write_text(f"{folder.name} {record.image}")
         write_manifest(part / "manifest.csv", records)
         write_rig(part / "rig.json", RIG)
-        place = PlaceRecord(latitude_deg=32.8, longitude_deg=34.9)
+        place = PlaceRecord(latitude_deg=32.8, longitude_deg=34.9) if placed else None
         PicturesRecord(source="imported", datum=place, vertical_datum=level).write(
             part / "survey.json"
         )
@@ -95,6 +109,19 @@ def test_the_plan_of_both_dives_holds_all_lines(tmp_path: Path) -> None:
     assert min(flown - {-1}) == count
     stations = stations_of_plan(replace(PLAN, lines=PLAN.lines))
     assert (assign_lines(stations, whole) == stations.line).all()
+
+
+def test_the_level_of_depths_is_that_of_the_dives_that_have_some(tmp_path: Path) -> None:
+    nan = float("nan")
+    flat = dive(tmp_path / "flat", 2, level="none", depth_m=nan)
+    deep = dive(tmp_path / "deep", 2, level="NN2000", placed=False)
+    join_dives(tmp_path / "both", [flat, deep])
+    joined = PicturesRecord.read(tmp_path / "both" / "images" / "survey.json")
+    assert joined.vertical_datum == "NN2000"
+    assert joined.datum is not None
+    surface = dive(tmp_path / "surface", 2)
+    with pytest.raises(ImageError, match="--vertical-datum"):
+        join_dives(tmp_path / "other", [deep, surface])
 
 
 def test_dives_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -1,15 +1,23 @@
 """Navigation without positions: what depths, headings and attitudes give on their own."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.records import MappingRecord, PicturesRecord
+from camera_calib.freedom import part_of_rig
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
+from reconstruct.placing.run import Placed, Placing, find_place
+from reconstruct.views.model_files import as_transform
 from tests.reconstruct.placing.test_georeference import (
     exact,
     gauge,
@@ -17,6 +25,7 @@ from tests.reconstruct.placing.test_georeference import (
     points_in_model,
 )
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.true_models import near_truth, warped_scene
 
 NAN = float("nan")
 DOWN = np.array([0.0, 0.0, 1.0])
@@ -61,6 +70,9 @@ def test_exact_depths_alone_level_a_rigs_model_and_give_its_depth() -> None:
     np.testing.assert_array_equal(found.sigma_position_m[:2], 0.0)
     assert found.sigma_heading_deg == 0.0
     assert 0.0 < found.sigma_position_m[2] < 1.0
+    said = found.to_json()
+    assert [said[f"sigma_{name}"] for name in ("north_m", "east_m", "heading_deg")] == [None] * 3
+    assert said["sigma_depth_m"] == found.sigma_position_m[2]
 
 
 @pytest.mark.parametrize("sigma_m", [0.001])
@@ -76,6 +88,23 @@ def test_headings_and_depths_turn_a_model_to_north(sigma_m: float) -> None:
     assert found.sigma_heading_deg > 0
 
 
+def test_headings_alone_leave_the_level_of_the_sea_floor() -> None:
+    scene, truth = make_scene(points=400), gauge(8, 1.0)
+    start = level(
+        points_in_model(scene.points_ned, truth),
+        np.stack([in_model(pose, truth).translation for pose in scene.ned_from_cam]),
+    )
+    found = local_fit(scene, with_only(scene.records, "heading_deg"), truth, known=True)
+    assert found is not None
+    lean = (found.ned_from_model.rotation * start.rotation.inv()).apply(DOWN)
+    assert lean[2] == pytest.approx(1.0, abs=1e-9)
+    turn = (found.ned_from_model.rotation * truth.rotation.inv()).as_euler("ZYX", degrees=True)[0]
+    assert 1e-6 < abs(turn) < 0.3
+    said = found.to_json()
+    assert said["sigma_tilt_deg"] is None
+    assert 0.1 < said["sigma_heading_deg"] < 1.1
+
+
 def test_roll_and_pitch_alone_level_a_model() -> None:
     scene, truth = make_scene(points=400), gauge(6, 1.0)
     found = local_fit(
@@ -83,6 +112,69 @@ def test_roll_and_pitch_alone_level_a_model() -> None:
     )
     assert found is not None
     assert tilt_deg(found.ned_from_model, truth) < 0.01
+
+
+def placed_by_one_camera(
+    workspace: Path, truth: Similarity, readings: tuple[str, ...], datum: Datum | None
+) -> Placed:
+    """A model of the left camera's pictures, in a gauge, with some of the readings."""
+    whole = make_scene(points=400)
+    mono = [i for i, r in enumerate(whole.records) if r.camera == "left"]
+    scene = replace(
+        whole,
+        rig=part_of_rig(whole.rig, ["left"]),
+        **{name: [getattr(whole, name)[i] for i in mono]
+           for name in ("records", "ned_from_cam", "pixels", "ids")},
+    )  # fmt: skip
+    seen, warps = warped_scene(scene)
+    model = near_truth(scene, seen, warps, np.random.default_rng(1), (0.0, 0.0)).model
+    back = truth.rotation.inv()
+    model.transform(pycolmap.Sim3d(
+        1 / truth.scale, pycolmap.Rotation3d(back.as_quat()),
+        -back.apply(truth.translation) / truth.scale,
+    ))  # fmt: skip
+    pinholes = [as_transform(image.cam_from_world()).inv()
+                for _, image in sorted(model.images.items())]  # fmt: skip
+    return find_place(
+        Placing(
+            workspace=workspace, model=model, records=with_only(scene.records, *readings),
+            pinholes=pinholes, warps=warps, rig=scene.rig, datum=datum, mapping=MappingRecord(),
+            survey=PicturesRecord(source="imported", vertical_datum="the sea"),
+            settings=ReconstructConfig(), shape=None,
+        )
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("readings", "level"),
+    [(("latitude_deg", "longitude_deg"), "mean plane of the sea floor in the pictures"),
+     (("latitude_deg", "longitude_deg", "depth_m"), "the sea")],
+)  # fmt: skip
+def test_heights_count_from_depths_only_where_there_are_depths(
+    tmp_path: Path, readings: tuple[str, ...], level: str
+) -> None:
+    placed = placed_by_one_camera(tmp_path, gauge(9, 0.3), readings, DATUM)
+    assert (placed.frame.name, placed.frame.datum) == ("ned", DATUM)
+    assert placed.frame.vertical_datum == level
+
+
+@pytest.mark.parametrize(
+    ("readings", "lean_deg", "turn_deg"),
+    [(("heading_deg",), 5.0, 0.5), (("roll_deg", "pitch_deg", "heading_deg"), 0.2, 0.2)],
+)
+def test_attitudes_turn_a_model_of_one_camera_without_a_scale(
+    tmp_path: Path, readings: tuple[str, ...], lean_deg: float, turn_deg: float
+) -> None:
+    truth = gauge(8, 0.3)
+    placed = placed_by_one_camera(tmp_path, truth, readings, None)
+    assert not placed.frame.scaled and placed.frame.datum is None and placed.fit is None
+    assert placed.world_from_model.scale == 1.0
+    off = placed.world_from_model.rotation * truth.rotation.inv()
+    down = off.apply(DOWN)
+    assert np.rad2deg(np.arccos(down[2])) < lean_deg
+    assert abs(off.as_euler("ZYX", degrees=True)[0]) < turn_deg
+    assert placed.frame.notes[-1].startswith("unscaled; no latitude and longitude: ")
+    assert "heading by navigation" in placed.frame.notes[-1]
 
 
 def test_depths_of_a_track_without_relief_give_no_scale(
@@ -95,7 +187,7 @@ def test_depths_of_a_track_without_relief_give_no_scale(
 
 
 @pytest.mark.parametrize("reading", ["depths", "positions"])
-def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
+def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> None:
     """Of a track whose depth varies by 0.4 m, over 24 seeds of white errors."""
     scene, sigma_m = make_scene(points=400), 0.01
     rng = np.random.default_rng(11)
@@ -108,7 +200,7 @@ def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
             for r, p in zip(scene.records, scene.ned_from_cam, strict=True)
         ],
     )
-    errors = []
+    errors, leans = [], []
     for seed in range(24):
         rng, truth = np.random.default_rng(seed), gauge(seed, 0.3)
         off = {s: sigma_m * rng.standard_normal(3) for s in stations}
@@ -134,4 +226,7 @@ def test_the_scale_of_one_camera_lies_within_its_sigma(reading: str) -> None:
         )  # fmt: skip
         assert found is not None
         errors.append(np.log(found.ned_from_model.scale / truth.scale) / found.sigma_scale)
+        lean = (found.ned_from_model.rotation * truth.rotation.inv()).as_rotvec(degrees=True)[:2]
+        leans.append(lean / found.sigma_tilt_deg)
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
+    assert 0.6 < np.sqrt(np.mean(np.square(leans))) < 1.4

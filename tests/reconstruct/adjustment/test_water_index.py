@@ -1,0 +1,141 @@
+"""What not knowing the index of the water does to ranges and scale."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.frames import Array
+from alice_survey.base.records import RangeRecord
+from camera_calib.freedom import knowing_water
+from camera_calib.rig import Covariance, Rig
+from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
+from reconstruct.adjustment.survey_fit import calibrated_covariance, fit_survey
+from reconstruct.mapping.refraction import refract
+from reconstruct.placing.alignment import align_similarity
+from tests.reconstruct.scenes import Scene, make_scene
+from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+
+DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
+POSES = {"right.rx_rad": 2e-5, "right.ry_rad": 2e-5, "right.rz_rad": 2e-5,
+         "right.x_m": 2e-6, "right.y_m": 2e-6, "right.z_m": 2e-6}  # fmt: skip
+SIGMA = 1e-3
+WATER = ("left.n_water", "right.n_water")
+
+
+def adjusted(scene: Scene, believed: Rig, folder: Path) -> AdjustedSurvey:
+    """The survey as adjusted by who believes in a rig."""
+    seen, warps = warped_scene(replace(scene, rig=believed))
+    start = near_truth(replace(scene, rig=believed), seen, warps, np.random.default_rng(1))
+    mapped, _ = refract(start, seen, folder)
+    return adjust_survey(mapped, scene.records, believed, DISTANCES, ReconstructConfig())
+
+
+def with_poses(rig: Rig) -> Rig:
+    matrix = np.diag(np.array(list(POSES.values())) ** 2)
+    return replace(rig, covariance=Covariance(parameters=tuple(POSES), matrix=matrix))
+
+
+def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) -> None:
+    """With h the sideways way in water, `z - d - g = h / tan(c)` and `sin(a) = n sin(c)`.
+
+    Pixels hold a, so that `dz/dn = (z - d - g) / (n cos^2 c)`: what lies amid two parallel cameras
+    moves along their axes alone.
+    """
+    scene = make_scene(lines=1, stations=1, points=60_000, relief_m=0.3)
+    scene = replace(
+        scene, pixels=[p + np.random.default_rng(i).normal(0, 0.05, p.shape)
+                       for i, p in enumerate(scene.pixels)]
+    )  # fmt: skip
+    rig = knowing_water(scene.rig, SIGMA)
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
+    mapped, _ = refract(start, seen, tmp_path)
+    moved = fit_survey(mapped, seen, rig, port=False, pose=False).calibration
+    assert moved is not None
+    ned_from_cam = scene.ned_from_cam[0]
+    places = ned_from_cam.inv().apply(moved.places)
+    ways = ned_from_cam.rotation.inv().apply(moved.points.sum(axis=2))
+    half_m = 0.5 * scene.rig.baseline_m
+    amid = np.abs(places[:, 0] - half_m) < 0.005
+    assert amid.sum() > 50
+    port = scene.rig.cameras["left"].port
+    d, g, n = port.port_distance_m, port.glass_thickness_m, port.n_water
+    _, y, z = places[amid].T
+    in_water = z - d - g
+    # The ways in air and glass are 3 % of all: c as if all were water is right to a thousandth.
+    cos_sq = z**2 / (half_m**2 + y**2 + z**2)
+    np.testing.assert_allclose(ways[amid, 2], in_water / (n * cos_sq), rtol=0.005)
+    spread = np.sqrt(np.diag(moved.of_points(moved.places[amid][:1])[0]))
+    along = np.abs(ned_from_cam.rotation.inv().apply(spread))[2]
+    assert along == pytest.approx(SIGMA * in_water[0] / (n * cos_sq[0]), rel=0.02)
+
+
+def test_an_index_that_was_calibrated_in_the_same_water_counts_as_calibrated(
+    tmp_path: Path,
+) -> None:
+    """With its correlations; one of a setting counts next to what is calibrated."""
+    scene = make_scene(lines=2, stations=5, points=600, noise_px=0.05, scale=2)
+    names = (*POSES, "left.fx_px", *WATER)
+    sigma = np.array([*POSES.values(), 0.5, SIGMA, SIGMA])
+    correlation = np.eye(len(names))
+    correlation[-3:, -3:] = [[1, -0.9, -0.9], [-0.9, 1, 0.9999], [-0.9, 0.9999, 1]]
+    matrix = correlation * np.outer(sigma, sigma)
+    whole = replace(scene.rig, covariance=Covariance(parameters=names, matrix=matrix))
+    assert knowing_water(whole, 5e-4) is whole
+    exact = adjusted(scene, whole, tmp_path).exact
+    assert exact is not None
+    assert exact.fit.parameters == names
+    prior = exact.fit.prior_sigmas[-2:]  # the keypoints' bias widens the focal length's alone
+    np.testing.assert_allclose(prior, SIGMA, rtol=1e-6)
+    added = calibrated_covariance(whole, names) - matrix
+    bias = np.zeros(len(names), dtype=bool)
+    bias[names.index("left.fx_px")] = True
+    np.testing.assert_allclose(added[~np.outer(bias, bias)], 0.0, atol=1e-20)
+
+    carried = whole.in_water(1.3412)
+    assert not set(WATER) & set(carried.sigmas)
+    other = knowing_water(carried, 5e-4)
+    assert [other.sigmas[name] for name in WATER] == [5e-4] * 2
+    assert other.covariance is not None
+    np.testing.assert_array_equal(other.covariance.matrix[:-2, :-2], matrix[:-2, :-2])
+    np.testing.assert_array_equal(other.covariance.matrix[:-2, -2:], 0.0)
+    assert other.covariance.correlation[-1, -2] == pytest.approx(1.0, abs=1e-6)
+    assert knowing_water(carried, 0.0) is carried
+    dry = replace(carried, cameras={n: c.in_air() for n, c in carried.cameras.items()})
+    assert knowing_water(dry, 5e-4) is dry
+
+
+def scale_error_and_sigma(found: AdjustedSurvey, scene: Scene) -> tuple[float, float]:
+    """Of the stations' scale, relative."""
+    assert found.shape is not None
+    pupils, true, _, _ = pupils_and_points(found.mapped, scene)
+    error = 1.0 / align_similarity(pupils, true).scale - 1.0
+    stations = centres_of(found)
+    arms = stations - stations.mean(axis=0)
+    weights = arms / (arms**2).sum()
+    by_mode = np.einsum("fi,fik->k", weights, found.shape.modes.stations[:, 3:])
+    return error, float(np.linalg.norm(by_mode))
+
+
+def centres_of(found: AdjustedSurvey) -> Array:
+    assert found.exact is not None
+    return found.exact.fit.state.centres
+
+
+def test_scales_lie_within_their_sigmas_where_the_index_is_drawn(tmp_path: Path) -> None:
+    drawn, counted, ignored = np.random.default_rng(4).normal(0, SIGMA, 12), [], []
+    for seed, off in enumerate(drawn):
+        truth = make_scene(lines=2, stations=5, points=600, noise_px=0.05, scale=2, seed=seed)
+        believed = with_poses(truth.rig)
+        scene = make_scene(
+            lines=2, stations=5, points=600, noise_px=0.05, scale=2, seed=seed,
+            rig=truth.rig.in_water(truth.rig.cameras["left"].n_water + off),
+        )  # fmt: skip
+        for rig, ratios in ((knowing_water(believed, SIGMA), counted), (believed, ignored)):
+            error, sigma = scale_error_and_sigma(adjusted(scene, rig, tmp_path), scene)
+            ratios.append(error / sigma)
+    assert 0.7 < np.sqrt(np.mean(np.square(counted))) < 1.4
+    assert np.sqrt(np.mean(np.square(ignored))) > 1.5
