@@ -358,6 +358,8 @@ def _placing_summary(folder: Path) -> Summary:
         f"{found.registered} of {found.total} pictures registered, "
         f"{found.mean_reprojection_px:.2f} px; {found.scale_source}"
     )
+    if found.georeference is not None and found.georeference.mount is not None:
+        text += f"; {found.georeference.mount.words}"
     return text, found.to_json()
 
 
@@ -619,7 +621,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="sparse",
         command="reconstruct",
         about="the model placed in the world",
-        version=8,
+        version=9,
         work="reconstruct.placing.run:run_sparse",
         takes=("reconstruct",),
         needs=("image", "mapping"),

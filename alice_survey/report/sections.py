@@ -297,6 +297,8 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
         ]
         rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
         rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+        if place.mount is not None:
+            rows.append(("mount of the rig", place.mount.words))
     notes = figures.held.frame.notes
     drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
     return Section(

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array, pose_to_json
+from camera_calib.mount import nearest_mount
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import Bend
 from reconstruct.placing.generalised_fit import Correlation
@@ -30,9 +31,21 @@ class FoundMount:
     lever_sigma_m: Array
     """(3,) forward, right, down."""
 
+    @property
+    def words(self) -> str:
+        """What was found, with its sigmas."""
+        arm = zip(self.body_from_rig.translation, self.lever_sigma_m, strict=True)
+        forward, right, down = (f"{value:+.2f} (sigma {sigma:.2g})" for value, sigma in arm)
+        return (
+            f"mount found: {nearest_mount(self.body_from_rig.rotation)}, sigma "
+            f"{self.turn_sigma_deg.max():.2g} deg; pupil {forward} m forward, {right} m right, "
+            f"{down} m down"
+        )
+
     def to_json(self) -> dict[str, Any]:
         """What `georeference.json` says."""
         return {
+            "words": self.words,
             "body_from_rig": pose_to_json(self.body_from_rig),
             "turn_sigma_deg": self.turn_sigma_deg.tolist(),
             "lever_sigma_m": self.lever_sigma_m.tolist(),
