@@ -364,6 +364,8 @@ def _placing_summary(folder: Path) -> Summary:
             f"{math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m):.2g} m"
             for joint in found.joints
         )
+    if found.georeference is not None and found.georeference.mount is not None:
+        text += f"; {found.georeference.mount.words}"
     return text, found.to_json()
 
 

@@ -146,7 +146,7 @@ def true_rig() -> Rig:
     return Rig(
         cameras={"camera": camera},
         cam_from_rig={"camera": RigidTransform.identity()},
-        body_from_rig=RigidTransform.identity(),
+        body_from_rig=None,
         source="synthetic",
     )
 

@@ -169,7 +169,7 @@ def part_of_rig(rig: Rig, names: Sequence[str]) -> Rig:
         rig,
         cameras={name: rig.cameras[name] for name in names},
         cam_from_rig={name: rig.cam_from_rig[name] * first.inv() for name in names},
-        body_from_rig=rig.body_from_cam(names[0]),
+        body_from_rig=None if rig.body_from_rig is None else rig.body_from_cam(names[0]),
     )
     if rig.covariance is None:
         return part

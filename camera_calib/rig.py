@@ -20,8 +20,6 @@ from camera_calib.optics import LENSES, PORTS
 _FORMAT = {"format": "alice-survey rig", "version": 2}
 _NORM_TOLERANCE = 1e-3
 """Tolerance of the length of a quaternion in a file that was typed or rounded."""
-UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
-"""Pose on the vehicle of rigs of which none is known: at the body's origin, looking down."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,8 +85,8 @@ class Rig:
 
     cameras: Mapping[str, Camera]
     cam_from_rig: Mapping[str, RigidTransform]
-    body_from_rig: RigidTransform
-    """Pose of the reference camera's entrance pupil on the vehicle (the lever arm)."""
+    body_from_rig: RigidTransform | None
+    """Pose of the reference camera's entrance pupil on the vehicle (the mount); None: unknown."""
     source: str
     """Where the numbers come from, in words; it is printed with every result."""
     covariance: Covariance | None = None
@@ -118,7 +116,16 @@ class Rig:
         return float(((second - self.cam_from_rig[names[0]].inv().translation) ** 2).sum() ** 0.5)
 
     def body_from_cam(self, camera: str) -> RigidTransform:
-        """Pose of a camera on the vehicle."""
+        """Pose of a camera on the vehicle.
+
+        Raises:
+            CalibrationError: it is not known.
+        """
+        if self.body_from_rig is None:
+            raise CalibrationError(
+                f"{self.source}: how the rig is mounted on the vehicle is unknown: state it with "
+                "'alice-survey camera mount RIG nadir-bow-up --lever 0.55 -0.05 0.08 -o RIG'"
+            )
         return self.body_from_rig * self.cam_from_rig[camera].inv()
 
     def in_water(self, n_water: float) -> "Rig":
@@ -130,6 +137,11 @@ class Rig:
         cameras = {name: camera.in_water(n_water) for name, camera in self.cameras.items()}
         covariance = None if self.covariance is None else self.covariance.without("n_water")
         return replace(self, cameras=cameras, covariance=covariance)
+
+
+def mounted(rig: Rig | None) -> Rig | None:
+    """The rig where its place on the vehicle is known, else None."""
+    return None if rig is None or rig.body_from_rig is None else rig
 
 
 def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
@@ -191,7 +203,7 @@ def write_rig(path: str | Path, rig: Rig) -> None:
         **_FORMAT,
         "source": rig.source,
         "cameras": cameras,
-        "body_from_rig": pose_to_json(rig.body_from_rig),
+        "body_from_rig": None if rig.body_from_rig is None else pose_to_json(rig.body_from_rig),
         "sigmas": rig.sigmas,
     }
     if rig.covariance is not None:
@@ -236,7 +248,7 @@ class _StoredCovariance(_FilePart):
 
 class _RigFile(_FilePart):
     cameras: dict[str, _StoredCamera]
-    body_from_rig: _StoredPose
+    body_from_rig: _StoredPose | None
     source: str
     covariance: _StoredCovariance | None = None
 
@@ -271,7 +283,9 @@ def read_rig(path: str | Path) -> Rig:
                 name: one.cam_from_rig.value(f"{name}: cam_from_rig")
                 for name, one in file.cameras.items()
             },
-            body_from_rig=file.body_from_rig.value("body_from_rig"),
+            body_from_rig=(
+                None if file.body_from_rig is None else file.body_from_rig.value("body_from_rig")
+            ),
             source=file.source,
             covariance=None if file.covariance is None else file.covariance.value(),
         )

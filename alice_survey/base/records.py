@@ -220,6 +220,12 @@ class PortRecord(JsonRecord):
     correlation: tuple[tuple[float, ...], ...]
 
 
+class MountRecord(JsonRecord):
+    """How the rig is mounted, where the survey found it."""
+
+    words: str
+
+
 class GeoreferenceRecord(JsonRecord):
     """`sparse/georeference.json`: residuals of navigation, and sigmas of the placing."""
 
@@ -234,6 +240,7 @@ class GeoreferenceRecord(JsonRecord):
     sigma_tilt_deg: float | None
     scale_of_navigation: float | None = None
     scale_of_navigation_sigma: float | None = None
+    mount: MountRecord | None = None
 
 
 class SimilarityRecord(JsonRecord):

@@ -212,6 +212,43 @@ def convert(
 
 
 @app.command(
+    epilog=examples(
+        "camera mount rig.json",
+        "camera mount rig.json nadir-bow-up --lever 0.55 -0.05 0.08 -o rig.json --plot mount.png",
+        "camera mount rig.json forward+30 -o mounted.json",
+    )
+)
+def mount(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="rig.json.")],
+    how: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[MOUNT]",
+            help="nadir-bow-up, -right, -down, -left; forward, aft, port, starboard; forward+30: "
+            "30 degrees down; or a file of a pose or of another rig.",
+        ),
+    ] = None,
+    lever: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="First camera's glass: forward, right, down, m."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="rig.json to write.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF of the mount.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show or state how a rig is mounted on its vehicle.
+
+    The lever counts from the point whose position navigation states. Without a mount attitudes of
+    navigation mean nothing for the pictures, until a survey finds it.
+    """
+    from camera_calib.mount import mount_report
+
+    print_result(*mount_report(rig, how, lever, output, plot), as_json)
+
+
+@app.command(
     epilog=examples("camera uncertainty rig.json", "camera uncertainty rig.json --range 2 --json")
 )
 def uncertainty(

@@ -327,6 +327,14 @@ def calibrate(
         float | None,
         typer.Option(min=1, max=1.4, help="Also write the rig in water of this index."),
     ] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(help="On the vehicle: nadir-bow-up, forward+30 and others, or a file."),
+    ] = None,
+    lever: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="First camera's glass: forward, right, down, m."),
+    ] = None,
     survey: SurveyFile = None,
     threads: Threads = None,
     as_json: AsJson = False,
@@ -345,7 +353,7 @@ def calibrate(
         water=water, start=start, known=intrinsics, port=port, dome_radius_mm=dome_radius,
         port_distance_mm=port_distance, glass_mm=glass, glass_sigma_mm=glass_sigma, n_glass=n_glass,
         n_glass_sigma=n_glass_sigma, n_water=n_water, n_water_sigma=n_water_sigma,
-        carry_to_n=carry_to_n,
+        carry_to_n=carry_to_n, mount=mount, lever_m=lever,
     )  # fmt: skip
     if options != CalibrateOptions():
         result = calibrate_pictures(options, executor_of(threads))

@@ -301,6 +301,8 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
             rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
         if place.sigma_tilt_deg is not None:
             rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+        if place.mount is not None:
+            rows.append(("mount of the rig", place.mount.words))
     for joint in found.joints:
         apart = (joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m)
         what = f"of {count(joint.stations, 'station')} that navigation alone joins to the others"

@@ -37,6 +37,7 @@ from camera_calib.calibrate.solve import (
 )
 from camera_calib.calibrate.text import calibration_text
 from camera_calib.calibration import Calibration, TargetView
+from camera_calib.mount import MOUNTS, check_mount, mount_line, with_mount
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
 
@@ -70,6 +71,10 @@ def calibrate_pictures(
     lens_names(settings, places, start=None)
     start = None if settings.start is None else read_rig(settings.start)
     check_settings(settings, start)
+    if settings.mount is not None:
+        check_mount(settings.mount)
+    elif settings.lever_m is not None:
+        raise CalibrationError(f"--lever goes with --mount: {MOUNTS}, or a file")
     lists = {camera: find_pictures(place) for camera, place in places.items()}
     check_own(lists)
     clocks: Mapping[str, ClockOffset] = {}
@@ -84,7 +89,10 @@ def calibrate_pictures(
         calibration = calibrated(settings, found, target, start)
         rig = calibration.rig
         source = "; ".join([rig.source, *_clock_lines(clocks, rig.reference)])
-        calibration = finish(partial, replace(calibration, rig=replace(rig, source=source)), found)
+        rig = replace(rig, source=source)
+        if settings.mount is not None:
+            rig = with_mount(rig, settings.mount, settings.lever_m)
+        calibration = finish(partial, replace(calibration, rig=rig), found)
         CalibrationRecord.save(
             partial / "calibration.json",
             {
@@ -175,6 +183,12 @@ def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) ->
     """Location of the results, and what to do with them."""
     rig = shlex.quote(str(output / "rig.json"))
     lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
+    lines.append(mount_line(calibration.rig))
+    if calibration.rig.body_from_rig is None:
+        lines.append(
+            f"  state it with alice-survey camera mount {rig} nadir-bow-up --lever 0.55 -0.05 0.08 "
+            f"-o {rig}, or let a survey with navigation find it"
+        )
     if settings.carry_to_n is not None:
         lines.append(f"in water of index {settings.carry_to_n:g}: {output / 'rig_carried.json'}")
     if settings.water:

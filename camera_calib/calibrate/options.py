@@ -68,6 +68,10 @@ class CalibrateOptions:
     n_water_sigma: float | None = None
     carry_to_n: float | None = None
     """Also write the rig in water of this index."""
+    mount: str | None = None
+    """How the rig sits on the vehicle, as `with_mount` reads it; None: as of the start."""
+    lever_m: tuple[float, float, float] | None = None
+    """Place of the reference camera's front glass on the vehicle."""
 
     def places(self) -> dict[str, str]:
         """Folder or pattern by camera; the first is the reference.

@@ -44,7 +44,7 @@ from camera_calib.freedom import (
 )
 from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
-from camera_calib.rig import UNKNOWN_MOUNT, Rig
+from camera_calib.rig import Rig
 from camera_calib.target_shape import TargetShape, usual_shape
 
 Intrinsics = Literal["held", "prior", "free"]
@@ -288,7 +288,7 @@ def first_rig(
     return Rig(
         cameras=cameras,
         cam_from_rig=first_cam_from_rig(cameras, usable, points),
-        body_from_rig=UNKNOWN_MOUNT,
+        body_from_rig=None,
         source="first values",
     )
 
@@ -329,7 +329,7 @@ def _alone(
     rig = Rig(
         cameras={name: blank.with_parameters({"fx_px": focal_px, "fy_px": focal_px})},
         cam_from_rig={name: RigidTransform.identity()},
-        body_from_rig=RigidTransform.identity(),
+        body_from_rig=None,
         source="first values",
     )
     wanted = intrinsics(lens)

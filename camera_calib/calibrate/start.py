@@ -250,7 +250,7 @@ def poses_alone(
     alone = Rig(
         cameras={name: camera},
         cam_from_rig={name: RigidTransform.identity()},
-        body_from_rig=RigidTransform.identity(),
+        body_from_rig=None,
         source="one camera",
     )
     at = [v for v, view in enumerate(views) if name in view.pixels]

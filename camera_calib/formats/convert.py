@@ -36,7 +36,7 @@ from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
-from camera_calib.rig import UNKNOWN_MOUNT, Rig
+from camera_calib.rig import Rig
 
 _TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
 MODELS = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
@@ -201,12 +201,12 @@ def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, 
         _may_lose_covariance(rig, task, where)
         notes.append(f"{task.target}: left out {_covariance_words(rig)}")
         rig = replace(rig, covariance=None)
-    if MOUNT not in target.holds and rig.body_from_rig is not UNKNOWN_MOUNT:
+    if MOUNT not in target.holds and rig.body_from_rig is not None:
         notes.append(f"{task.target}: left out the rig's pose on the vehicle")
-    if MOUNT in target.holds and rig.body_from_rig is UNKNOWN_MOUNT:
+    if MOUNT in target.holds and rig.body_from_rig is None:
         notes.append(
-            f"{task.source}: states no pose on the vehicle: {next(iter(rig.cameras))} is taken to "
-            "look down from the body's origin"
+            f"{task.source}: states no pose on the vehicle, which stays unknown: "
+            "'alice-survey camera mount' states it"
         )
     return rig, notes
 

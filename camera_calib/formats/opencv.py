@@ -98,7 +98,8 @@ def write_opencv(path: Path, rig: Rig) -> list[Path]:
             _write_port(storage, f"port{i}", camera)
     _write_texts(storage, "camera_names", names)
     storage.write("source", rig.source)
-    storage.write("body_from_rig", rig.body_from_rig.as_matrix())
+    if rig.body_from_rig is not None:
+        storage.write("body_from_rig", rig.body_from_rig.as_matrix())
     if rig.covariance is not None:
         _write_texts(storage, "covariance_parameters", list(rig.covariance.parameters))
         storage.write("covariance", rig.covariance.matrix)

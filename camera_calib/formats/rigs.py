@@ -14,7 +14,7 @@ from camera_calib.formats.fields import Fields, camera_name
 from camera_calib.freedom import POSE
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import UNKNOWN_MOUNT, Covariance, Rig
+from camera_calib.rig import Covariance, Rig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ def assemble(
     return Rig(
         cameras=dict(zip(plain, cameras, strict=True)),
         cam_from_rig={name: _scaled(p, reading) for name, p in zip(plain, poses, strict=True)},
-        body_from_rig=UNKNOWN_MOUNT,
+        body_from_rig=None,
         source=f"{tool} file {path.name}",
     )
 
@@ -226,10 +226,9 @@ def _scaled(pose: RigidTransform, reading: ReadOptions) -> RigidTransform:
     )
 
 
-def _mount(rig: Rig, camera: str) -> RigidTransform:
-    if rig.body_from_rig is UNKNOWN_MOUNT:  # stays unknown, whichever camera is the reference
-        return UNKNOWN_MOUNT
-    return rig.body_from_cam(camera)
+def _mount(rig: Rig, camera: str) -> RigidTransform | None:
+    """The mount of a rig that another camera leads."""
+    return None if rig.body_from_rig is None else rig.body_from_cam(camera)
 
 
 def _parameters(rig: Rig) -> tuple[str, ...]:

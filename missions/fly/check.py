@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.seafloor.terrain import survey_terrain
-from camera_calib.rig import Rig, design_rig, read_rig
+from camera_calib.rig import Rig, design_rig, mounted, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
 from missions.coverage.geofiles import write_coverage_tif, write_outlines
@@ -100,16 +100,20 @@ def check_log(
 def rig_of(workspace: Path, camera: CameraConfig, water: WaterConfig) -> Rig:
     """The cameras of a workspace in the survey's water: calibrated, or else as designed.
 
+    They are mounted as designed where the calibration does not say how.
+
     Args:
         workspace: with `calibration/rig.json` or `images/rig.json` where they were calibrated.
         camera: the design.
         water: of the survey.
     """
+    designed = design_rig(camera, water)
     for folder in ("calibration", "images"):
         path = workspace / folder / "rig.json"
         if path.is_file():
-            return read_rig(path).in_water(water.n_water)
-    return design_rig(camera, water)
+            rig = read_rig(path).in_water(water.n_water)
+            return mounted(rig) or replace(rig, body_from_rig=designed.body_from_rig)
+    return designed
 
 
 def check_report(

@@ -139,9 +139,7 @@ def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath
     Raises:
         PlanError: part of the picture looks past the sea floor.
     """
-    glass_rig = rig.cameras[rig.reference].front_cam
-    glass_rig = rig.cam_from_rig[rig.reference].inv().apply(glass_rig)
-    glass_body = rig.body_from_rig.apply(glass_rig)
+    glass_body = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
     body_from_cam = rig.body_from_cam(name)
     local_from_cam = RigidTransform.from_translation(-glass_body) * body_from_cam
     border = footprint_ne(rig.cameras[name], local_from_cam, altitude_m)

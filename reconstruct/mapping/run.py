@@ -22,7 +22,7 @@ from alice_survey.base.manifest import ImageRecord, read_manifest
 from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesRecord
 from alice_survey.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.rig import Rig, read_rig
+from camera_calib.rig import Rig, mounted, read_rig
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.refraction import Convergence, refract
@@ -249,10 +249,11 @@ def _match_all(
     seed: int,
     executor: Executor,
 ) -> list[VerifiedPair]:
-    placed = placed_pictures(inputs.records, inputs.rig, inputs.datum)
+    rig = mounted(inputs.rig)
+    placed = placed_pictures(inputs.records, rig, inputs.datum)
     lost = [i for i in range(len(inputs.records)) if i not in placed]
     unseen = sum(inputs.records[i].has_attitude for i in lost)
-    if inputs.rig is not None and inputs.datum is not None and unseen:
+    if rig is not None and inputs.datum is not None and unseen:
         warn(
             f"{unseen} pictures with an attitude have no footprint (they see the horizon, or have "
             "no altitude): their partners are sought in their order and by their looks"
@@ -260,7 +261,7 @@ def _match_all(
     alike: list[tuple[int, int]] = []
     if len(inputs.records) > SMALL_SET:
         alike = alike_pairs(features, lost, _ALIKE, seed=seed, executor=executor)
-    sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum, alike)
+    sure, maybe = choose_pairs(inputs.records, rig, inputs.datum, alike)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
     counts = executor.map(coarse_matches, looks, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]

@@ -146,7 +146,7 @@ def footprints(records: Sequence[ImageRecord], rig: Rig, datum: Datum) -> list[P
     for record, position in zip(records, positions, strict=True):
         attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
         ned_from_body = RigidTransform.from_components(position, rotation_from_attitude(*attitude))
-        outer_glass = (ned_from_body * rig.body_from_rig).apply(reference.front_cam)
+        outer_glass = (ned_from_body * rig.body_from_cam(rig.reference)).apply(reference.front_cam)
         floor = outer_glass[2] + record.altitude_m
         ned_from_cam = ned_from_body * rig.body_from_cam(record.camera)
         points, directions = borders[record.camera]

@@ -371,9 +371,11 @@ def judge_model(
         bends: along and across, as navigation shows them.
     """
     positions = sigmas = np.full((len(records), 3), np.nan)
-    if datum is not None:
-        positions, sigmas = pinhole_positions(records, rig, mapped.warps, datum)
-    rotations = navigation_rotations(records, rig, mapped.warps)
+    rotations: dict[int, Rotation] = {}
+    if rig.body_from_rig is not None:
+        rotations = navigation_rotations(records, rig, mapped.warps)
+        if datum is not None:
+            positions, sigmas = pinhole_positions(records, rig, mapped.warps, datum)
     doming = measure_doming(mapped.model, rotations, bends)
     # What adjustments made of the rig, before its size was put back.
     rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0

@@ -69,6 +69,10 @@ _NUISANCES = {
     "stretch": (STRETCH, 1.0),
     **{name: (LEVER.start + k, 1.0) for k, name in enumerate(_LEVERS)},
     "clock_s": (CLOCK, 1.0),
+    **{
+        f"mount_{axis}_deg": (MOUNT.start + k, float(np.rad2deg(1.0)))
+        for k, axis in enumerate(("forward", "right", "down"))
+    },
 }
 
 

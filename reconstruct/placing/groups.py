@@ -17,7 +17,7 @@ from alice_survey.base.errors import collected_by, warn
 from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import JointRecord
-from camera_calib.rig import Rig
+from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.normal_equations import POSE
 from reconstruct.adjustment.uncertainty import SoftModes
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
@@ -63,6 +63,7 @@ def join_groups(
     model, notes = pycolmap.Reconstruction(mapped.model), []
     of_name = {record.image: record for record in records}
     members = [frames[groups == group].tolist() for group in range(int(groups.max()) + 1)]
+    rig = mounted(rig)
     mounts = None if rig is None else body_from_pinhole(rig, mapped.warps)
     fits = [
         _placed(model, of_frames, of_name, mounts, datum if mapped.scaled else None, installed)

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array
+from alice_survey.base.frames import Array, pose_to_json
+from camera_calib.mount import nearest_mount
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import Bend
 from reconstruct.placing.generalised_fit import Correlation
@@ -17,6 +19,37 @@ _METHOD = (
     "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
     "stated sigmas, correlation times and white shares by restricted maximum likelihood"
 )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundMount:
+    """How the rig is mounted on the vehicle, found with the place."""
+
+    body_from_rig: RigidTransform
+    turn_sigma_deg: Array
+    """(3,) about the vehicle's axes forward, right, down."""
+    lever_sigma_m: Array
+    """(3,) forward, right, down."""
+
+    @property
+    def words(self) -> str:
+        """What was found, with its sigmas."""
+        arm = zip(self.body_from_rig.translation, self.lever_sigma_m, strict=True)
+        forward, right, down = (f"{value:+.2f} (sigma {sigma:.2g})" for value, sigma in arm)
+        return (
+            f"mount found: {nearest_mount(self.body_from_rig.rotation)}, sigma "
+            f"{self.turn_sigma_deg.max():.2g} deg; pupil {forward} m forward, {right} m right, "
+            f"{down} m down"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """What `georeference.json` says."""
+        return {
+            "words": self.words,
+            "body_from_rig": pose_to_json(self.body_from_rig),
+            "turn_sigma_deg": self.turn_sigma_deg.tolist(),
+            "lever_sigma_m": self.lever_sigma_m.tolist(),
+        }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,8 +83,10 @@ class PlacementFit:
     """How bent the model is still, along the block and, where it is wide, across; none where
     stations are too few."""
     nuisances: Mapping[str, tuple[float, float]]
-    """What was found of the errors of the lever arm (m), the clock (s) and navigation's own frame
-    (turn in degrees, stretch), and their sigmas."""
+    """What was found of the errors of the lever arm (m), the clock (s), the mount (degrees) and
+    navigation's own frame (turn in degrees, stretch), and their sigmas."""
+    mount: FoundMount | None = None
+    """The mount, where it was not known."""
 
     @property
     def covariance(self) -> Array:
@@ -117,6 +152,7 @@ class PlacementFit:
                 name: {"value": found, "sigma": sigma}
                 for name, (found, sigma) in self.nuisances.items()
             },
+            "mount": None if self.mount is None else self.mount.to_json(),
             "soft_modes": self.modes.tolist(),
             "soft_modes_factor": self.mode_factor,
             "middle_ned_m": self.middle_ned.tolist(),

@@ -38,7 +38,7 @@ from alice_survey.base.run import progress
 from alice_survey.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.freedom import knowing_water
-from camera_calib.rig import Rig, write_rig
+from camera_calib.rig import Rig, mounted, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
 from reconstruct.mapping.mapper import Mapped, model_baseline
@@ -57,6 +57,7 @@ from reconstruct.placing.control_file import (
 )
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.groups import join_groups, joints_of
+from reconstruct.placing.mount import fit_with_mount
 from reconstruct.placing.navigation_equations import PLACE, Installation, body_from_pinhole
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
@@ -203,7 +204,15 @@ def run_sparse(
         write_rig(folder / "rig.json", adjusted.exact.fit.rig)
     write_frame(folder / "frame.json", placed.frame)
     rig = adjusted.rig
-    mounts = {} if rig is None else {n: rig.body_from_cam(n).rotation for n in rig.cameras}
+    if rig is not None and placed.fit is not None and placed.fit.mount is not None:
+        rig = replace(rig, body_from_rig=placed.fit.mount.body_from_rig)
+        write_rig(folder / "rig.json", rig)
+    known_mount = mounted(rig)
+    mounts = (
+        {}
+        if known_mount is None
+        else {n: known_mount.body_from_cam(n).rotation for n in known_mount.cameras}
+    )
     rows = track_rows(model, of_name, warps, placed.frame, mounts)
     covariances = _covariances(folder, placed, rows, shape)
     if adjusted.shape is not None:
@@ -395,25 +404,38 @@ def _fit(
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    if task.rig is None and any(_is_turned(record) for record in task.records):
-        warn(
-            "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
-            "import the pictures with --rig, whose body_from_rig says so"
-        )
-    navigate = partial(
+    rig, installed = mounted(task.rig), Installation.of(task.settings)
+    fit_to = partial(
         fit_navigation,
         task.records,
         task.pinholes,
-        None if task.rig is None else body_from_pinhole(task.rig, task.warps),
         levelled=levelled,
         known_scale=scale,
-        installed=Installation.of(task.settings),
         scale_sigma=sigma,
         modes=modes,
         joints=joints,
     )
+    mounts = None if rig is None else body_from_pinhole(rig, task.warps)
+    navigate = partial(fit_to, mounts, installed=installed)
     if task.datum is not None:
-        fit = navigate(task.datum, control=ties.equations if ties.informs else None)
+        control = ties.equations if ties.informs else None
+        pinhole_from_rig = _pinhole_from_rig(task)
+        if rig is not None or pinhole_from_rig is None:
+            fit = navigate(task.datum, control=control)
+        else:
+            fit = fit_with_mount(
+                task.records,
+                task.pinholes,
+                pinhole_from_rig,
+                lambda mounts, known: fit_to(mounts, task.datum, installed=known, control=control),
+                installed,
+            )
+    attitudes = any(_is_turned(record) for record in task.records)
+    if attitudes and rig is None and (fit is None or fit.mount is None):
+        warn(
+            "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
+            "state it with 'alice-survey camera mount', and import the pictures with that --rig"
+        )
     if fit is not None:
         return fit, None
     start = ties.start(scale)
@@ -428,7 +450,7 @@ def _fit(
             fit = navigate(None, known_scale=bars[0], scale_sigma=bars[1])
         else:
             fit = navigate(None)
-        note = None if fit is None else _local_note(task.records, headed=task.rig is not None)
+        note = None if fit is None else _local_note(task.records, headed=rig is not None)
         return fit, note
     fit = fit_control(
         task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma,
@@ -443,10 +465,11 @@ def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | Non
     records = [
         replace(record, latitude_deg=nan, longitude_deg=nan, depth_m=nan) for record in task.records
     ]
-    if task.rig is None or not any(_is_turned(record) for record in records):
+    rig = mounted(task.rig)
+    if rig is None or not any(_is_turned(record) for record in records):
         return None
     fit = fit_navigation(
-        records, task.pinholes, body_from_pinhole(task.rig, task.warps), None, levelled=levelled,
+        records, task.pinholes, body_from_pinhole(rig, task.warps), None, levelled=levelled,
         known_scale=1.0, installed=Installation.of(task.settings),
     )  # fmt: skip
     return None if fit is None else (fit.ned_from_model, _local_note(records, headed=True))
@@ -454,6 +477,14 @@ def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | Non
 
 def _is_turned(record: ImageRecord) -> bool:
     return record.readings["roll and pitch"] or record.readings["heading"]
+
+
+def _pinhole_from_rig(task: Placing) -> dict[str, RigidTransform] | None:
+    """Poses of the pinholes on the rig; None where several cameras are no rig."""
+    if task.rig is not None:
+        return {n: w.pinhole_from_cam * task.rig.cam_from_rig[n] for n, w in task.warps.items()}
+    names = {record.camera for record in task.records}
+    return {name: RigidTransform.identity() for name in names} if len(names) == 1 else None
 
 
 def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:

@@ -77,8 +77,7 @@ def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
 
     assert list(found.rig.cameras) == list(truth.cameras)
     assert len(found.views) == 40 and not found.rejections
-    top_of_picture = found.rig.body_from_rig.rotation.apply([0.0, -1.0, 0.0])
-    np.testing.assert_allclose(top_of_picture, [1.0, 0.0, 0.0], atol=1e-12)  # towards the bow
+    assert found.rig.body_from_rig is None
     assert found.noise_px == pytest.approx(NOISE_PX, rel=0.05)
     errors, sigmas = differences(found.rig, truth), found.rig.sigmas
     over = np.array([errors[key] / sigmas[key] for key in errors])
