@@ -23,6 +23,7 @@ from reconstruct.placing.generalised_fit import (
 )
 from reconstruct.placing.navigation_equations import (
     CLOCK,
+    DRIFT,
     GROUPS,
     LEVER,
     MOUNT,
@@ -56,6 +57,9 @@ _SIGNIFICANT = 3.0
 """Sigmas of its own by which a sum of squares must be too large to count as such."""
 _CONTRADICTION_SIGMAS = 3.0
 """A nuisance this far from what is expected of it is reported."""
+_DRIFT_SIGMAS = 0.3
+"""Drift of depths that is likely over a survey, over their stated sigma."""
+_VAGUE_DRIFT_SIGMAS = 100.0
 _VAGUE_PER_M = 10.0
 """Curvature that any model has less of by far."""
 _STRETCH = 0.005
@@ -69,6 +73,7 @@ _NUISANCES = {
     "stretch": (STRETCH, 1.0),
     **{name: (LEVER.start + k, 1.0) for k, name in enumerate(_LEVERS)},
     "clock_s": (CLOCK, 1.0),
+    "depth_drift_m": (DRIFT, 1.0),
     **{
         f"mount_{axis}_deg": (MOUNT.start + k, float(np.rad2deg(1.0)))
         for k, axis in enumerate(("forward", "right", "down"))
@@ -244,6 +249,7 @@ class _NavigationTask:
             solved_for.append(CLOCK)
         settling = [*free, *modes]
         widened: dict[str, float] = {}
+        drift_m = 0.0
         for _ in range(_STEPS):
             middle = self._middle(place)
             bent = epochs.deformed(sizes)
@@ -253,7 +259,7 @@ class _NavigationTask:
                 found,
                 used,
                 solved_for,
-                self._extra(place, middle, sizes, factor),
+                self._extra(place, middle, sizes, factor, drift_m),
                 frame_bounds=bounds,
                 widened=widened,
             )
@@ -265,11 +271,14 @@ class _NavigationTask:
             factor = _mode_factor(sizes[:soft], sigma[PARAMETERS:][:soft], factor)
             still = np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma[settling]
             if still.all() and abs(factor - before) <= _SETTLED_SIGMAS * factor:
-                off = self._turned(nuisances[TURN], bounds, got.correlation)
-                if widened or off < _CONTRADICTION_SIGMAS:
+                if widened:
                     break
-                widened = {"heading": off}
-                bounds[TURN] *= off
+                drift_m = self._drift(place, middle, sizes, factor, got, solved_for, bounds)
+                widened = self._contradictions(nuisances[TURN], drift_m, bounds, got.correlation)
+                if not widened:
+                    break
+                if drift_m:
+                    solved_for.append(DRIFT)
         middle = self._middle(place)
         scaled = got
         if SCALE not in free:
@@ -280,7 +289,7 @@ class _NavigationTask:
                 found,
                 got.used,
                 [*stiff, SCALE],
-                self._extra(place, middle, sizes, factor),
+                self._extra(place, middle, sizes, factor, drift_m),
                 frame_bounds=bounds,
                 correlation=got.correlation,
             )
@@ -401,21 +410,82 @@ class _NavigationTask:
             for k in range(min(count, 2))
         )
 
-    def _turned(
-        self, turn: float, bounds: Mapping[int, float], correlation: Mapping[str, Correlation]
+    def _drift(
+        self,
+        place: Similarity,
+        middle: Array,
+        sizes: Array,
+        factor: float,
+        got: Estimate,
+        free: Sequence[int],
+        bounds: Mapping[int, float],
     ) -> float:
-        """How many sigmas navigation's frame is turned against its own headings; 0 if unknown."""
-        if not ({"horizontal", "heading"} <= set(correlation) and bounds.get(TURN, 0.0) > 0):
+        """Drift of depths over the survey, metres, if it is more than is likely, else 0.
+
+        Only a known tilt tells it from one of the model.
+        """
+        epochs = self.epochs
+        if not (epochs.timed and epochs.has_tilt and got.used[:, 2].sum() >= LEAST_STATIONS):
             return 0.0
-        expected = frame_sigma(bounds[TURN], self.epochs.time, correlation["horizontal"])
-        off = abs(turn) / expected
-        if off > _CONTRADICTION_SIGMAS:
+        usual = self._usual_sigma(2)
+        found = estimate(
+            epochs.time,
+            equations(epochs.deformed(sizes), place, middle),
+            got.used,
+            [*free, DRIFT],
+            self._extra(place, middle, sizes, factor, _VAGUE_DRIFT_SIGMAS * usual),
+            frame_bounds=bounds,
+        )
+        drift_m = float(found.change[DRIFT])
+        likely = np.hypot(_DRIFT_SIGMAS * usual, np.sqrt(found.covariance[DRIFT, DRIFT]))
+        return drift_m if abs(drift_m) > _CONTRADICTION_SIGMAS * likely else 0.0
+
+    def _usual_sigma(self, channel: int) -> float:
+        return float(np.median(self.epochs.sigma[self.epochs.known[:, channel], channel]))
+
+    def _contradictions(
+        self,
+        turn: float,
+        drift_m: float,
+        bounds: dict[int, float],
+        correlation: Mapping[str, Correlation],
+    ) -> dict[str, float]:
+        """Name what navigation says of itself in two ways, and make both as unsure as they differ.
+
+        Args:
+            turn: of navigation's frame against its headings, radians.
+            drift_m: of depths against attitudes and pictures; 0 where there is none.
+            bounds: of navigation's frame; widened in place.
+            correlation: of errors.
+
+        Returns:
+            Groups whose stated sigmas are too small, and by what factor.
+        """
+        widened = {}
+        if drift_m:
+            usual = self._usual_sigma(2)
             warn(
-                f"headings of the navigation and its positions disagree, {np.rad2deg(turn):+.2g} "
-                f"deg where {np.rad2deg(expected):.2g} deg is likely: both count as that unsure; "
-                "check the compass and the camera's mount (body_from_rig)"
+                f"depths of the navigation drift by {drift_m:+.2g} m against its attitudes and the "
+                f"pictures, where {_DRIFT_SIGMAS * usual:.2g} m is likely: depth counts as that "
+                "unsure; check the pressure sensor's zero and the tide"
             )
-        return float(off)
+            # Its level may have been right at any time of the survey.
+            widened["depth"] = float(np.hypot(1.0, 0.5 * drift_m / usual))
+        if {"horizontal", "heading"} <= set(correlation) and bounds.get(TURN, 0.0) > 0:
+            expected = frame_sigma(bounds[TURN], self.epochs.time, correlation["horizontal"])
+            if abs(turn) > _CONTRADICTION_SIGMAS * expected:
+                stated = self._usual_sigma(5)
+                # Each takes its share of what they differ by.
+                differ = abs(turn) * (1.0 + (stated / expected) ** 2)
+                warn(
+                    "headings of the navigation and its positions disagree by "
+                    f"{np.rad2deg(differ):.2g} deg where "
+                    f"{np.rad2deg(np.hypot(expected, stated)):.2g} deg is likely: both count as "
+                    "that unsure; check the compass and the camera's mount (body_from_rig)"
+                )
+                widened["heading"] = max(differ / stated, 1.0)
+                bounds[TURN] *= differ / expected
+        return widened
 
     def _middle(self, place: Similarity) -> Array:
         middle: Array = place.apply(self.epochs.centres).mean(axis=0)
@@ -437,7 +507,12 @@ class _NavigationTask:
         return {TURN: bound, STRETCH: min(bound, _STRETCH)}
 
     def _extra(
-        self, place: Similarity, middle: Array, sizes: Array, mode_factor: float = 1.0
+        self,
+        place: Similarity,
+        middle: Array,
+        sizes: Array,
+        mode_factor: float = 1.0,
+        drift_m: float = 0.0,
     ) -> Extra:
         columns = PARAMETERS + len(sizes)
         misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
@@ -455,6 +530,8 @@ class _NavigationTask:
             misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
             rows.append(scale)
         known = self.installed.weights(columns)
+        if drift_m:
+            known[DRIFT] = 1.0 / abs(drift_m)
         known[PARAMETERS : columns - self.joints] = 1.0 / mode_factor
         at = np.flatnonzero(known)
         misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[at])

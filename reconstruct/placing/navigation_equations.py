@@ -4,9 +4,10 @@ A placement is `ned = scale * rotation * model + translation`. Its parameters he
 about a present one, in this order: rotation about north, east and down (radians), shift north, east
 and down of the middle of the track (metres), logarithm of the scale, and after these seven the
 nuisances: a turn (radians) and a stretch (relative) of navigation's own frame, the error of the
-mount (radians about forward, right, down), that of the lever arm (metres forward, right, down) and
-that of the clock (seconds by which pictures are later than navigation has them). After these come
-the sizes of the model's soft modes, in their sigmas.
+mount (radians about forward, right, down), that of the lever arm (metres forward, right, down),
+that of the clock (seconds by which pictures are later than navigation has them) and the drift of
+depths (metres from the first time to the last). After these come the sizes of the model's soft
+modes, in their sigmas.
 """
 
 import math
@@ -25,11 +26,11 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
 
-PARAMETERS = 16
+PARAMETERS = 17
 """Number of parameters before the soft modes."""
 PLACE = 7
 """Number of parameters of the placement; the rest are nuisances."""
-SCALE, TURN, STRETCH, MOUNT, LEVER, CLOCK = 6, 7, 8, slice(9, 12), slice(12, 15), 15
+SCALE, TURN, STRETCH, MOUNT, LEVER, CLOCK, DRIFT = 6, 7, 8, slice(9, 12), slice(12, 15), 15, 16
 GROUPS = ("horizontal", "depth", "tilt", "heading")
 GROUP_OF = ("horizontal", "horizontal", "depth", "tilt", "tilt", "heading")
 """Groups of the six channels: north, east, depth, roll, pitch, heading."""
@@ -114,6 +115,13 @@ class Epochs:
         arms = (ned_from_model.rotation * self.model_from_body).apply(self.levers)
         moved: Array = ned_from_model.apply(self.centres) + arms
         return moved
+
+    @property
+    def elapsed(self) -> Array:
+        """(M,) time over that of all, from -1/2 to 1/2."""
+        from_first = self.time - self.time[0]
+        share: Array = from_first / max(float(from_first[-1]), 1e-300) - 0.5
+        return share
 
     @property
     def has_attitude(self) -> bool:
@@ -305,6 +313,7 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     jacobian[:, 3:, MOUNT] = angles_from_ned @ ned_from_body
     jacobian[:, :3, LEVER] = ned_from_body
     jacobian[:, :3, CLOCK] = _velocities(epochs, positions)
+    jacobian[:, 2, DRIFT] = epochs.elapsed[epochs.moment]
     turn = place.rotation.as_matrix()
     turned = turn @ epochs.modes[:, 3:]
     moved = place.scale * turn @ epochs.modes[:, :3]
