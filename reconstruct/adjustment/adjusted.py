@@ -57,7 +57,7 @@ class AdjustedSurvey:
     """How well its shape is known; None where it is not."""
 
     def deformed(self, sizes: Array, left: Array) -> Self:
-        """The same after measurements from outside have said how its soft modes lie.
+        """The same after measurements from outside have said how large its soft modes are.
 
         Args:
             sizes: (K,) of every mode of the `shape`, in its sigmas.

@@ -3,11 +3,11 @@
 The covariance is that of the last adjustment: the inverse of its weighted normal equations, scaled
 by the variance of the keypoints that its residuals show (see `reconstruct.mapping.robust`), and
 what errors of the calibration add to it. A model of pictures has no place of its own, so that what
-is stated is its shape: the covariance of what is left when all stations together are laid onto the
+is stated is its shape: the covariance of what is left when all stations together are moved onto the
 truth by a rigid motion (and by a scale, where nothing fixes that) with the least squares error (the
 inner constraints of a free network; Baarda's S-transformation, 1973). Where the whole lies in the
 world is for the georeference to say. Stations that no point links make groups, and the shape is
-that of each; how a group lies to the largest is a mode of which pictures know nothing.
+that of each; where a group is relative to the largest is a mode of which pictures know nothing.
 
 Rig and ports are not exact: a lens that is off by its sigma bends the whole block a little, and
 every picture more does the same again. To first order stations and points move with the rig's
@@ -132,7 +132,7 @@ class Groups:
     """(N, 3) about which groups turn and grow."""
 
     def carried(self, motions: Array, places: Array, group: Indices) -> Array:
-        """Places (M, 3) of groups (M,) that lie otherwise to the first.
+        """Places (M, 3) of groups (M,) that are moved relative to the first.
 
         Args:
             motions: (N - 1, 6 or 7) of the other groups: turn, shift, logarithm of the scale.

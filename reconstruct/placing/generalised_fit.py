@@ -3,8 +3,8 @@
 Errors of navigation are correlated: weights that take readings as independent give sigmas that are
 far too small. Here every group of channels (horizontal position, depth, tilt, heading) has the
 marginal sigma that navigation states, and a correlation time and white and constant shares that the
-misfit between navigation and the model gives, the model being stiff. Whether errors begin anew with
-a dive, and how far the constants of dives are apart, is found in the same way. They are found by
+misfit between navigation and the model gives, the model being stiff. Whether errors restart with a
+dive, and how far the constants of dives are apart, is found in the same way. They are found by
 restricted maximum likelihood (Patterson & Thompson 1971), which counts what the placement itself
 has absorbed, and the covariance of the placement is averaged over all that are likely.
 """
@@ -287,7 +287,7 @@ class _PlacementProblem:
         return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)
 
     def times(self, how: Correlation) -> Array:
-        """(M,) times; dives after which errors begin anew lie too far apart for any correlation."""
+        """(M,) times; dives where errors restart are too far apart for any correlation."""
         if not how.restart:
             return self.time
         apart = 100.0 * how.tau + float(np.ptp(self.time))
