@@ -41,7 +41,7 @@ from reconstruct.adjustment.normal_equations import (
     PointEquations,
     reduce_parts,
 )
-from reconstruct.adjustment.uncertainty import Motions, SoftModes
+from reconstruct.adjustment.soft_modes import Motions, SoftModes
 from reconstruct.mapping.arrays import (
     LEAST_POINTS,
     Indices,

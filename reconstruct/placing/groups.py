@@ -2,7 +2,7 @@
 
 Pictures do not show where such groups are relative to each other. Each is placed by its own
 navigation first, which brings it near enough for the adjustment's linear motions of groups (see
-`reconstruct.adjustment.uncertainty.SoftModes`); the model's place then finds these motions, with
+`reconstruct.adjustment.soft_modes.SoftModes`); the model's place then finds these motions, with
 navigation's errors correlated between groups as along the track.
 """
 
@@ -19,7 +19,7 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import JointRecord
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.normal_equations import POSE
-from reconstruct.adjustment.uncertainty import SoftModes
+from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.pictures.files import named

@@ -40,7 +40,8 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, mounted, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
-from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, write_uncertainty
+from reconstruct.adjustment.soft_modes import SoftModes
+from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
