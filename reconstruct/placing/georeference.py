@@ -12,15 +12,7 @@ from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
 from reconstruct.placing.first_placement import first_placement, observable
-from reconstruct.placing.generalised_fit import (
-    Correlation,
-    Estimate,
-    Extra,
-    estimate,
-    frame_sigma,
-    no_extra,
-    without_gross_errors,
-)
+from reconstruct.placing.generalised_fit import Estimate, estimate, without_gross_errors
 from reconstruct.placing.navigation_equations import (
     CLOCK,
     DRIFT,
@@ -40,6 +32,7 @@ from reconstruct.placing.navigation_equations import (
     without_navigation,
 )
 from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.placement_problem import Correlation, Extra, frame_sigma, no_extra
 
 _LEVEL_SIGMA_DEG = 10.0
 """How far from level the sea floor's mean plane may be, where no attitude was measured."""

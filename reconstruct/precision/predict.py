@@ -21,7 +21,7 @@ from reconstruct.adjustment.uncertainty import BlockShape, shape_of_block
 from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import sag_weights
-from reconstruct.placing.generalised_fit import Extra, estimate
+from reconstruct.placing.generalised_fit import estimate
 from reconstruct.placing.navigation_equations import (
     GROUP_OF,
     PARAMETERS,
@@ -32,6 +32,7 @@ from reconstruct.placing.navigation_equations import (
     Epochs,
     equations,
 )
+from reconstruct.placing.placement_problem import Extra
 from reconstruct.precision.instruments import NavigationErrors
 from reconstruct.precision.tracks import ExpectedBlock
 
