@@ -1,7 +1,7 @@
 """Commands that bring in what real dives recorded: pictures and logs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -87,6 +87,42 @@ def join(
 
     found = join_dives(workspace, dives)
     typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
+
+
+@app.command(
+    name="import-control",
+    epilog=examples(
+        "import-control gcp_list.txt --sigma 0.02 -w reef",
+        "import-control markers.xml -w reef --overwrite",
+    ),
+)
+def import_control(
+    file: Annotated[Path, typer.Argument(help="ODM's gcp_list.txt, or Metashape's markers XML.")],
+    sigma: Annotated[
+        float | None, typer.Option(min=1e-6, help="m; of points whose accuracy is not stated.")
+    ] = None,
+    sigma_vertical: Annotated[
+        float | None, typer.Option(min=1e-6, help="m; of heights; as --sigma if not given.")
+    ] = None,
+    heights: Annotated[
+        Literal["level", "ellipsoid"],
+        typer.Option(help="They count from the level of the survey's depths, or from WGS 84's."),
+    ] = "level",
+    workspace: Workspace = WORK,
+    overwrite: Annotated[bool, typer.Option(help="Replace files that are there.")] = False,
+) -> None:
+    """Bring in ground control points of another program.
+
+    Writes control.csv and picks.csv of the workspace, by which the next 'reconstruct' places the
+    model.
+    """
+    from reconstruct.placing.control_import import import_control as work
+
+    found = work(
+        workspace, file, sigma_m=sigma, sigma_vertical_m=sigma_vertical, heights=heights,
+        overwrite=overwrite,
+    )  # fmt: skip
+    typer.echo(f"{found}\nin {workspace}; next: alice-survey reconstruct -w {workspace}")
 
 
 @app.command(

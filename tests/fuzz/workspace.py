@@ -59,6 +59,30 @@ def _picks(folder: Path) -> None:
     (folder / "picks.csv").write_text("\n".join(["image,point,x,y,sigma_px", *rows]) + "\n")
 
 
+def _gcp_list(folder: Path) -> None:
+    rows = [
+        f"{576_600 + i} {5_188_200 - i} 1{i}.5 {100 + i} 20{i} DJI_{i}.JPG A{i}" for i in range(6)
+    ]
+    (folder / "gcp_list.txt").write_text("\n".join(["EPSG:32615", *rows]) + "\n")
+
+
+def _markers(folder: Path) -> None:
+    (folder / "markers.xml").write_text(
+        '<document version="1.5.0"><chunk><cameras><camera id="0" label="DJI_0"/></cameras>'
+        '<markers><marker id="1" label="A"><reference x="-91.9" y="46.8" z="12" sx="0.1" sy="0.1" '
+        'sz="0.2" enabled="true"/></marker></markers><frames><frame><markers><marker marker_id="1">'
+        '<location camera_id="0" pinned="true" x="10.5" y="20"/></marker></markers></frame>'
+        '</frames><reference>EPSG:4326</reference><settings><property name="accuracy_markers" '
+        'value="0.01"/></settings></chunk></document>'
+    )
+
+
+def read_foreign_control(path: Path) -> object:
+    from reconstruct.placing.control_import import read_foreign
+
+    return read_foreign(path)
+
+
 def read_picks(path: Path) -> object:
     from reconstruct.placing.control_file import read_picks
 
@@ -131,6 +155,8 @@ TARGETS = (
     ),
     _target("control.csv", "csv", "control.csv", _control, read_control),
     _target("picks.csv", "csv", "picks.csv", _picks, read_picks),
+    _target("gcp_list.txt", "text", "gcp_list.txt", _gcp_list, read_foreign_control),
+    _target("markers of Metashape", "text", "markers.xml", _markers, read_foreign_control),
     _target("reference PLY", "text", "a.ply", _reference_ply, read_reference),
     _target("reference PLY, binary", "binary", "a.ply", _binary_ply, read_reference),
     _target(

@@ -1,0 +1,250 @@
+"""Ground control as ODM and Metashape write it arrives as points and picks of the workspace."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import WorkspaceError, collected_by
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord, write_manifest
+from reconstruct.placing.control_file import read_control, read_picks
+from reconstruct.placing.control_import import import_control
+
+PLACES = {
+    "A": (46.8426, -91.9946, -12.5),
+    "B": (46.8431, -91.9939, -13.0),
+    "C": (46.8424, -91.9931, -12.0),
+}
+"""Latitude, longitude and height of points."""
+PICKS = [("DJI_1", "A", 100.0, 200.5), ("DJI_2", "A", 40.25, 7.0), ("DJI_2", "B", 300.0, 20.0),
+         ("DJI_1", "C", 3.5, 9.0), ("DJI_2", "C", 5.0, 6.0)]  # fmt: skip
+NAMES = ("camera/DJI_1.jpg", "camera/DJI_2.jpg")
+
+
+def utm(latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+    """Easting and northing in zone 15 north: Kruger's series to the third order (Karney 2011)."""
+    a, f = 6_378_137.0, 1 / 298.257223563
+    n = f / (2 - f)
+    size = a / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    alpha = (
+        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16, 13 * n**2 / 48 - 3 * n**3 / 5, 61 * n**3 / 240,
+    )  # fmt: skip
+    phi, lam = math.radians(latitude_deg), math.radians(longitude_deg + 93.0)
+    e = 2 * math.sqrt(n) / (1 + n)
+    t = math.sinh(math.atanh(math.sin(phi)) - e * math.atanh(e * math.sin(phi)))
+    xi, eta = math.atan2(t, math.cos(lam)), math.atanh(math.sin(lam) / math.hypot(1.0, t))
+    east, north = eta, xi
+    for j, c in enumerate(alpha, 1):
+        east += c * math.cos(2 * j * xi) * math.sinh(2 * j * eta)
+        north += c * math.sin(2 * j * xi) * math.cosh(2 * j * eta)
+    return 500_000 + 0.9996 * size * east, 0.9996 * size * north
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    return workspace_of(tmp_path / "reef", NAMES)
+
+
+def workspace_of(folder: Path, names: tuple[str, ...]) -> Path:
+    records = [
+        ImageRecord(image=name, camera=name.split("/", maxsplit=1)[0], station=i)
+        for i, name in enumerate(names)
+    ]
+    (folder / "images").mkdir(parents=True)
+    write_manifest(folder / "images" / "manifest.csv", records)
+    write_json(folder / "images" / "stage.json", {"stage": "images", "digest": ""})
+    return folder
+
+
+def gcp_list(path: Path, system: str = "WGS84 UTM 15N", *, named: bool = True) -> Path:
+    lines = [system, "# a comment", ""]
+    for picture, point, x, y in PICKS:
+        latitude, longitude, height = PLACES[point]
+        east, north = utm(latitude, longitude)
+        lines.append(
+            f"{east:.4f}\t{north:.4f} {height} {x} {y} {picture}.JPG"
+            + (f" {point}" if named else "")
+        )
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def markers_xml(path: Path, **changes: str) -> Path:
+    """What Metashape writes, with B unticked and one marker place that is only expected."""
+    stated = {"C": 'sx="0.03" sy="0.02" sz="0.05"'}
+    numbers = {"DJI_1": 7, "DJI_2": 9}
+    rows = "".join(
+        f'<marker id="{i}" label="{name}"><reference x="{lon}" y="{lat}" z="{h}" '
+        f'enabled="{str(name != "B").lower()}" {stated.get(name, "")}/></marker>'
+        for i, (name, (lat, lon, h)) in enumerate(PLACES.items())
+    )
+    seen = "".join(
+        f'<marker marker_id="{i}">'
+        + "".join(
+            f'<location camera_id="{numbers[picture]}" pinned="true" x="{x}" y="{y}"/>'
+            for picture, point, x, y in PICKS
+            if point == name
+        )
+        + ('<location camera_id="7" pinned="false" x="1" y="1"/>' if name == "B" else "")
+        + "</marker>"
+        for i, name in enumerate(PLACES)
+    )
+    parts = {
+        "system": '<reference>GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",'
+        '6378137,298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433],'
+        'AUTHORITY["EPSG","4326"]]</reference>',
+        "settings": '<settings><property name="accuracy_markers" value="0.01"/>'
+        '<property name="accuracy_projections" value="0.8"/></settings>',
+        "head": '<?xml version="1.0" encoding="UTF-8"?>',
+        **changes,
+    }
+    path.write_text(
+        f'{parts["head"]}<document version="1.5.0"><chunk label="reef"><cameras>'
+        '<camera id="7" label="DJI_1"/><camera id="9" label="DJI_2.JPG"/></cameras>'
+        f'<markers>{rows}</markers><frames><frame id="0"><markers>{seen}</markers></frame></frames>'
+        f"{parts['system']}{parts['settings']}</chunk></document>"
+    )
+    return path
+
+
+def points_of(workspace: Path) -> dict[str, Any]:
+    return {point.name: point for point in read_control(workspace / "control.csv").points}
+
+
+def check_places(workspace: Path) -> None:
+    found = points_of(workspace)
+    assert set(found) == set(PLACES)
+    for name, (latitude, longitude, height) in PLACES.items():
+        point = found[name]
+        metres = (
+            np.deg2rad([point.latitude_deg - latitude, point.longitude_deg - longitude]) * 6.4e6
+        )
+        assert np.abs(metres).max() < 2e-4
+        assert point.depth_m == pytest.approx(-height)
+
+
+def picks_of(workspace: Path) -> Array:
+    picks = read_picks(workspace / "picks.csv")
+    order = [(f"camera/{p}.jpg", point) for p, point, _, _ in PICKS]
+    by = {(pick.image, pick.point): pick for pick in picks}
+    assert len(by) == len(picks) == len(PICKS)
+    return np.array([[by[key].x_px, by[key].y_px] for key in order])
+
+
+def test_odm_lists_give_points_where_they_are_and_picks_to_the_pixel(
+    workspace: Path, tmp_path: Path
+) -> None:
+    found = import_control(workspace, gcp_list(tmp_path / "gcp_list.txt"), sigma_m=0.02)
+    check_places(workspace)
+    np.testing.assert_allclose(picks_of(workspace), [[x, y] for _, _, x, y in PICKS], atol=1e-9)
+    assert (found.points, found.checks, found.picks, found.pictures) == (3, 0, 5, 2)
+    assert {p.sigma_m for p in points_of(workspace).values()} == {0.02}
+
+
+def test_rows_without_names_are_one_point_by_place(workspace: Path, tmp_path: Path) -> None:
+    path = gcp_list(tmp_path / "gcp_list.txt", named=False)
+    import_control(workspace, path, sigma_m=0.02, sigma_vertical_m=0.04)
+    assert sorted(points_of(workspace)) == ["P1", "P2", "P3"]
+    assert points_of(workspace)["P1"].sigma_vertical_m == 0.04
+    assert [p.point for p in read_picks(workspace / "picks.csv")] == ["P1", "P1", "P2", "P3", "P3"]
+
+
+def test_metashape_markers_keep_their_accuracies_and_checks(
+    workspace: Path, tmp_path: Path
+) -> None:
+    found = import_control(workspace, markers_xml(tmp_path / "markers.xml"))
+    check_places(workspace)
+    np.testing.assert_allclose(picks_of(workspace), [[x, y] for _, _, x, y in PICKS], atol=1e-9)
+    assert (found.points, found.checks, found.picks) == (3, 1, 5)  # what is not pinned is no pick
+    points = points_of(workspace)
+    assert [points[n].use for n in "ABC"] == ["control", "check", "control"]
+    assert [points[n].sigma_m for n in "ABC"] == [0.01, 0.01, 0.03]
+    assert points["C"].sigma_vertical_m == 0.05
+    assert {p.sigma_px for p in read_picks(workspace / "picks.csv")} == {0.8}
+
+
+def test_heights_of_the_ellipsoid_stay_heights(workspace: Path, tmp_path: Path) -> None:
+    import_control(workspace, markers_xml(tmp_path / "m.xml"), heights="ellipsoid")
+    assert points_of(workspace)["A"].height_m == -12.5
+    assert math.isnan(points_of(workspace)["A"].depth_m)
+
+
+def test_a_local_grid_has_north_and_east(workspace: Path, tmp_path: Path) -> None:
+    local = '<reference>LOCAL_CS["Local",LOCAL_DATUM["Local",0],UNIT["metre",1]]</reference>'
+    path = markers_xml(tmp_path / "m.xml", system=local)
+    import_control(workspace, path)
+    point = points_of(workspace)["A"]
+    assert (point.north_m, point.east_m, point.depth_m) == (46.8426, -91.9946, 12.5)
+    with pytest.raises(WorkspaceError, match="local grid"):
+        import_control(workspace, path, heights="ellipsoid", overwrite=True)
+
+
+def test_pictures_of_a_rig_are_told_apart_by_their_folder(tmp_path: Path) -> None:
+    workspace = workspace_of(tmp_path / "w", ("left/1.png", "right/1.png", "left/2.png"))
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(
+        "EPSG:4326\n-91 46 1 10 20 left/1.png A\n-91 46 1 11 21 right\\1.png A\n"
+        "-91 46 1 12 22 2.png A\n-91 46 1 13 23 1.png A\n-91 46 1 13 23 9.png A\n"
+    )
+    warnings: list[str] = []
+    with collected_by(lambda _, text: warnings.append(text)):
+        import_control(workspace, path, sigma_m=0.1)
+    assert [p.image for p in read_picks(workspace / "picks.csv")] == [
+        "left/1.png", "right/1.png", "left/2.png",
+    ]  # fmt: skip
+    assert any("1.png, 9.png" in line for line in warnings)
+
+
+def test_nothing_is_replaced_unasked(workspace: Path, tmp_path: Path) -> None:
+    path = gcp_list(tmp_path / "gcp_list.txt")
+    (workspace / "picks.csv").write_text("image,point,x,y\n")
+    with pytest.raises(WorkspaceError, match=r"picks.csv is there.*--overwrite"):
+        import_control(workspace, path, sigma_m=0.02)
+    assert (workspace / "picks.csv").read_text() == "image,point,x,y\n"
+    assert not (workspace / "control.csv").exists()
+    import_control(workspace, path, sigma_m=0.02, overwrite=True)
+    assert len(picks_of(workspace)) == len(PICKS)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("EPSG:4326\n-91 46 1 10 20 DJI_1.jpg A\n", "--sigma"),
+        ("EPSG:4326\n-91 46 1 10 DJI_1.jpg\n", "line 2: 5 fields"),
+        ("EPSG:4326\n-91 46 1 10 20p DJI_1.jpg\n", "line 2: .*no five numbers"),
+        ("EPSG:999999\n-91 46 1 10 20 DJI_1.jpg\n", "no coordinate system"),
+        ("EPSG:32615\n1e12 46 1 10 20 DJI_1.jpg\n", "is not a place"),
+        (
+            "EPSG:4326\n-91 46 1 10 20 x.jpg A\n-91 47 1 1 2 x.jpg A\n",
+            "line 3: point A has another",
+        ),
+        ("EPSG:4326\n-91 46 nan 10 20 DJI_1.jpg A\n", "no point has a place"),
+        ("EPSG:4326\n", "no point has a place"),
+        ("easting northing\n1 2\n", "neither a gcp_list.txt"),
+        ("", "neither a gcp_list.txt"),
+        ("<document><chunk><markers></chunk>", "not valid XML"),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><document><markers/></document>', "DOCTYPE"),
+        ("<document><markers/></document>", "0 chunks"),
+        ("<document><chunk><markers/></chunk></document>", "no coordinate system"),
+    ],
+)
+def test_faults_are_named_in_one_line(
+    workspace: Path, tmp_path: Path, text: str, named: str
+) -> None:
+    path = tmp_path / "control.txt"
+    path.write_text(text)
+    with pytest.raises(WorkspaceError, match=named) as fault:
+        import_control(workspace, path)
+    assert "\n" not in str(fault.value)
+    assert not (workspace / "control.csv").exists()
+
+
+def test_pictures_that_are_not_there_are_named(workspace: Path, tmp_path: Path) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("EPSG:4326\n-91 46 1 10 20 other.jpg A\n")
+    with pytest.raises(WorkspaceError, match=r"none of its 1 picks .*other\.jpg"):
+        import_control(workspace, path, sigma_m=0.02)
