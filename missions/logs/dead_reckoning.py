@@ -65,7 +65,10 @@ class Track:
 
 
 def with_dead_reckoning(
-    dive: LoggedDive, errors: TrackErrors, start: tuple[float, float, float] | None
+    dive: LoggedDive,
+    errors: TrackErrors,
+    start: tuple[float, float, float] | None,
+    declination_deg: float = 0.0,
 ) -> LoggedDive:
     """A dive whose positions are those of its velocities and attitudes between its fixes.
 
@@ -74,11 +77,12 @@ def with_dead_reckoning(
         errors: of both.
         start: latitude, longitude (degrees) and standard deviation (metres) of the first velocity,
             for a dive without a fix there.
+        declination_deg: of the log's north, east positive.
 
     Raises:
         NavigationError: it has no velocity or no attitude, or no fix and no start.
     """
-    velocity, broken = _velocity_ne(dive)
+    velocity, broken = _velocity_ne(dive, np.deg2rad(declination_deg))
     fixes_s, fixes, sigmas = _fixes(dive)
     if start is not None:
         fixes_s = np.append(velocity.time_s[0], fixes_s)
@@ -151,7 +155,15 @@ def dead_reckoned(
     starts = np.searchsorted(at, np.arange(len(time_s) + 1))
     prior = np.array([errors.scale, np.deg2rad(errors.heading_deg)])
     state, spread, refused = _smooth(
-        steps, moves, breaks, starts, places, sigmas, prior, errors.noise_mps**2, _FAR_M**2,
+        steps,
+        moves,
+        breaks,
+        starts,
+        places,
+        sigmas,
+        prior,
+        errors.noise_mps**2,
+        _FAR_M**2,
         _GATE,
     )
     tied = np.isin(stretch, stretch[at])
@@ -161,8 +173,8 @@ def dead_reckoned(
     )
 
 
-def _velocity_ne(dive: LoggedDive) -> tuple[Signal, int]:
-    """Velocity to north and east, (N, 2), where known, and how many gaps break it."""
+def _velocity_ne(dive: LoggedDive, declination_rad: float) -> tuple[Signal, int]:
+    """Velocity to true north and east, (N, 2), where known, and how many gaps break it."""
     if dive.velocity_ned is not None:
         source, times = dive.velocity_ned.source, dive.velocity_ned.time_s
         ne = dive.velocity_ned.values[:, :2]
@@ -179,7 +191,8 @@ def _velocity_ne(dive: LoggedDive) -> tuple[Signal, int]:
     good = np.isfinite(ne).all(axis=1)
     if good.sum() < 2:
         raise NavigationError(f"{source}: no two velocities have an attitude")
-    times, ne = times[good], ne[good]
+    cos, sin = math.cos(declination_rad), math.sin(declination_rad)
+    times, ne = times[good], ne[good] @ np.array([[cos, sin], [-sin, cos]])
     broken = int((np.diff(times) > longest_gap_s(times)).sum())
     return Signal(source=source, time_s=times, values=ne), broken
 

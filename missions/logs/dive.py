@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from alice_survey.base.frames import Array
 from missions.logs.navigation_csv import interpolated
 
-ROLES = ("navigation", "depth", "attitude", "altitude")
+ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")
 """What of a log may be chosen by name."""
 DATED_AFTER_S = 1e8
 """Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""

@@ -15,6 +15,7 @@ from alice_survey.base.artefacts import read_csv
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
 from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
 from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
@@ -51,6 +52,10 @@ class ImportOptions:
     """Time zone of dates that name none (QGroundControl's CSV)."""
     vehicle_log: Path | None = None
     """Vehicle log to write, too."""
+    dead_reckon: TrackErrors | None = None
+    """How velocities err: positions are those of velocities and attitudes between fixes."""
+    start_at: tuple[float, float, float] | None = None
+    """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
     def __post_init__(self) -> None:
         numbers = (
@@ -64,6 +69,15 @@ class ImportOptions:
             raise NavigationError(
                 f"a declination of {self.declination_deg:g} degrees: give -180 to 180"
             )
+        if self.start_at is not None:
+            latitude, longitude, sigma = self.start_at
+            if self.dead_reckon is None:
+                raise NavigationError("--start-at is where dead reckoning starts: give it too")
+            if not (abs(latitude) <= 85 and abs(longitude) <= 360 and 0 < sigma < math.inf):
+                raise NavigationError(
+                    f"--start-at {latitude:g} {longitude:g} {sigma:g}: give latitude, longitude "
+                    "(degrees) and a sigma above 0 (metres)"
+                )
 
 
 def import_log(
@@ -92,6 +106,10 @@ def import_log(
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
     dive = read_dive(path, options)
+    if options.dead_reckon is not None:
+        dive = with_dead_reckoning(
+            dive, options.dead_reckon, options.start_at, options.declination_deg
+        )
     dated = dive.dated or options.start_utc is not None
     if options.start_utc is not None:
         dive = _dated(dive, options.start_utc)
