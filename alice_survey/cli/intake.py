@@ -95,7 +95,7 @@ def join(
         "import-log sparus2.bag -o navigation.csv",
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
         "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
-        "import-log dvl.mcap --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
+        "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     ),
 )
 def import_log(

@@ -1,6 +1,7 @@
 """What a vehicle's own log records of a dive, in any format: series of numbers against time."""
 
 import bisect
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -101,6 +102,15 @@ class LoggedDive:
                 )
                 times = np.union1d(times, signal.time_s[lacking])
         return times
+
+
+def finite_number(value: object) -> float:
+    """A number of a log that may hold anything; NaN for what is none."""
+    try:
+        number = float(value)  # type: ignore[arg-type]  # what is none raises
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+    return number if math.isfinite(number) and not isinstance(value, bool) else math.nan
 
 
 def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:

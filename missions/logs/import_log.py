@@ -21,6 +21,8 @@ from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
+_JSON = (".json", ".jsonl", ".log", ".txt", "")
+"""What files of JSON reports are called."""
 _LONGEST_S = 1e9
 _MICRO = 1e6
 
@@ -155,6 +157,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
     from missions.logs.qgc_csv import read_qgc_csv
     from missions.logs.ros_bag import is_bag, read_ros_bag
+    from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
@@ -165,6 +168,8 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     if path.is_dir() or is_bag(path):
         datum = None if options.datum_deg is None else Datum(*options.datum_deg)
         return read_ros_bag(path, chosen, datum)
+    if suffix in _JSON and is_waterlinked(path):
+        return read_waterlinked(path, chosen)
     if suffix in (".bin", ".log"):
         return read_ardusub_bin(path, chosen)
     if suffix == ".tlog":
@@ -173,7 +178,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_qgc_csv(path, chosen, options.time_zone)
     raise NavigationError(
         f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
-        ".log or .tlog, or QGroundControl's .csv"
+        ".log or .tlog, QGroundControl's .csv, or JSON reports of a Water Linked DVL"
     )
 
 
