@@ -51,7 +51,7 @@ class TrackErrors:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
+class ReckonedTrack:
     """Places of a dive about a datum."""
 
     time_s: Array
@@ -126,7 +126,7 @@ def with_dead_reckoning(
 
 def dead_reckoned(
     velocity: Signal, fixes: tuple[Array, Array, Array], errors: TrackErrors
-) -> Track:
+) -> ReckonedTrack:
     """Smooth a track of velocities over fixes.
 
     Args:
@@ -168,7 +168,7 @@ def dead_reckoned(
     )
     tied = np.isin(stretch, stretch[at])
     state[~tied], spread[~tied] = np.nan, np.nan
-    return Track(
+    return ReckonedTrack(
         time_s=time_s, ne=state, sigma_m=np.sqrt(0.5 * spread.sum(axis=1)), refused=int(refused)
     )
 
