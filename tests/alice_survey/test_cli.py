@@ -22,8 +22,8 @@ from camera_calib.rig import design_rig, write_rig
 
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
-    "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-log", "measure",
-    "control", "quality", "mosaic-tiles", "report", "view", "join",
+    "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-control",
+    "import-log", "measure", "control", "quality", "mosaic-tiles", "report", "view", "join",
 )  # fmt: skip
 
 
