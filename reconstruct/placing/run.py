@@ -72,7 +72,7 @@ from reconstruct.placing.track import (
     write_track_geojson,
     write_track_tum,
 )
-from reconstruct.views.model import WorldFrame, read_warps, write_frame
+from reconstruct.views.model import MEAN_PLANE, WorldFrame, read_warps, write_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction
 
 RIG_SCALE_SIGMA = 1e-3
@@ -81,7 +81,6 @@ RIG_SCALE_SIGMA = 1e-3
 LENGTH_SCALE_SIGMA = 1e-2
 """Relative sigma of a scale from one length that a person measured."""
 _VERTICAL_OF_CONTROL = "WGS 84 ellipsoid, or the level of the control points' depths"
-_VERTICAL_OF_LEVEL = "mean plane of the sea floor in the pictures"
 _LOCAL = "placed by control points in their own north, east and depth; no CRS"
 
 
@@ -346,7 +345,7 @@ def find_place(task: Placing) -> Placed:
             if any(record.readings["depth"] for record in task.records):
                 vertical = str(task.survey.vertical_datum)
             elif local is not None or not ties.used_points:
-                vertical = _VERTICAL_OF_LEVEL
+                vertical = MEAN_PLANE
         notes += [source] if datum is not None else [source, local or _LOCAL]
     else:
         found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
@@ -355,7 +354,7 @@ def find_place(task: Placing) -> Placed:
         if found is not None:
             factor, source = found[0], _scale_source(known, ties)
         place = replace(levelled, scale=factor, translation=factor * levelled.translation)
-        scaled, vertical = known is not None or found is not None, _VERTICAL_OF_LEVEL
+        scaled, vertical = known is not None or found is not None, MEAN_PLANE
         turned = None if scaled else _turned(task, levelled)
         if turned is not None:
             place, note = turned
