@@ -69,6 +69,40 @@ def fused(
     return float(mean), sigma, len(used), len(set(stations[used]))
 
 
+def surfaces(
+    heights: Array, sigmas: Array, places: Array, steepness: Array, cell: float
+) -> list[list[int]]:
+    """The points of each surface of a cell from above, as `surfaces_of` tells them apart."""
+    ranks = [int(i) for i in np.argsort(heights, kind="stable")]
+
+    def parted(parts: list[list[int]], slopes: list[float] | None) -> list[list[int]]:
+        joined = [list(parts[0])]
+        for n, part in enumerate(parts[1:], 1):
+            below, above = parts[n - 1][-1], part[0]
+            least = 5.0 * math.hypot(sigmas[below], sigmas[above])
+            if slopes is None:
+                least += cell
+            else:
+                known = [slope for slope in (slopes[n - 1], slopes[n]) if not math.isnan(slope)]
+                least += math.sqrt(2) * cell * max(known) if known else math.inf
+            if heights[above] - heights[below] > least:
+                joined.append([])
+            joined[-1] += part
+        return joined
+
+    parts = parted([[i] for i in ranks], None)
+    slopes = []
+    for part in parts:
+        known = sorted(float(steepness[i]) for i in part if not math.isnan(steepness[i]))
+        slopes.append(known[len(known) // 2] if known else math.nan)
+    shown = [
+        part
+        for part in parted(parts, slopes)
+        if len(part) >= 3 and len({int(places[i]) for i in part}) >= 2
+    ]
+    return shown[::-1] if len(shown) > 1 else [ranks]
+
+
 def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> float:
     """How far the DEM rises at most over the line from a cell to the camera (negative: free).
 

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense.points import EDGE_ON, Points
+from reconstruct.dense.points import Points
 from reconstruct.dense.surfaces import sorted_ranks, surfaces_of
 from reconstruct.raster import DemGrid
 
 Float32 = NDArray[np.float32]
 
 _GATE = 3.0
+_STEEPEST = np.float32(1e-3)
+"""Third part of a unit normal below which a surface counts as upright."""
 FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
 STRAY_CELLS = 8
@@ -53,22 +55,22 @@ class FusedCells:
         )
 
 
-def fuse_points(grid: DemGrid, points: Points, stations: NDArray[np.int64]) -> FusedCells:
+def fuse_points(
+    grid: DemGrid, points: Points, stations: NDArray[np.int64], least_up: float
+) -> FusedCells:
     """Give each cell of a grid one height from the points that fall in it, and what lies below.
-
-    Points whose normal is known to be turned away from above, or nearly so, are left out.
 
     Args:
         grid: cells, of which points outside are ignored, in the coordinates of the points.
         points: of all views that see the grid.
         stations: (V,) of every view, by its number.
+        least_up: least third part of a point's unit normal, where it is known, for it to count.
     """
-    up = points.normals[:, 2]
-    facing = points.part(~(up < EDGE_ON))  # NaN compares as False
+    facing = points.part(~(points.normals[:, 2] < least_up))  # NaN compares as False
     starts, order = bin_points(
         facing.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
     )
-    up = facing.normals[order, 2]
+    up = np.maximum(facing.normals[order, 2], _STEEPEST)
     steepness = np.sqrt(np.maximum(1.0 - up * up, 0.0)) / up
     height, sigma, count, met, surfaces, lower = fuse_cells(
         starts, facing.enu[order, 2], facing.sigmas[order], facing.views[order], stations,

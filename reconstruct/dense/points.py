@@ -18,7 +18,7 @@ _BLOCK = 16
 _ROUNDING = 1e-6
 """Relative rounding of coordinates as float32; kernels and arrays differ by less."""
 EDGE_ON = math.cos(math.radians(80.0))
-"""Least part along the vertical of a point's normal for it to count as seen from above."""
+"""Least third part of a point's normal for it to be on a surface that a plane's viewer sees."""
 _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 
