@@ -258,7 +258,8 @@ def _axes(plane: Plane) -> dict[str, Direction]:
 
 
 def _enu(ned: Array) -> Direction:
-    return float(ned[1]), float(ned[0]), float(-ned[2]) + 0.0
+    east, north, up = (round(float(v), 15) + 0.0 for v in (ned[1], ned[0], -ned[2]))
+    return east, north, up
 
 
 def write_plane(folder: Path, plane: Plane, world: WorldFrame) -> None:

@@ -269,9 +269,8 @@ def _solve(
     views: Sequence[SeenView],
     blocks: Sequence[Block],
     wanted: Literal["even", "water", "raw"],
-    looks: Callable[
-        [Callable[[LightTask], LightSamples], Sequence[LightTask]], Iterator[LightSamples]
-    ],
+    executor: Executor,
+    label: str,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
     if wanted == "raw":
