@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -269,12 +269,33 @@ def sparse_model(views: list[View], scene: Scene, points: int = 400, seed: int =
     )
 
 
-def write_workspace(folder: Path, model: SparseModel, scene: Scene) -> Path:
-    """A workspace with finished `images` and `sparse` stages."""
+def write_workspace(
+    folder: Path,
+    model: SparseModel,
+    scene: Scene,
+    world_from_scene: RigidTransform | None = None,
+) -> Path:
+    """A workspace with finished `images` and `sparse` stages.
+
+    Args:
+        folder: of the workspace.
+        model: of the scene.
+        scene: what pictures show.
+        world_from_scene: where scene and cameras stand in the world, together; None where they are.
+    """
     for view in model.views:
         path = folder / "images" / view.image
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), render(view, scene))
+    if world_from_scene is not None:
+        model = replace(
+            model,
+            views=tuple(
+                replace(view, world_from_cam=world_from_scene * view.world_from_cam)
+                for view in model.views
+            ),
+            points_world=world_from_scene.apply(model.points_world),
+        )
     sparse = folder / "sparse"
     (sparse / "model").mkdir(parents=True)
     _colmap(model).write(str(sparse / "model"))

@@ -55,18 +55,17 @@ class FusedCells:
         )
 
 
-def fuse_points(
-    grid: DemGrid, points: Points, stations: NDArray[np.int64], least_up: float
-) -> FusedCells:
+def fuse_points(grid: DemGrid, points: Points, stations: NDArray[np.int64]) -> FusedCells:
     """Give each cell of a grid one height from the points that fall in it, and what lies below.
+
+    Points whose normal is known to look down do not count.
 
     Args:
         grid: cells, of which points outside are ignored, in the coordinates of the points.
         points: of all views that see the grid.
         stations: (V,) of every view, by its number.
-        least_up: least third part of a point's unit normal, where it is known, for it to count.
     """
-    facing = points.part(~(points.normals[:, 2] < least_up))  # NaN compares as False
+    facing = points.part(~(points.normals[:, 2] < 0.0))  # NaN compares as False
     starts, order = bin_points(
         facing.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
     )

@@ -20,7 +20,7 @@ from reconstruct.dense.dem import (
     slope_deg,
     without_strays,
 )
-from reconstruct.dense.points import EDGE_ON, Points, joined, points_in_box
+from reconstruct.dense.points import Points, joined, points_in_box
 from reconstruct.dense.pose_part import PosePart, spread_over
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightModel
@@ -138,9 +138,7 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> Tile:
     offset = np.array(setup.offset_enu)
     grid = task.grid.moved(-offset[0], -offset[1])
     points = _points_over(setup, task, grid, offset)
-    # flanks of the sea floor are part of it; the floor at its foot is not part of a wall
-    least_up = 0.0 if setup.plane == LEVEL else EDGE_ON
-    cells = fuse_points(grid, points, setup.stations, least_up)
+    cells = fuse_points(grid, points, setup.stations)
     cells = cells.without(~without_strays(cells.height))
     height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS)
     if task.pose_sigmas is not None:  # once, however many views: they share it

@@ -230,8 +230,9 @@ def lay_out_view(sigma_factor: float, plane: str, task: ViewTask) -> ViewSummary
 
     Args:
         sigma_factor: on the standard deviations of refined depths.
-        plane: name of the plane, by which the view's part in it is kept. Over all but the level
-            one, on which the cloud rests too, points count that face the plane's viewer.
+        plane: name of the plane, by which the view's part in it is kept. The level one takes all
+            points, for the cloud, and flanks of the sea floor are part of it; others take those
+            that are known to face the plane's viewer: the floor at its foot is no part of a wall.
         task: the view, in the frame of the plane.
     """
     store, view = task.store, task.view
@@ -240,7 +241,7 @@ def lay_out_view(sigma_factor: float, plane: str, task: ViewTask) -> ViewSummary
     kept = store.load_mask(task.index, "kept", view.pinhole.width_px)
     if plane != LEVEL:
         with np.errstate(invalid="ignore"):
-            kept &= ~(normals_up(depth, view) < EDGE_ON)
+            kept &= normals_up(depth, view) >= EDGE_ON
     rows, columns = np.nonzero(kept)
     if len(rows) < _LEAST_PIXELS:
         return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, sigma=np.nan)

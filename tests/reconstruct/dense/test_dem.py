@@ -102,7 +102,7 @@ def test_fuse_cells_equals_its_slow_twin():
 def test_heights_are_up_and_rows_go_south():
     grid = DemGrid(west=0.0, north=2.0, cell=1.0, rows=2, columns=2)
     enu = np.array([[0.5, 1.5, -10.0], [1.5, 1.5, -11.0], [0.5, 0.5, -12.0]])
-    found = fuse_points(grid, points(enu, np.full(3, 0.01), np.arange(3)), np.arange(3), 0.0)
+    found = fuse_points(grid, points(enu, np.full(3, 0.01), np.arange(3)), np.arange(3))
     np.testing.assert_allclose(found.height[[0, 0, 1], [0, 1, 0]], [-10, -11, -12])
     assert np.isnan(found.height[1, 1])
     assert found.count.tolist() == [[1, 1], [1, 0]]
@@ -114,9 +114,9 @@ def test_a_few_outliers_do_not_move_a_cell():
     grid = DemGrid(west=0.0, north=1.0, cell=1.0, rows=1, columns=1)
     enu = np.column_stack([rng.uniform(0.1, 0.9, (60, 2)), rng.normal(5.0, 0.003, 60)])
     stations = np.arange(6)
-    clean = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations, 0.0)
+    clean = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
     enu[::6, 2] += 0.3
-    dirty = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations, 0.0)
+    dirty = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
     assert abs(dirty.height[0, 0] - clean.height[0, 0]) < 0.001
     assert abs(clean.height[0, 0] - 5.0) < 3 * clean.sigma[0, 0]
     assert 0.0005 < clean.sigma[0, 0] < 0.003  # six views, each 3 mm

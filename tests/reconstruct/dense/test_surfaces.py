@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reconstruct.dense.dem import FusedCells, fuse_points
-from reconstruct.dense.points import EDGE_ON, Points
+from reconstruct.dense.points import Points
 from reconstruct.raster import DemGrid
 
 CELL_M, SIGMA_M = 0.01, 0.002
@@ -61,9 +61,9 @@ def together(*sheets: Points) -> Points:
     )
 
 
-def fused(points: Points, cells: int = 30, least_up: float = 0.0) -> FusedCells:
+def fused(points: Points, cells: int = 30) -> FusedCells:
     grid = DemGrid(west=0.0, north=CELL_M, cell=CELL_M, rows=1, columns=cells)
-    return fuse_points(grid, points, STATIONS, least_up)
+    return fuse_points(grid, points, STATIONS)
 
 
 def test_an_overhang_above_the_floor_is_two_surfaces():
@@ -106,8 +106,6 @@ def test_a_steep_wall_is_one_surface_with_a_large_sigma(height_m: float):
     found = fused(wall)
     assert (found.surfaces == 1).all()
     np.testing.assert_allclose(found.sigma, height_m / math.sqrt(12) / math.sqrt(12), rtol=0.25)
-    seen = found if slope_deg < 80 else fused(wall, least_up=EDGE_ON)
-    assert np.isfinite(seen.height).all() == (slope_deg < 80)
 
 
 def test_undersides_do_not_count():
