@@ -672,10 +672,11 @@ STAGES: tuple[StageSpec, ...] = (
         products={
             "dem.tif": "elevation model (GeoTIFF)",
             "sigma.tif": "sigma of its heights",
+            "planes": "the same over further planes",
             "cloud.laz": "point cloud with colour, normal, sigma",
         },
         picture="dem.png",
-        reported=("dem.tif", "sigma.tif"),
+        reported=("dem.tif", "sigma.tif", "plane.json", "planes"),
     ),
     StageSpec(
         name="mosaic",
@@ -696,10 +697,11 @@ STAGES: tuple[StageSpec, ...] = (
         summary=_mosaic_summary,
         products={
             "mosaic.tif": "orthomosaic (cloud-optimised GeoTIFF)",
+            "planes": "those of further planes",
             "footprints.geojson": "what each picture shows",
         },
         picture="mosaic.png",
-        reported=("mosaic.tif",),
+        reported=("mosaic.tif", "planes"),
     ),
     StageSpec(
         name="mesh",
