@@ -127,7 +127,7 @@ def best_plane(model: SparseModel) -> Plane:
     azimuth = math.degrees(math.atan2(normal[1], normal[0])) % 360.0
     tilt = math.degrees(math.asin(max(-1.0, min(1.0, -normal[2]))))
     rotation = facing(azimuth, tilt)
-    about = f"best plane: {_words(round(azimuth, 1), round(tilt, 1))}"
+    about = f"best plane: {_words(round(azimuth, 1) + 0.0, round(tilt, 1) + 0.0)}"
     if upright is not None:
         into = -normal
         rotation = Rotation.from_matrix(np.stack([upright, np.cross(into, upright), into]))

@@ -13,6 +13,7 @@ from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, heard
 from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
+from reconstruct.evaluate.elevation import elevation_in
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -196,3 +197,9 @@ def test_planes_that_nothing_faces_are_an_error(wall: tuple[Path, list[str]], tm
         (tmp_path / name).symlink_to(wall[0] / name)
     with pytest.raises(ReconstructionError, match="nothing is seen on any of the planes"):
         spec("dense").make(tmp_path, config("back=facing 0"), SERIAL)
+
+
+def test_scores_and_comparisons_refuse_a_dem_of_a_wall(wall: tuple[Path, list[str]], level: Path):
+    assert elevation_in(level / "dense").cell == 0.01
+    with pytest.raises(ReconstructionError, match=r"of the plane 'wall', not level.*planes"):
+        elevation_in(wall[0] / "dense")
