@@ -383,17 +383,25 @@ def _dense_inputs(workspace: Path) -> list[Path]:
 
 def _dense_summary(folder: Path) -> Summary:
     found = records.CloudRecord.read(folder / "cloud.json")
-    return f"{found.points} points; surface in {folder / 'dem.tif'}", found.to_json()
+    surfaces = [folder / "dem.tif", *sorted(folder.glob("planes/*/dem.tif"))]
+    text = f"{found.points} points; surface in {', '.join(str(path) for path in surfaces)}"
+    return text, found.to_json()
 
 
 def _mosaic_inputs(workspace: Path) -> list[Path]:
-    return [workspace / "dense" / "dem.tif", *_model_inputs(workspace)]
+    dense = workspace / "dense"
+    planes = sorted((dense / "planes").glob("*/dem.tif"))
+    about = _there(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
+    return [dense / "dem.tif", *planes, *about, *_model_inputs(workspace)]
 
 
 def _mosaic_summary(folder: Path) -> Summary:
-    found = records.MosaicRecord.read(folder / "mosaic.json")
-    text = f"{found.width_px} x {found.height_px} px in {folder / 'mosaic.tif'}"
-    return text, found.to_json()
+    texts, values = [], []
+    for path in _there(folder / "mosaic.json", *sorted(folder.glob("planes/*/mosaic.json"))):
+        found = records.MosaicRecord.read(path)
+        texts.append(f"{found.width_px} x {found.height_px} px in {path.with_suffix('.tif')}")
+        values.append(found.to_json())
+    return "; ".join(texts), values[0] if values else {}
 
 
 def _mesh_inputs(workspace: Path) -> list[Path]:
@@ -653,28 +661,29 @@ STAGES: tuple[StageSpec, ...] = (
         folder="dense",
         command="reconstruct",
         about="the surface: depth of every view, fused",
-        version=4,
+        version=5,
         work="reconstruct.dense.run:run_dense",
         takes=("reconstruct",),
         needs=("image", "placing"),
-        settings=only("reconstruct", "dense_scale", "dense_partners", "dem_cell_m"),
+        settings=only("reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes"),
         inputs=_dense_inputs,
         summary=_dense_summary,
         resumes=True,
         products={
             "dem.tif": "elevation model (GeoTIFF)",
             "sigma.tif": "sigma of its heights",
+            "planes": "the same over further planes",
             "cloud.laz": "point cloud with colour, normal, sigma",
         },
         picture="dem.png",
-        reported=("dem.tif", "sigma.tif"),
+        reported=("dem.tif", "sigma.tif", "plane.json", "planes"),
     ),
     StageSpec(
         name="mosaic",
         folder="mosaic",
         command="reconstruct",
         about="the orthomosaic, painted on the surface",
-        version=5,
+        version=6,
         work="reconstruct.mosaic.run:run_mosaic",
         takes=("reconstruct", "water", "area.seafloor_depth_m"),
         needs=("image", "placing", "dense"),
@@ -688,10 +697,11 @@ STAGES: tuple[StageSpec, ...] = (
         summary=_mosaic_summary,
         products={
             "mosaic.tif": "orthomosaic (cloud-optimised GeoTIFF)",
+            "planes": "those of further planes",
             "footprints.geojson": "what each picture shows",
         },
         picture="mosaic.png",
-        reported=("mosaic.tif",),
+        reported=("mosaic.tif", "planes"),
     ),
     StageSpec(
         name="mesh",

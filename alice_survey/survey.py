@@ -61,6 +61,7 @@ def run(
     scale: int | None = None,
     executor: Executor | None = None,
     flight: FlightChanges | None = None,
+    planes: Sequence[str] | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Run stages one after the other; those that are up to date are skipped.
 
@@ -71,6 +72,7 @@ def run(
         scale: overrides `imaging.scale`.
         executor: where tasks run; None for all cores of this machine.
         flight: overrides vehicle and sea.
+        planes: overrides `reconstruct.planes`.
 
     Returns:
         Results of each stage, as text and as JSON values.
@@ -83,6 +85,14 @@ def run(
     if flight is not None and flight != FlightChanges():
         config = flight.applied(config)
         warn("these options hold for this flight alone: to keep them, put them into survey.toml")
+    if planes:
+        config = changed(config, "reconstruct", planes=list(planes))
+        if config.reconstruct.planes != planned.reconstruct.planes:
+            warn(
+                "these planes hold for this run alone, the next without them makes the surface "
+                f"again: to keep them, put planes = {json.dumps(list(planes))} below "
+                "[reconstruct] in survey.toml"
+            )
     if imported:
         if len(stages) > 1:  # a rig of real pictures comes with them
             stages = [stage for stage in stages if stage != "calibrate"]

@@ -99,8 +99,8 @@ def local_crs(datum: Datum) -> CRS:
 
 
 def crs_of(frame: WorldFrame) -> CRS | None:
-    """The projection of rasters of a frame; None in the `model` frame."""
-    return None if frame.name == "model" or frame.datum is None else local_crs(frame.datum)
+    """The projection of rasters of a frame; None in those of a model and of a plane."""
+    return None if frame.name != "ned" or frame.datum is None else local_crs(frame.datum)
 
 
 def transform_of(grid: DemGrid) -> Affine:
@@ -118,7 +118,7 @@ def frame_tags(frame: WorldFrame) -> dict[str, str]:
     }
     if frame.notes:
         tags["NOTES"] = "; ".join(frame.notes)
-    return tags
+    return tags | dict(frame.tags)
 
 
 @contextmanager

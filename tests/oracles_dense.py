@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -67,6 +67,40 @@ def fused(
     used = np.unique(v)
     sigma = math.sqrt(1 / formal + variance / len(used))
     return float(mean), sigma, len(used), len(set(stations[used]))
+
+
+def surfaces(
+    heights: Array, sigmas: Array, places: Array, steepness: Array, cell: float
+) -> list[list[int]]:
+    """The points of each surface of a cell from above, as `surfaces_of` tells them apart."""
+    ranks = [int(i) for i in np.argsort(heights, kind="stable")]
+
+    def parted(parts: list[list[int]], slopes: list[float] | None) -> list[list[int]]:
+        joined = [list(parts[0])]
+        for n, part in enumerate(parts[1:], 1):
+            below, above = parts[n - 1][-1], part[0]
+            least = 5.0 * math.hypot(sigmas[below], sigmas[above])
+            if slopes is None:
+                least += cell
+            else:
+                known = [slope for slope in (slopes[n - 1], slopes[n]) if not math.isnan(slope)]
+                least += math.sqrt(2) * cell * max(known) if known else math.inf
+            if heights[above] - heights[below] > least:
+                joined.append([])
+            joined[-1] += part
+        return joined
+
+    parts = parted([[i] for i in ranks], None)
+    slopes = []
+    for part in parts:
+        known = sorted(float(steepness[i]) for i in part if not math.isnan(steepness[i]))
+        slopes.append(known[len(known) // 2] if known else math.nan)
+    shown = [
+        part
+        for part in parted(parts, slopes)
+        if len(part) >= 3 and len({int(places[i]) for i in part}) >= 2
+    ]
+    return shown[::-1] if len(shown) > 1 else [ranks]
 
 
 def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> float:
@@ -235,12 +269,33 @@ def sparse_model(views: list[View], scene: Scene, points: int = 400, seed: int =
     )
 
 
-def write_workspace(folder: Path, model: SparseModel, scene: Scene) -> Path:
-    """A workspace with finished `images` and `sparse` stages."""
+def write_workspace(
+    folder: Path,
+    model: SparseModel,
+    scene: Scene,
+    world_from_scene: RigidTransform | None = None,
+) -> Path:
+    """A workspace with finished `images` and `sparse` stages.
+
+    Args:
+        folder: of the workspace.
+        model: of the scene.
+        scene: what pictures show.
+        world_from_scene: where scene and cameras stand in the world, together; None where they are.
+    """
     for view in model.views:
         path = folder / "images" / view.image
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), render(view, scene))
+    if world_from_scene is not None:
+        model = replace(
+            model,
+            views=tuple(
+                replace(view, world_from_cam=world_from_scene * view.world_from_cam)
+                for view in model.views
+            ),
+            points_world=world_from_scene.apply(model.points_world),
+        )
     sparse = folder / "sparse"
     (sparse / "model").mkdir(parents=True)
     _colmap(model).write(str(sparse / "model"))

@@ -18,6 +18,7 @@ from pydantic import (
 
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import ConfigError
+from alice_survey.base.plane_settings import parse_planes
 from alice_survey.base.seawater import GREEN_NM, n_water, n_water_sigma
 
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
@@ -330,12 +331,19 @@ class ReconstructConfig(Config):
     dense_scale: float | None = Field(None, gt=0.05, le=1)
     dense_partners: int = Field(4, ge=1, le=12)
     dem_cell_m: float | None = Field(None, gt=0, le=10)
+    planes: tuple[str, ...] = ("level",)
     mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
     mesh_triangles: int | None = Field(None, ge=100, le=50_000_000)
     mesh_error_px: float = Field(0.25, ge=0.01, le=10)
     mesh_page_px: int = Field(8192, ge=512, le=16_384)
     colour: Literal["even", "water", "raw"] = "even"
     dispersion: Literal["auto", "on", "off"] = "auto"
+
+    @field_validator("planes")
+    @classmethod
+    def _planes_can_be_read(cls, planes: tuple[str, ...]) -> tuple[str, ...]:
+        parse_planes(planes)
+        return planes
 
 
 class SurveyConfig(Config):

@@ -388,6 +388,30 @@ class CloudRecord(JsonRecord):
     thinned_to: float
 
 
+Direction = tuple[float, float, float]
+
+
+class PlaneRecord(JsonRecord):
+    """`plane.json` of a folder: the plane that its rasters are projected on.
+
+    A raster's place (x, y) and height h there are the point origin + x right + y up + h out, in the
+    model's unit: east, north and up from the datum.
+    """
+
+    path: ClassVar = "dense/plane.json"
+    name: str
+    about: str
+    origin_enu: Direction
+    right_enu: Direction
+    up_enu: Direction
+    out_enu: Direction
+    """Unit vectors: right and up in the plane for its viewer, and out of it towards the viewer."""
+    frame: Literal["ned", "model"]
+    unit: str
+    datum: PlaceRecord | None = None
+    vertical_datum: str
+
+
 class SurfaceRecord(JsonRecord):
     """`dense/surface.json`."""
 

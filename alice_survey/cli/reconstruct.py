@@ -25,6 +25,7 @@ reconstruct_app = typer.Typer(
     epilog=examples(
         "reconstruct -w reef",
         "reconstruct -w reef --threads 2 --json",
+        "reconstruct -w quay --plane level --plane 'wall=facing 180'",
         "reconstruct pair left.png right.png --rig rig.json -o stingray",
     ),
 )
@@ -35,6 +36,13 @@ def reconstruct(
     context: typer.Context,
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
+    plane: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Plane of DEM and mosaic, any number: level, auto (the best one), or "
+            "'NAME=facing DEGREES tilt DEGREES': where the surface faces, and its lean back."
+        ),
+    ] = None,
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
@@ -47,7 +55,8 @@ def reconstruct(
         from alice_survey.survey import run
 
         stages = names("calibrate", "reconstruct")
-        print_result(*run(stages, workspace, survey, None, executor_of(threads)), as_json)
+        result = run(stages, workspace, survey, None, executor_of(threads), planes=plane)
+        print_result(*result, as_json)
 
 
 @reconstruct_app.command(

@@ -296,14 +296,16 @@ def plain_name(name: str) -> str:
 
 
 def shrunk_png(path: Path, most_px: int = _MOST_PX) -> bytes:
-    """A picture that a stage has drawn, at most this many pixels wide and high.
+    """A picture that a stage has drawn, at most this many pixels wide and high; on white.
 
     Raises:
         WorkspaceError: it cannot be decoded.
     """
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise WorkspaceError(f"{path} cannot be read as a picture: run its stage again")
+    if picture.ndim == 3 and picture.shape[2] == 4:
+        picture = np.where(picture[..., 3:] > 0, picture[..., :3], 255).astype(picture.dtype)
     height, width = picture.shape[:2]
     shrink = max(width, height) / most_px
     if shrink > 1.0:

@@ -121,7 +121,7 @@ def _surface(held: Held) -> Surface:
     dense = held.workspace / "dense"
     heights, sigmas, stations = [], [], []
     known = wanted = reached = 0
-    area = planned_area(held)
+    area = planned_area(held) if held.plane is None else None
     with (
         rasterio.open(dense / "dem.tif") as dem,
         rasterio.open(dense / "sigma.tif") as sigma,

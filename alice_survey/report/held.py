@@ -13,7 +13,14 @@ import numpy as np
 from alice_survey import stages
 from alice_survey.base.artefacts import JsonRecord, StageRecord
 from alice_survey.base.frames import Array
-from alice_survey.base.records import ChangeRecord, FrameRecord, PicturesRecord, PlaceRecord
+from alice_survey.base.plane_settings import LEVEL
+from alice_survey.base.records import (
+    ChangeRecord,
+    FrameRecord,
+    PicturesRecord,
+    PlaceRecord,
+    PlaneRecord,
+)
 from alice_survey.stages import finished
 from missions.values.plan_file import Plan, read_plan
 
@@ -82,6 +89,12 @@ class Held:
         return self.read(FrameRecord) or FrameRecord(
             datum=None if self.plan is None else _place(self.plan)
         )
+
+    @cached_property
+    def plane(self) -> PlaneRecord | None:
+        """The plane of surface and mosaic where it is not the level one."""
+        found = self.read(PlaneRecord)
+        return None if found is None or found.name == LEVEL else found
 
     @property
     def unit(self) -> str:

@@ -104,6 +104,9 @@ def _title_block(held: Held) -> list[tuple[str, str]]:
 def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> SurveyMap:
     """The map of a workspace, with some layers."""
     datum = held.frame.datum
+    if held.plane is not None:
+        origin = f"the plane {held.plane.name}, {held.plane.about}: right and up in it"
+        return SurveyMap(layers=layers, unit=held.unit, origin=origin, placed=False)
     if datum is None or held.frame.name != "ned":
         return SurveyMap(layers=layers, unit=held.unit, origin="the model's own axes", placed=False)
     place = f"{datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"

@@ -38,6 +38,7 @@ from alice_survey.kit.words import (
 from alice_survey.report import plots
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, known_column
+from alice_survey.report.planes import planes_section
 from camera_calib.camera import camera_from_json
 from camera_calib.rig import Rig, read_rig
 from missions.values.plan_file import Plan
@@ -59,6 +60,9 @@ def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Sec
         yield _control(figures.control)
     if held.has("dense"):
         yield _surface(figures)
+    planes = planes_section(held)
+    if planes is not None:
+        yield planes
     if figures.registration is not None:
         yield _model(figures, figures.registration)
     if held.has("mapping") or held.has("calibration"):

@@ -24,7 +24,12 @@ Shape = Sequence[tuple[float, float]]
 
 
 def shape_layers(held: Held) -> Iterator[ShapeLayer]:
-    """All shapes that a workspace holds, the lowest first."""
+    """All shapes that a workspace holds, the lowest first.
+
+    They lie on the level map: there are none where surface and mosaic are of another plane.
+    """
+    if held.plane is not None:
+        return
     area = planned_area(held)
     if area is not None:
         yield ShapeLayer(

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.records import CloudRecord
-from reconstruct.dense.dem import bin_points, sorted_ranks
+from reconstruct.dense.dem import bin_points
 from reconstruct.dense.points import Points
+from reconstruct.dense.surfaces import sorted_ranks
 from reconstruct.ply import VERTEX as MESH_VERTEX
 from reconstruct.ply import write_ply
 from reconstruct.raster import DemGrid, crs_of

@@ -1,7 +1,7 @@
 """The digital elevation model: one robust height per cell, positive up, with sigma and count."""
 
 import math
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 from alice_survey.base.compiled import compiled
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.points import Points
+from reconstruct.dense.surfaces import sorted_ranks, surfaces_of
 from reconstruct.raster import DemGrid
 
 Float32 = NDArray[np.float32]
 
 _GATE = 3.0
+_STEEPEST = np.float32(1e-3)
+"""Third part of a unit normal below which a surface counts as upright."""
 FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
 STRAY_CELLS = 8
@@ -23,28 +26,64 @@ _LEAST_COMPANY = 0.22
 """Share of that square that must be known; what is more isolated is mostly wrong."""
 
 
-def fuse_points(
-    grid: DemGrid, points: Points, stations: NDArray[np.int64]
-) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8]]:
-    """Give each cell of a grid one height from the points that fall in it.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FusedCells:
+    """What points show of the cells of a grid, (rows, columns) each."""
+
+    height: Float32
+    """Height of the uppermost surface; NaN in empty cells."""
+    sigma: Float32
+    count: NDArray[np.uint16]
+    """How many views the height rests on."""
+    stations: NDArray[np.uint8]
+    """How many stations; 255 stands for more."""
+    surfaces: NDArray[np.uint8]
+    """How many surfaces lie over each other; 0 in empty cells."""
+    lower: Float32
+    """Height of the lowest of several surfaces; NaN where there is one."""
+
+    def without(self, cells: NDArray[np.bool_]) -> "FusedCells":
+        """The same with some cells emptied."""
+        nan, none = np.float32(np.nan), np.uint8(0)
+        return FusedCells(
+            height=np.where(cells, nan, self.height),
+            sigma=np.where(cells, nan, self.sigma),
+            count=np.where(cells, np.uint16(0), self.count),
+            stations=np.where(cells, none, self.stations),
+            surfaces=np.where(cells, none, self.surfaces),
+            lower=np.where(cells, nan, self.lower),
+        )
+
+
+def fuse_points(grid: DemGrid, points: Points, stations: NDArray[np.int64]) -> FusedCells:
+    """Give each cell of a grid one height from the points that fall in it, and what lies below.
+
+    Points whose normal is known to look down do not count.
 
     Args:
         grid: cells, of which points outside are ignored, in the coordinates of the points.
         points: of all views that see the grid.
         stations: (V,) of every view, by its number.
-
-    Returns:
-        Height and standard deviation, NaN in empty cells, how many views the height rests on, and
-        how many stations (255 stands for more); (rows, columns) each.
     """
+    facing = points.part(~(points.normals[:, 2] < 0.0))  # NaN compares as False
     starts, order = bin_points(
-        points.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
+        facing.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
     )
-    height, sigma, count, met = fuse_cells(
-        starts, points.enu[order, 2], points.sigmas[order], points.views[order], stations, _GATE
-    )
+    up = np.maximum(facing.normals[order, 2], _STEEPEST)
+    steepness = np.sqrt(np.maximum(1.0 - up * up, 0.0)) / up
+    height, sigma, count, met, surfaces, lower = fuse_cells(
+        starts, facing.enu[order, 2], facing.sigmas[order], facing.views[order], stations,
+        steepness, grid.cell, _GATE,
+    )  # fmt: skip
     shape = (grid.rows, grid.columns)
-    return height.reshape(shape), sigma.reshape(shape), count.reshape(shape), met.reshape(shape)
+    return FusedCells(
+        height=height.reshape(shape),
+        sigma=sigma.reshape(shape),
+        count=count.reshape(shape),
+        stations=met.reshape(shape),
+        surfaces=surfaces.reshape(shape),
+        lower=lower.reshape(shape),
+    )
 
 
 @compiled
@@ -84,42 +123,17 @@ def bin_points(
 
 
 @compiled
-def sorted_ranks(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Indices that sort values upwards (Shell's sort, which numba compiles in no time).
-
-    The order of equal values depends on the values alone, not on the machine.
-    """
-    count = values.size
-    ranks = np.arange(count)
-    gap = 1
-    while gap < count:
-        gap = 3 * gap + 1
-    while gap > 1:
-        gap //= 3
-        for i in range(gap, count):
-            moved = ranks[i]
-            j = i
-            while j >= gap and values[ranks[j - gap]] > values[moved]:
-                ranks[j] = ranks[j - gap]
-                j -= gap
-            ranks[j] = moved
-    return ranks
-
-
-@compiled
 def fuse_cells(
     starts: NDArray[np.int64],
     heights: Float32,
     sigmas: Float32,
     views: NDArray[np.int32],
     stations: NDArray[np.int64],
+    steepness: Float32,
+    cell: float,
     gate: float,
-) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8]]:
-    """Robust height of each cell: the weighted mean of what lies near the median.
-
-    The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
-    median's own sigma. The standard deviation adds the formal one of independent views to the
-    scatter over the square root of the number of views: pixels of one view share their errors.
+) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8], Float32]:
+    """Robust height of each cell's uppermost surface, and of its lowest where it has several.
 
     Args:
         starts: (C + 1,) where the points of each cell start.
@@ -127,73 +141,114 @@ def fuse_cells(
         sigmas: (N,) of the heights.
         views: (N,) of the heights.
         stations: (V,) of every view, by its number.
+        steepness: (N,) tangent of the angle between normal and vertical; NaN where unknown.
+        cell: side of a cell.
         gate: in standard deviations.
 
     Returns:
-        (C,) height and sigma, NaN in empty cells, and number of views and of stations used (255
-        stands for more).
+        (C,) height and sigma, NaN in empty cells; number of views and of stations used (255 stands
+        for more); number of surfaces, and height of the lowest, NaN where there is one surface.
     """
     cells = starts.size - 1
     height = np.full(cells, np.nan, np.float32)
     sigma = np.full(cells, np.nan, np.float32)
     count = np.zeros(cells, np.uint16)
     met = np.zeros(cells, np.uint8)
-    for cell in range(cells):
-        first, last = starts[cell], starts[cell + 1]
+    surfaces = np.zeros(cells, np.uint8)
+    lowest = np.full(cells, np.nan, np.float32)
+    for n in range(cells):
+        first, last = starts[n], starts[n + 1]
         if first == last:
             continue
-        values = heights[first:last]
-        order = sorted_ranks(values)
-        half = 0.0
-        for i in range(values.size):
-            half += 0.5 / sigmas[first + i] ** 2
-        median_at, below = order[-1], 0.0
-        for i in order:
-            below += 1.0 / sigmas[first + i] ** 2
-            if below >= half:
-                median_at = i
-                break
-        median = values[median_at]
-        misses = np.empty(values.size, np.float32)
-        for i in range(values.size):
-            misses[i] = abs(values[i] - median)
-        ranks = sorted_ranks(misses)
-        middle = values.size // 2
-        scatter = MAD_TO_SIGMA * misses[ranks[middle]]
-        if values.size % 2 == 0:
-            scatter = 0.5 * (scatter + MAD_TO_SIGMA * misses[ranks[middle - 1]])
-        reach = gate * max(scatter, sigmas[first + median_at])
-        total, weights, squares = 0.0, 0.0, 0.0
-        formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
-        places, companions = np.empty(values.size, np.int64), 0
-        for i in range(values.size):
-            if abs(values[i] - median) > reach:
-                continue
-            w = 1.0 / sigmas[first + i] ** 2
-            total += w * (values[i] - median)
-            squares += w * (values[i] - median) ** 2
-            weights += w
-            if views[first + i] != last_view:
-                if in_view > 0:
-                    formal += view_weight / in_view
-                last_view, in_view, view_weight = views[first + i], 0, 0.0
-                seen += 1
-                place, known = stations[last_view], False
-                for k in range(companions):
-                    known = known or places[k] == place
-                if not known:
-                    places[companions] = place
-                    companions += 1
-            in_view += 1
-            view_weight += w
-        formal += view_weight / in_view
-        mean = total / weights
-        variance = max(squares / weights - mean * mean, 0.0)
-        height[cell] = median + mean
-        sigma[cell] = math.sqrt(1.0 / formal + variance / seen)
-        count[cell] = seen
-        met[cell] = min(companions, 255)
-    return height, sigma, count, met
+        values, spreads, seen_by = heights[first:last], sigmas[first:last], views[first:last]
+        found, of_point = surfaces_of(
+            values, spreads, stations[seen_by], steepness[first:last], cell
+        )
+        surfaces[n] = min(found, 255)
+        if found > 1:
+            floor = of_point == found - 1
+            lowest[n] = robust_height(
+                values[floor], spreads[floor], seen_by[floor], stations, gate
+            )[0]
+            top = of_point == 0
+            values, spreads, seen_by = values[top], spreads[top], seen_by[top]
+        height[n], sigma[n], count[n], met[n] = robust_height(
+            values, spreads, seen_by, stations, gate
+        )
+    return height, sigma, count, met, surfaces, lowest
+
+
+@compiled
+def robust_height(
+    heights: Float32,
+    sigmas: Float32,
+    views: NDArray[np.int32],
+    stations: NDArray[np.int64],
+    gate: float,
+) -> tuple[float, float, int, int]:
+    """Robust height of some points: the weighted mean of what lies near the median.
+
+    The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
+    median's own sigma. The standard deviation adds the formal one of independent views to the
+    scatter over the square root of the number of views: pixels of one view share their errors.
+
+    Args:
+        heights: (N,) sorted by view, one or more.
+        sigmas: (N,) of the heights.
+        views: (N,) of the heights.
+        stations: (V,) of every view, by its number.
+        gate: in standard deviations.
+
+    Returns:
+        Height and sigma, and number of views and of stations used (255 stands for more).
+    """
+    order = sorted_ranks(heights)
+    half = 0.0
+    for i in range(heights.size):
+        half += 0.5 / sigmas[i] ** 2
+    median_at, below = order[-1], 0.0
+    for i in order:
+        below += 1.0 / sigmas[i] ** 2
+        if below >= half:
+            median_at = i
+            break
+    median = heights[median_at]
+    misses = np.empty(heights.size, np.float32)
+    for i in range(heights.size):
+        misses[i] = abs(heights[i] - median)
+    ranks = sorted_ranks(misses)
+    middle = heights.size // 2
+    scatter = MAD_TO_SIGMA * misses[ranks[middle]]
+    if heights.size % 2 == 0:
+        scatter = 0.5 * (scatter + MAD_TO_SIGMA * misses[ranks[middle - 1]])
+    reach = gate * max(scatter, sigmas[median_at])
+    total, weights, squares = 0.0, 0.0, 0.0
+    formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
+    places, companions = np.empty(heights.size, np.int64), 0
+    for i in range(heights.size):
+        if abs(heights[i] - median) > reach:
+            continue
+        w = 1.0 / sigmas[i] ** 2
+        total += w * (heights[i] - median)
+        squares += w * (heights[i] - median) ** 2
+        weights += w
+        if views[i] != last_view:
+            if in_view > 0:
+                formal += view_weight / in_view
+            last_view, in_view, view_weight = views[i], 0, 0.0
+            seen += 1
+            place, known = stations[last_view], False
+            for k in range(companions):
+                known = known or places[k] == place
+            if not known:
+                places[companions] = place
+                companions += 1
+        in_view += 1
+        view_weight += w
+    formal += view_weight / in_view
+    mean = total / weights
+    variance = max(squares / weights - mean * mean, 0.0)
+    return median + mean, math.sqrt(1.0 / formal + variance / seen), seen, min(companions, 255)
 
 
 @compiled

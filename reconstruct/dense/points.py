@@ -17,6 +17,8 @@ _BLOCK = 16
 """Side of a block of pixels whose points are looked at together, pixels."""
 _ROUNDING = 1e-6
 """Relative rounding of coordinates as float32; kernels and arrays differ by less."""
+EDGE_ON = math.cos(math.radians(80.0))
+"""Least third part of a point's normal for it to be on a surface that a plane's viewer sees."""
 _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 
@@ -35,6 +37,10 @@ class Points:
     """(N,) standard deviations of the depth."""
     views: NDArray[np.int32]
     """(N,) number of the view, in ascending order."""
+
+    def part(self, kept: NDArray[np.bool_]) -> "Points":
+        """Those of the points that are kept."""
+        return Points(**{field.name: getattr(self, field.name)[kept] for field in fields(Points)})
 
 
 def points_in_box(
@@ -210,27 +216,61 @@ def gather(
             )
             level = colour[row, column, k] * (above * (1 - p) + below * p)
             colours[i, 2 - k] = min(255, int(level + 0.5))
-        up, down = row - _REACH, row + _REACH
-        left, right = column - _REACH, column + _REACH
-        if up < 0 or left < 0 or down >= height or right >= width:
-            continue
-        _spot(depth, slopes, row, right, a)
-        _spot(depth, slopes, row, left, other)
-        for k in range(3):
-            a[k] -= other[k]
-        _spot(depth, slopes, down, column, b)
-        _spot(depth, slopes, up, column, other)
-        for k in range(3):
-            b[k] -= other[k]
-        n0 = b[1] * a[2] - b[2] * a[1]
-        n1 = b[2] * a[0] - b[0] * a[2]
-        n2 = b[0] * a[1] - b[1] * a[0]
-        length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-        if not length > 0.0:  # NaN as well
-            continue
-        for k in range(3):
-            normals[i, k] = (t[k, 0] * n0 + t[k, 1] * n1 + t[k, 2] * n2) / length
+        length = _normal(depth, slopes, row, column, a, b, other)
+        if length > 0.0:
+            n0, n1, n2 = other[0], other[1], other[2]
+            for k in range(3):
+                normals[i, k] = (t[k, 0] * n0 + t[k, 1] * n1 + t[k, 2] * n2) / length
     return enu[:count].copy(), normals, colours, sigmas
+
+
+def normals_up(depth: Float32, view: View) -> Float32:
+    """Third part, up, of the unit normals (H, W) of a view's depth; NaN next to unknown depth."""
+    transform = enu_from_cam(view, np.zeros(3))
+    found: Float32 = _normals_up(depth, view.kernel_lens, transform)
+    return found
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _normals_up(depth: Float32, lens: KernelLens, enu_from_cam: Array) -> Float32:
+    t = enu_from_cam
+    slopes = slopes_of(depth, lens)
+    up = np.full(depth.shape, np.nan, np.float32)
+    a, b, n = np.empty(3), np.empty(3), np.empty(3)
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            length = _normal(depth, slopes, row, column, a, b, n)
+            if length > 0.0:
+                up[row, column] = (t[2, 0] * n[0] + t[2, 1] * n[1] + t[2, 2] * n[2]) / length
+    return up
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _normal(
+    depth: Float32, slopes: Float32, row: int, column: int, a: Array, b: Array, normal: Array
+) -> float:
+    """Write the normal (3,) of a pixel, in the camera, into `normal`; return its length.
+
+    The length is 0 or NaN where the normal is not known. `a` and `b` (3,) are for what lies
+    between.
+    """
+    up, down = row - _REACH, row + _REACH
+    left, right = column - _REACH, column + _REACH
+    if up < 0 or left < 0 or down >= depth.shape[0] or right >= depth.shape[1]:
+        return 0.0
+    _spot(depth, slopes, row, right, a)
+    _spot(depth, slopes, row, left, normal)
+    for k in range(3):
+        a[k] -= normal[k]
+    _spot(depth, slopes, down, column, b)
+    _spot(depth, slopes, up, column, normal)
+    for k in range(3):
+        b[k] -= normal[k]
+    n0 = b[1] * a[2] - b[2] * a[1]
+    n1 = b[2] * a[0] - b[0] * a[2]
+    n2 = b[0] * a[1] - b[1] * a[0]
+    normal[0], normal[1], normal[2] = n0, n1, n2
+    return math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
 
 
 @compiled(error_model="numpy", fastmath=FAST)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
+from reconstruct.planes import Plane
 from reconstruct.views.model import SparseModel
 
 _COMPANY = 16
@@ -26,10 +27,10 @@ _NODE_CELLS = 16
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosePart:
-    """Variances of the surface's height from poses, at sparse points."""
+    """Variances of the surface's height over a plane from poses, at sparse points."""
 
     places: Array
-    """(P, 2) north and east."""
+    """(P, 2) north and east, or up and right of another plane."""
     variances: Array
     """(P,) variances of the height, in the square of the model's unit."""
 
@@ -63,6 +64,23 @@ class PosePart:
         return found
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorsOfPoses:
+    """What errors of poses do to sparse points."""
+
+    points_world: Array
+    """(P, 3)."""
+    covariances: Array
+    """(P, 3, 3)."""
+
+    def over(self, plane: Plane) -> PosePart:
+        """The part of it along a plane's normal."""
+        normal = plane.normal_world
+        variances = np.einsum("i,pij,j->p", normal, self.covariances, normal)
+        places = plane.plane_from_world.apply(self.points_world)[:, :2]
+        return PosePart(places=places, variances=np.maximum(variances, 0.0))
+
+
 def spread_over(nodes: Array, rows: int, columns: int) -> Array:
     """A lattice (m, n) whose corners are a grid's at its cells (rows, columns), bilinear."""
     m, n = nodes.shape
@@ -77,8 +95,8 @@ def spread_over(nodes: Array, rows: int, columns: int) -> Array:
 
 
 @progress.step("find what poses add to errors")
-def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
-    """The surface's uncertainty from poses; None, with a warning, where it is not known."""
+def find_errors_of_poses(workspace: Path, model: SparseModel) -> ErrorsOfPoses | None:
+    """What poses do to points; None, with a warning, where it is not known."""
     path = workspace / "sparse" / "covariance.npz"
     if not path.is_file():
         warn("no sparse/covariance.npz: sigma.tif leaves out what errors of poses do to heights")
@@ -89,9 +107,9 @@ def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
     if len(known.point_ids) != len(model.points_world):
         warn("sparse/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
         return None
-    own = known.point_cov[:, 2, 2] - known.point_noise[:, 2, 2]
-    seen = np.isfinite(own)
+    own = known.point_cov - known.point_noise
+    seen = np.isfinite(own).all(axis=(1, 2))
     if not seen.any():
         warn("sparse/covariance.npz knows no point: sigma.tif leaves out errors of poses")
         return None
-    return PosePart(places=model.points_world[seen, :2], variances=np.maximum(own[seen], 0.0))
+    return ErrorsOfPoses(points_world=model.points_world[seen], covariances=own[seen])

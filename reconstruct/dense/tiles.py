@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from alice_survey.base.frames import Array
-from reconstruct.dense.cloud import thinned_points
+from alice_survey.base.plane_settings import LEVEL
+from reconstruct.dense.cloud import VERTEX, thinned_points
 from reconstruct.dense.dem import (
     FILL_CELLS,
     STRAY_CELLS,
@@ -19,10 +20,10 @@ from reconstruct.dense.dem import (
     slope_deg,
     without_strays,
 )
-from reconstruct.dense.points import joined, points_in_box
+from reconstruct.dense.points import Points, joined, points_in_box
 from reconstruct.dense.pose_part import PosePart, spread_over
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.light.solve import LightModel, LightSamples
+from reconstruct.light.solve import LightModel
 from reconstruct.raster import DemGrid, tiles_of
 from reconstruct.views.model import View
 
@@ -30,11 +31,12 @@ _TILE_CELLS = 256
 _WORST_CELLS = 1.0
 """Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
 _RIM = FILL_CELLS + STRAY_CELLS
+_NO_VERTICES = np.empty(0, VERTEX)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewSummary:
-    """Where the points of a view lie."""
+    """Where the points of a view lie over a plane."""
 
     bounds: tuple[float, float, float, float] | None
     """South, west, north, east; None where no depth was found."""
@@ -44,10 +46,6 @@ class ViewSummary:
     """Side of a pixel on the ground."""
     sigma: float
     """Median standard deviation of its depth."""
-    light: LightSamples
-    """What it and its neighbours show of the same spots."""
-    nodes: Array
-    """What it shows at the nodes of the light model; see `light.at_nodes`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +73,10 @@ class Tile:
     """Slope, degrees."""
     count: NDArray[np.uint16]
     stations: NDArray[np.uint8]
+    surfaces: NDArray[np.uint8]
+    lower: NDArray[np.float32]
     vertices: NDArray[Any]
+    """Points of the cloud; none of another plane than the level one."""
 
 
 def tile_tasks(
@@ -113,28 +114,55 @@ def tile_tasks(
     return tasks
 
 
-def fuse_tile(
-    store: ViewStore,
-    light: LightModel,
-    stations: NDArray[np.int64],
-    offset_enu: tuple[float, float, float],
-    edge: float,
-    sigma_factor: float,
-    task: FuseTask,
-) -> Tile:
-    """Fuse the points of all views in a tile into cells and cloud points.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FuseSetup:
+    """What all tiles of a plane share."""
 
-    Args:
-        store: with the depth of every view.
-        light: of the survey.
-        stations: (V,) station of every view.
-        offset_enu: origin of the cloud.
-        edge: of the cubes to which the cloud is thinned.
-        sigma_factor: on the standard deviations of refined depths.
-        task: the tile.
-    """
-    offset = np.array(offset_enu)
+    store: ViewStore
+    """With the depth of every view."""
+    plane: str
+    """Name of the plane."""
+    light: LightModel
+    stations: NDArray[np.int64]
+    """(V,) station of every view."""
+    offset_enu: tuple[float, float, float]
+    """Origin near the points, in the frame of the plane; also the cloud's."""
+    edge: float
+    """Of the cubes to which the cloud is thinned."""
+    sigma_factor: float
+    """On the standard deviations of refined depths."""
+
+
+def fuse_tile(setup: FuseSetup, task: FuseTask) -> Tile:
+    """Fuse the points of all views in a tile into cells, and, of the level plane, cloud points."""
+    offset = np.array(setup.offset_enu)
     grid = task.grid.moved(-offset[0], -offset[1])
+    points = _points_over(setup, task, grid, offset)
+    cells = fuse_points(grid, points, setup.stations)
+    cells = cells.without(~without_strays(cells.height))
+    height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS)
+    if task.pose_sigmas is not None:  # once, however many views: they share it
+        shared = spread_over(task.pose_sigmas, grid.rows, grid.columns)
+        sigma = np.hypot(sigma, shared.astype(np.float32))
+    top, bottom, left, right = task.rim
+    inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
+    own = grid.window(top, left, grid.rows - top - bottom, grid.columns - left - right)
+    return Tile(
+        window=task.window,
+        height=(height[inner] + offset[2]).astype(np.float32),
+        sigma=sigma[inner],
+        slope=slope_deg(height, grid.cell)[inner],
+        count=cells.count[inner],
+        stations=cells.stations[inner],
+        surfaces=cells.surfaces[inner],
+        lower=(cells.lower[inner] + offset[2]).astype(np.float32),
+        vertices=_vertices(own, points, setup.edge) if setup.plane == LEVEL else _NO_VERTICES,
+    )
+
+
+def _points_over(setup: FuseSetup, task: FuseTask, grid: DemGrid, offset: Array) -> Points:
+    """The kept points of all views over a grid."""
+    store = setup.store
     box = (
         grid.west,
         float(grid.east_of(grid.columns)),
@@ -144,7 +172,7 @@ def fuse_tile(
     parts = []
     for index, view in task.views:
         depth, sigma = store.load_depth(index, "fine")
-        sigma *= np.float32(sigma_factor)
+        sigma *= np.float32(setup.sigma_factor)
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * grid.cell
         parts.append(
@@ -153,38 +181,24 @@ def fuse_tile(
                 index,
                 depth,
                 sigma,
-                store.load_mask(index, "kept", view.pinhole.width_px) & sure,
+                store.load_mask(index, f"kept.{setup.plane}", view.pinhole.width_px) & sure,
                 store.load_colour(index),
-                light.factors(view.camera, view.image),
+                setup.light.factors(view.camera, view.image),
                 offset,
                 box,
-                np.asarray(store.load(index, "blocks")),
+                np.asarray(store.load(index, f"blocks.{setup.plane}")),
             )
         )
-    points = joined(parts)
-    height, sigma, count, met = fuse_points(grid, points, stations)
-    stray = ~without_strays(height)
-    height[stray], sigma[stray], count[stray], met[stray] = np.nan, np.nan, 0, 0
-    height, sigma = fill_gaps(height, sigma, FILL_CELLS)
-    if task.pose_sigmas is not None:  # once, however many views: they share it
-        shared = spread_over(task.pose_sigmas, grid.rows, grid.columns)
-        sigma = np.hypot(sigma, shared.astype(np.float32))
-    top, bottom, left, right = task.rim
-    inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
-    own = grid.window(top, left, grid.rows - top - bottom, grid.columns - left - right)
+    return joined(parts)
+
+
+def _vertices(grid: DemGrid, points: Points, edge: float) -> NDArray[Any]:
+    """Cloud points over a grid."""
     columns = DemGrid(
-        west=own.west,
-        north=own.north,
+        west=grid.west,
+        north=grid.north,
         cell=edge,
-        rows=math.ceil(own.rows * own.cell / edge - 1e-9),
-        columns=math.ceil(own.columns * own.cell / edge - 1e-9),
+        rows=math.ceil(grid.rows * grid.cell / edge - 1e-9),
+        columns=math.ceil(grid.columns * grid.cell / edge - 1e-9),
     )
-    return Tile(
-        window=task.window,
-        height=(height[inner] + offset[2]).astype(np.float32),
-        sigma=sigma[inner],
-        slope=slope_deg(height, grid.cell)[inner],
-        count=count[inner],
-        stations=met[inner],
-        vertices=thinned_points(columns, points),
-    )
+    return thinned_points(columns, points)

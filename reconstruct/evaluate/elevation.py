@@ -11,6 +11,7 @@ from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array, Datum
 from reconstruct.placing.alignment import align_rigid
+from reconstruct.planes import read_plane
 from reconstruct.raster import opened_raster
 from reconstruct.views.model import WorldFrame, read_frame
 
@@ -83,7 +84,18 @@ def read_elevation(workspace: Path) -> tuple[Elevation, WorldFrame]:
 
 
 def elevation_in(dense: Path) -> Elevation:
-    """The DEM and its standard deviation in a folder."""
+    """The level DEM and its standard deviation in a folder.
+
+    Raises:
+        ReconstructionError: its DEM is of another plane.
+        WorkspaceError: a file is missing or damaged.
+    """
+    plane = read_plane(dense)
+    if not plane.is_level:
+        raise ReconstructionError(
+            f"{dense / 'dem.tif'}: is of the plane {plane.name!r}, not level: name 'level' first "
+            "in reconstruct.planes, and run 'alice-survey reconstruct' again"
+        )
     with opened_raster(dense / "dem.tif") as source:
         height = source.read(1).astype(np.float64)
         transform = source.transform

@@ -329,8 +329,8 @@ def _box(
 
 def ground_of(survey: MosaicSetup, block: Block) -> Ground:
     """The surface of a block, and what around it may hide it."""
-    with opened_raster(survey.workspace / "dense" / "dem.tif") as raster:
-        return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
+    with opened_raster(survey.dem) as raster:
+        return Ground(*dem_around(raster, block.grid, block.reach), survey.sights)
 
 
 def _looks(
@@ -483,14 +483,14 @@ def _inner(block: Block) -> tuple[slice, slice]:
     return slice(margin, margin + rows), slice(margin, margin + columns)
 
 
-def label_path(scratch: Path) -> Path:
+def label_path(sights: Path) -> Path:
     """File of the survey's labels by cell."""
-    return scratch / "labels.tif"
+    return sights / "labels.tif"
 
 
-def tones_path(scratch: Path) -> Path:
+def tones_path(sights: Path) -> Path:
     """File of the survey's broad tones by cell."""
-    return scratch / "tones.tif"
+    return sights / "tones.tif"
 
 
 def _read_cells(survey: MosaicSetup, block: Block) -> tuple[NDArray[np.int32], Float32]:
@@ -499,13 +499,13 @@ def _read_cells(survey: MosaicSetup, block: Block) -> tuple[NDArray[np.int32], F
     top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX
     label = np.zeros((rows, columns), np.int32)
     tones = np.zeros((rows, columns, 3), np.float32)
-    with rasterio.open(label_path(survey.scratch)) as raster:
+    with rasterio.open(label_path(survey.sights)) as raster:
         r0, c0 = max(0, top), max(0, left)
         r1, c1 = min(raster.height, top + rows), min(raster.width, left + columns)
         window = Window(c0, r0, c1 - c0, r1 - r0)
         at = slice(r0 - top, r1 - top), slice(c0 - left, c1 - left)
         label[at] = raster.read(1, window=window)
     if label.any():
-        with rasterio.open(tones_path(survey.scratch)) as raster:
+        with rasterio.open(tones_path(survey.sights)) as raster:
             tones[at] = raster.read(window=window).transpose(1, 2, 0)
     return label, tones

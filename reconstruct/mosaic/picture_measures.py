@@ -101,6 +101,7 @@ def encoded(light: Float32) -> Float32:
     return levels
 
 
+@small_cache()
 def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasures:
     """Measure a picture of a workspace and write its small copy to a folder."""
     pictures = Pictures.open(workspace)
@@ -236,7 +237,7 @@ def _small_path(folder: Path, image: str) -> Path:
 
 
 def read_small(folder: Path, image: str) -> SmallCopy:
-    """The small copy of a picture that `measure_view` wrote."""
+    """The small copy of a picture that `measure_picture` wrote."""
     with _small_path(folder, image).open("rb") as file:
         return SmallCopy(levels=np.load(file), broad=np.load(file))
 
@@ -255,31 +256,30 @@ def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
 
 
 @small_cache()
-def measure_view(
-    workspace: Path, scratch: Path, heights: tuple[float, float], view: View
-) -> tuple[PictureMeasures, PictureFootprint]:
-    """Measure a picture and where it lies; write its small copy and what it sees of the DEM.
+def outline_view(
+    dem_tif: Path, sights: Path, heights: tuple[float, float], view: View
+) -> PictureFootprint:
+    """Find what a view sees of a DEM; write it for the tiles.
 
     Args:
-        workspace: with pictures and surface.
-        scratch: folder for what tiles need later.
+        dem_tif: the DEM.
+        sights: folder for what tiles need later.
         heights: lowest and highest cell of the DEM.
-        view: the view to measure.
+        view: in the DEM's frame.
     """
-    facts = measure_picture(workspace, scratch, view)
-    dem, grid, whole = _part_seen(workspace, heights, view)
+    dem, grid, whole = _part_seen(dem_tif, heights, view)
     if whole:
-        store_visible(scratch, view, dem, grid)
-    return facts, picture_footprint(view, dem, grid)
+        store_visible(sights, view, dem, grid)
+    return picture_footprint(view, dem, grid)
 
 
 def _part_seen(
-    workspace: Path, heights: tuple[float, float], view: View
+    dem_tif: Path, heights: tuple[float, float], view: View
 ) -> tuple[Float32, DemGrid, bool]:
     """The DEM below a view and all that it may see, coarser where that is a lot; whether it is."""
     west, east, south, north = footprints((view,), heights).boxes[0]
     camera = enu_from_cam(view, np.zeros(3))[:, 3]
-    with opened_raster(workspace / "dense" / "dem.tif") as raster:
+    with opened_raster(dem_tif) as raster:
         t = raster.transform
         columns = [min(west, camera[0]), max(east, camera[0])]
         rows = [max(north, camera[1]), min(south, camera[1])]

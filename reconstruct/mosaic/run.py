@@ -7,7 +7,7 @@ the picture as taken. No step holds more than one block, so that memory does not
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from alice_survey.base.config import ReconstructConfig, WaterConfig
+from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
@@ -42,11 +43,12 @@ from reconstruct.mosaic.paint import (
     paint_tiles,
     tones_path,
 )
-from reconstruct.mosaic.picture_measures import PictureMeasures, measure_view
+from reconstruct.mosaic.picture_measures import PictureMeasures, measure_picture, outline_view
 from reconstruct.mosaic.tools import MosaicSetup
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
+from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turned, write_plane
 from reconstruct.raster import DemGrid, opened_raster, round_cell, small_cache
 from reconstruct.views.model import SparseModel, read_model, read_warps
 
@@ -78,7 +80,7 @@ def run_mosaic(
     water: WaterConfig,
     seafloor_depth_m: float,
 ) -> None:
-    """Paint the mosaic on a finished surface.
+    """Paint the mosaics on a finished surface, one for each of its planes.
 
     Raises:
         ReconstructionError: the surface has no cell.
@@ -87,23 +89,93 @@ def run_mosaic(
     model = read_model(workspace / "sparse")
     scratch = folder / "scratch"
     scratch.mkdir()
-    with opened_raster(workspace / "dense" / "dem.tif") as raster:
+    measure = partial(measure_picture, workspace, scratch)
+    facts = list(executor.map(measure, model.views, label="measure pictures", task_mib=_TASK_MIB))
+    grey = all(fact.grey for fact in facts)
+    sea, dispersion = _dispersion(workspace, reconstruct.dispersion, water, seafloor_depth_m, grey)
+    painting = Painting(
+        workspace=workspace,
+        model=model,
+        scratch=scratch,
+        facts=facts,
+        water=sea,
+        dispersion=dispersion,
+        reconstruct=reconstruct,
+        executor=executor,
+    )
+    painted = []
+    for surface in plane_folders(workspace / "dense"):
+        plane = read_plane(surface)
+        below = surface != workspace / "dense"
+        target = folder / PLANES / plane.name if below else folder
+        painted.append(paint_plane(painting, plane, surface / "dem.tif", target))
+        if not painted[-1]:
+            if below:
+                target.rmdir()
+            warn(f"plane {plane.name!r} ({plane.about}): no picture sees its surface: no mosaic")
+    shutil.rmtree(scratch)
+    if not any(painted):
+        raise ReconstructionError("no picture sees any cell of dense/dem.tif; redo 'dense'")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Painting:
+    """What the mosaics of all planes share."""
+
+    workspace: Path
+    model: SparseModel
+    """In the world."""
+    scratch: Path
+    facts: Sequence[PictureMeasures]
+    water: Water | None
+    dispersion: dict[str, Any]
+    """What `mosaic.json` says about the water."""
+    reconstruct: ReconstructConfig
+    executor: Executor
+
+
+def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bool:
+    """Paint the mosaic of a plane; return whether any picture sees the surface over it.
+
+    Args:
+        painting: pictures and model.
+        plane: the plane.
+        dem: the surface over it.
+        folder: to write to.
+
+    Raises:
+        ReconstructionError: the surface has no cell.
+        WorkspaceError: it is damaged.
+    """
+    reconstruct, executor = painting.reconstruct, painting.executor
+    model = turned(painting.model, plane)
+    sights = painting.scratch / plane.name
+    sights.mkdir()
+    with opened_raster(dem) as raster:
         heights = height_range(raster)
         pixel = reconstruct.mosaic_pixel_m or round_cell(mean_pixel(model))
         grid = mosaic_grid(raster, pixel, model.frame)
     names = [view.image for view in model.views]
-    measure = partial(measure_view, workspace, scratch, heights)
-    measured = list(
-        executor.map(measure, model.views, label="measure pictures", task_mib=_TASK_MIB)
+    outline = partial(outline_view, dem, sights, heights)
+    label = partial(_label, plane)
+    outlines = list(
+        executor.map(outline, model.views, label=label("outline pictures"), task_mib=_TASK_MIB)
     )
-    facts = [fact for fact, _ in measured]
-    grey = all(fact.grey for fact in facts)
-    sea, dispersion = _dispersion(workspace, reconstruct.dispersion, water, seafloor_depth_m, grey)
-    survey = MosaicSetup(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=sea)
-    views = _seen_views(model, facts)
+    survey = MosaicSetup(
+        workspace=painting.workspace,
+        scratch=painting.scratch,
+        dem=dem,
+        sights=sights,
+        scaled=model.frame.scaled,
+        water=painting.water,
+    )
+    views = _seen_views(model, painting.facts)
     ground = footprints(model.views, heights)
-    label_blocks = seam_blocks(grid, ground)
-    colour = _solve(model, survey, facts, views, label_blocks, reconstruct.colour, executor)
+    blocks = seam_blocks(grid, ground)
+    colour = _solve(
+        model, survey, painting.facts, views, blocks, reconstruct.colour, executor,
+        label("compare light"),
+    )  # fmt: skip
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
         return [
@@ -117,23 +189,31 @@ def run_mosaic(
             for block in blocks
         ]
 
+    folder.mkdir(parents=True, exist_ok=True)
     write_labels(
-        (label_path(scratch), tones_path(scratch)),
+        (label_path(sights), tones_path(sights)),
         folder / "coverage.tif",
         grid,
         model.frame,
-        executor.map(label_block, tasks(label_blocks), label="seams", task_mib=_TASK_MIB),
+        executor.map(label_block, tasks(blocks), label=label("seams"), task_mib=_TASK_MIB),
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
-    rough = scratch / "rough.tif"
+    rough = sights / "rough.tif"
     groups = [tasks(group) for group in neighbours(tiles, _GROUP)]
-    painted = executor.map(paint_tiles, groups, label="mosaic", task_mib=_TASK_MIB)
+    painted = executor.map(paint_tiles, groups, label=label("mosaic"), task_mib=_TASK_MIB)
     covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
+    if covered == 0.0:
+        for name in ("coverage.tif", "mosaic_source.tif"):
+            (folder / name).unlink()
+        return False
     cloud_optimised(rough, folder / "mosaic.tif", executor.local_cores)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
-    plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
-    shutil.rmtree(scratch)
-    write_footprints(folder, model.views, [outline for _, outline in measured], model.frame)
+    if plane.is_level:
+        track = painting.workspace / "sparse" / "track.csv"
+        plot_track_over(folder / "mosaic.tif", track, folder / "track.png")
+    shutil.rmtree(sights)
+    write_footprints(folder, model.views, outlines, model.frame)
+    write_plane(folder, plane, painting.model.frame)
     MosaicRecord.save(
         folder / "mosaic.json",
         {
@@ -149,11 +229,16 @@ def run_mosaic(
             "vertical_datum": model.frame.vertical_datum,
             "colour": reconstruct.colour,
             **colour.to_json(),
-            "dispersion": dispersion,
+            "dispersion": painting.dispersion,
             "notes": [*model.frame.notes, *colour.notes],
             "pictures": names,
         },
     )
+    return True
+
+
+def _label(plane: Plane, what: str) -> str:
+    return what if plane.is_level else f"{what} of {plane.name}"
 
 
 def seam_blocks(grid: DemGrid, ground: Footprints) -> list[Block]:
@@ -185,6 +270,7 @@ def _solve(
     blocks: Sequence[Block],
     wanted: Literal["even", "water", "raw"],
     executor: Executor,
+    label: str,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
     if wanted == "raw":
@@ -201,7 +287,7 @@ def _solve(
         )
         for block in blocks
     ]
-    found = list(executor.map(compare_block, compare, label="compare light", task_mib=_TASK_MIB))
+    found = executor.map(compare_block, compare, label=label, task_mib=_TASK_MIB)
     parts = [part for part in found if len(part.views)]
     return solve_colour(wanted, joined_samples(parts), facts)
 

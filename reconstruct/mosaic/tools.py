@@ -27,6 +27,11 @@ class MosaicSetup:
 
     workspace: Path
     scratch: Path
+    """Folder of what is known of pictures."""
+    dem: Path
+    """The surface, in the frame of a plane."""
+    sights: Path
+    """Folder of what views see of it."""
     scaled: bool
     water: Water | None
     """Water of the port's dispersion; None where channels are not distinguished."""

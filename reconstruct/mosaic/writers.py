@@ -10,7 +10,6 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.run import progress
 from reconstruct.mosaic.grid import CELL_PX, coarse
 from reconstruct.mosaic.paint import Labels, Painted
@@ -37,11 +36,7 @@ def write_tiles(
     groups: Iterator[list[Painted]],
     names: list[str],
 ) -> float:
-    """Write colours and sources as they come; return the share of pixels that have colour.
-
-    Raises:
-        ReconstructionError: none has.
-    """
+    """Write colours and sources as they come; return the share of pixels that have colour."""
     shared = _profile(grid, frame)
     numbers = "uint16" if len(names) <= _LARGEST_UINT16 else "uint32"
     painted = 0
@@ -59,8 +54,6 @@ def write_tiles(
                 colours.write(tile.rgba, window=tile.window)
                 sources.write(tile.source.astype(numbers), 1, window=tile.window)
                 painted += int((tile.rgba[3] > 0).sum())
-    if painted == 0:
-        raise ReconstructionError("no picture sees any cell of dense/dem.tif; redo 'dense'")
     return painted / (grid.rows * grid.columns)
 
 

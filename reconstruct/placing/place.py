@@ -39,7 +39,7 @@ from reconstruct.placing.navigation_equations import Installation, body_from_pin
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import picture_modes
-from reconstruct.views.model import WorldFrame
+from reconstruct.views.model import MEAN_PLANE, WorldFrame
 
 RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach
@@ -47,7 +47,6 @@ RIG_SCALE_SIGMA = 1e-3
 LENGTH_SCALE_SIGMA = 1e-2
 """Relative sigma of a scale from one length that a person measured."""
 _VERTICAL_OF_CONTROL = "WGS 84 ellipsoid, or the level of the control points' depths"
-_VERTICAL_OF_LEVEL = "mean plane of the sea floor in the pictures"
 _LOCAL = "placed by control points in their own north, east and depth; no CRS"
 
 
@@ -129,7 +128,7 @@ def find_place(task: Placing) -> Placed:
             if any(record.readings["depth"] for record in task.records):
                 vertical = str(task.survey.vertical_datum)
             elif local is not None or not ties.used_points:
-                vertical = _VERTICAL_OF_LEVEL
+                vertical = MEAN_PLANE
         notes += [source] if datum is not None else [source, local or _LOCAL]
     else:
         found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
@@ -138,7 +137,7 @@ def find_place(task: Placing) -> Placed:
         if found is not None:
             factor, source = found[0], _scale_source(known, ties)
         place = replace(levelled, scale=factor, translation=factor * levelled.translation)
-        scaled, vertical = known is not None or found is not None, _VERTICAL_OF_LEVEL
+        scaled, vertical = known is not None or found is not None, MEAN_PLANE
         turned = None if scaled else _turned(task, levelled)
         if turned is not None:
             place, note = turned

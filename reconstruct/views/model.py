@@ -14,6 +14,8 @@ from alice_survey.base.records import CamerasRecord, FrameRecord, PlaceRecord
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, warp_from_json
 from reconstruct.views.range_shift import KernelLens, RangeShift, no_shift, range_shift
 
+MEAN_PLANE = "mean plane of the sea floor in the pictures"
+"""Vertical datum of a model that its own surface puts level."""
 _ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -21,8 +23,9 @@ _ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 class WorldFrame:
     """What the coordinates of a model mean. The third axis points down in every frame."""
 
-    name: Literal["ned", "model"]
-    """`ned`: north, east, down from the datum; `model`: arbitrary origin and heading, levelled."""
+    name: Literal["ned", "model", "plane"]
+    """`ned`: north, east, down from the datum; `model`: arbitrary origin and heading, levelled;
+    `plane`: of a plane in one of these (`reconstruct.planes`)."""
     datum: Datum | None
     scaled: bool
     """Whether lengths are metres."""
@@ -30,6 +33,8 @@ class WorldFrame:
     """Name of the level from which depths and heights count."""
     notes: tuple[str, ...] = ()
     """What a reader of any result must know, such as where the scale came from."""
+    tags: tuple[tuple[str, str], ...] = ()
+    """Names and values that its rasters carry besides."""
 
     @property
     def unit(self) -> str:
@@ -96,7 +101,13 @@ class SparseModel:
 
 
 def write_frame(path: Path, frame: WorldFrame) -> None:
-    """Write `frame.json`."""
+    """Write `frame.json`.
+
+    Raises:
+        ValueError: it is a plane's, which `plane.json` describes.
+    """
+    if frame.name == "plane":
+        raise ValueError(f"{path}: frame.json describes a model, not {frame.vertical_datum}")
     datum = frame.datum
     FrameRecord(
         name=frame.name,

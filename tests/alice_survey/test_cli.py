@@ -200,6 +200,34 @@ def test_reconstruct_in_a_folder_of_pictures_names_the_command_that_takes_them(
     assert not (tmp_path / "photos" / ".lock").exists()
 
 
+def test_a_plane_that_cannot_be_read_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    init_survey(tmp_path)
+    command = ["reconstruct", "-w", str(tmp_path), "--plane", "level", "--plane"]
+    said = fails([*command, "wall=north"], capsys, monkeypatch)
+    assert "NAME=facing DEGREES" in said
+    said = fails([*command, "level"], capsys, monkeypatch)
+    assert "two planes are named 'level'" in said
+
+
+def test_planes_of_the_command_line_hold_for_one_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = init_survey(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["alice-survey", "reconstruct", "-w", str(tmp_path),
+                                      "--plane", "wall=facing 180"])  # fmt: skip
+    with pytest.raises(SystemExit):
+        main()  # there are no pictures
+    shown = capsys.readouterr().err
+    assert 'planes = ["wall=facing 180"]' in shown
+    text = path.read_text().replace("# planes = [", 'planes = ["wall=facing 180"]  # [')
+    path.write_text(text)
+    with pytest.raises(SystemExit):
+        main()
+    assert "hold for this run" not in capsys.readouterr().err
+
+
 def test_status_names_the_next_command(tmp_path: Path) -> None:
     init_survey(tmp_path)
     shown = CliRunner().invoke(app, ["status", "-w", str(tmp_path), "--json"])

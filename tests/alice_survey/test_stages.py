@@ -153,7 +153,7 @@ def test_a_record_keeps_all_that_version_0_1_0_wrote(kind: type[JsonRecord], old
     if not path.is_file():
         assert kind in {
             records.ControlRecord, records.ScaleRecord, records.ReferenceRecord,
-            records.ChangeRecord, records.PortRecord,
+            records.ChangeRecord, records.PlaneRecord, records.PortRecord,
         }  # fmt: skip
         return
     written = json.loads(path.read_text())

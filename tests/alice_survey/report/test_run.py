@@ -2,10 +2,14 @@ import json
 import re
 from html import unescape
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from pypdf import PdfReader
 
+from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import SERIAL
@@ -75,6 +79,50 @@ def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit:
     cameras = next(layer for layer in shown["layers"] if layer["name"] == "cameras")
     # A model's own x goes east and its y north.
     assert cameras["shapes"][0] == [[0.3, 0.4]]
+
+
+def plane_of(name: str, tilt: str) -> dict[str, Any]:
+    return {
+        "name": name, "about": f"facing 180 deg, tilt {tilt} deg", "origin_enu": [0, 0, 0],
+        "right_enu": [1, 0, 0], "up_enu": [0, 0, 1], "out_enu": [0, -1, 0], "frame": "ned",
+        "unit": "m", "vertical_datum": "sea surface",
+    }  # fmt: skip
+
+
+def test_every_plane_is_shown_by_its_name(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    for name, painted in (("wall", True), ("hull", False)):
+        for stage, picture in (("dense", "dem"), ("mosaic", "mosaic")):
+            folder = workspace / stage / "planes" / name
+            if stage == "dense" or painted:
+                write_json(folder / "plane.json", plane_of(name, "12"))
+                see_through = np.zeros((30, 40, 4), np.uint8)
+                see_through[10:, :, 1::2] = 255
+                cv2.imwrite(str(folder / f"{picture}.png"), see_through)
+    about = {"pixel": 0.01, "width_px": 400, "height_px": 250}
+    write_json(workspace / "mosaic" / "planes" / "wall" / "mosaic.json", about)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)  # for there are planes now
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert "Plane wall" in page
+    assert "4.00 m wide and 2.50 m high" in page
+    assert "Surface over the plane: facing 180 deg, tilt 12 deg." in page
+    assert page.count("Plane hull") == 1
+
+
+def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    write_json(workspace / "dense" / "plane.json", plane_of("wall", "0"))
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
+    assert {layer["name"] for layer in shown["layers"]}.isdisjoint(
+        {"cameras", "footprints", "plan"}
+    )
+    assert shown["axes"] == ["along x", "along y"]
+    assert (
+        json.loads((workspace / "report" / "report.json").read_text())["surface"]["covered"] is None
+    )
 
 
 def test_a_plan_alone_is_reported(tmp_path: Path) -> None:

@@ -13,13 +13,13 @@ from reconstruct.dense.dem import (
 )
 from reconstruct.dense.points import Points
 from reconstruct.raster import DemGrid, grid_over, round_cell
-from tests.oracles_dense import fused
+from tests.oracles_dense import fused, surfaces
 
 
 def points(enu: np.ndarray, sigmas: np.ndarray, views: np.ndarray) -> Points:
     return Points(
         enu=enu.astype(np.float32),
-        normals=np.zeros_like(enu, dtype=np.float32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (len(enu), 1)),
         colours=np.zeros((len(enu), 3), np.uint8),
         sigmas=sigmas.astype(np.float32),
         views=views.astype(np.int32),
@@ -61,39 +61,52 @@ def test_bin_points_equals_a_dictionary_of_cells():
 
 def test_fuse_cells_equals_its_slow_twin():
     rng = np.random.default_rng(2)
-    sizes = rng.integers(0, 12, 80)
+    sizes = rng.integers(0, 24, 200)
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     heights = rng.normal(0, 0.01, starts[-1]).astype(np.float32)
-    heights[rng.random(len(heights)) < 0.1] += np.float32(0.4)
+    heights[rng.random(len(heights)) < 0.3] += np.float32(0.4)
+    heights[rng.random(len(heights)) < 0.1] += np.float32(0.3)
     sigmas = rng.uniform(0.002, 0.02, len(heights)).astype(np.float32)
     views = np.concatenate([np.sort(rng.integers(0, 4, n)) for n in sizes]).astype(np.int32)
+    steepness = rng.exponential(3.0, len(heights)).astype(np.float32)
+    steepness[rng.random(len(heights)) < 0.3] = np.nan
 
     stations = np.array([5, 5, 9, 2])
 
-    height, sigma, count, met = fuse_cells(starts, heights, sigmas, views, stations, 3.0)
+    height, sigma, count, met, number, lower = fuse_cells(
+        starts, heights, sigmas, views, stations, steepness, 0.05, 3.0
+    )
 
     for cell, size in enumerate(sizes):
         part = slice(starts[cell], starts[cell + 1])
         if size == 0:
             assert np.isnan(height[cell])
-            assert count[cell] == 0
+            assert count[cell] == number[cell] == 0
             continue
-        h, s, n, places = fused(heights[part], sigmas[part], views[part], stations, 3.0)
+        parts = surfaces(heights[part], sigmas[part], stations[views[part]], steepness[part], 0.05)
+        assert number[cell] == len(parts)
+        results = [
+            fused(heights[p], sigmas[p], views[p], stations, 3.0)
+            for p in (starts[cell] + np.sort(members) for members in parts)
+        ]
+        h, s, n, places = results[0]
         np.testing.assert_allclose(height[cell], h, atol=2e-6)
         np.testing.assert_allclose(sigma[cell], s, rtol=1e-3)
         assert count[cell] == n
         assert met[cell] == places
+        below = results[-1][0] if len(parts) > 1 else np.nan
+        np.testing.assert_allclose(lower[cell], below, atol=2e-6)
+    assert 20 < (number > 1).sum() < 150
 
 
 def test_heights_are_up_and_rows_go_south():
     grid = DemGrid(west=0.0, north=2.0, cell=1.0, rows=2, columns=2)
     enu = np.array([[0.5, 1.5, -10.0], [1.5, 1.5, -11.0], [0.5, 0.5, -12.0]])
-    height, _, count, _ = fuse_points(
-        grid, points(enu, np.full(3, 0.01), np.arange(3)), np.arange(3)
-    )
-    np.testing.assert_allclose(height[[0, 0, 1], [0, 1, 0]], [-10, -11, -12])
-    assert np.isnan(height[1, 1])
-    assert count.tolist() == [[1, 1], [1, 0]]
+    found = fuse_points(grid, points(enu, np.full(3, 0.01), np.arange(3)), np.arange(3))
+    np.testing.assert_allclose(found.height[[0, 0, 1], [0, 1, 0]], [-10, -11, -12])
+    assert np.isnan(found.height[1, 1])
+    assert found.count.tolist() == [[1, 1], [1, 0]]
+    assert found.surfaces.tolist() == [[1, 1], [1, 0]]
 
 
 def test_a_few_outliers_do_not_move_a_cell():
@@ -101,14 +114,12 @@ def test_a_few_outliers_do_not_move_a_cell():
     grid = DemGrid(west=0.0, north=1.0, cell=1.0, rows=1, columns=1)
     enu = np.column_stack([rng.uniform(0.1, 0.9, (60, 2)), rng.normal(5.0, 0.003, 60)])
     stations = np.arange(6)
-    clean, sigma, *_ = fuse_points(
-        grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations
-    )
+    clean = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
     enu[::6, 2] += 0.3
-    dirty, *_ = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
-    assert abs(dirty[0, 0] - clean[0, 0]) < 0.001
-    assert abs(clean[0, 0] - 5.0) < 3 * sigma[0, 0]
-    assert 0.0005 < sigma[0, 0] < 0.003  # six views, each 3 mm
+    dirty = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
+    assert abs(dirty.height[0, 0] - clean.height[0, 0]) < 0.001
+    assert abs(clean.height[0, 0] - 5.0) < 3 * clean.sigma[0, 0]
+    assert 0.0005 < clean.sigma[0, 0] < 0.003  # six views, each 3 mm
 
 
 def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():

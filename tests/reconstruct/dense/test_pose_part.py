@@ -3,11 +3,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import heard
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
-from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
+from reconstruct.dense.pose_part import PosePart, find_errors_of_poses, spread_over
+from reconstruct.planes import LEVEL_PLANE, Plane, facing
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 from tests.oracles_dense import write_workspace as write
@@ -46,19 +48,35 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_pixels_do_is_taken_out(workspace: Path):
     model = read_model(workspace / "sparse")
-    part = find_pose_part(workspace, model)
-    assert part is not None
+    errors = find_errors_of_poses(workspace, model)
+    assert errors is not None
+    part = errors.over(LEVEL_PLANE)
     assert part.median == pytest.approx(0.003, rel=1e-3)
     nodes = part.at_nodes(0.8, -0.4, 0.01, 100, 70)
     assert nodes.shape == (8, 6)
     np.testing.assert_allclose(nodes, 0.003, rtol=0.01)
 
 
+def test_a_wall_takes_what_is_unsure_along_its_normal(workspace: Path):
+    model = read_model(workspace / "sparse")
+    errors = find_errors_of_poses(workspace, model)
+    assert errors is not None
+    for direction, lean, expected in ((0.0, 0.0, 1.0), (180.0, 0.0, 1.0), (60.0, 0.0, 0.5)):
+        wall = Plane(
+            name="wall",
+            about="",
+            plane_from_world=RigidTransform.from_rotation(facing(direction, lean)),
+        )
+        assert errors.over(wall).median == pytest.approx(expected, rel=1e-6)
+    up = model.points_world[:, 2].max() + 1.0
+    assert (errors.over(wall).places[:, 0] > -up).all()  # up the wall: minus the depth
+
+
 def test_a_covariance_of_another_model_is_not_taken(workspace: Path):
     model = read_model(workspace / "sparse")
     fewer = replace(model, points_world=model.points_world[:-1])
     with heard() as warnings:
-        assert find_pose_part(workspace, fewer) is None
+        assert find_errors_of_poses(workspace, fewer) is None
     assert len(warnings) == 1
 
 

@@ -136,9 +136,11 @@ def test_stations_and_slope(workspace: Path):
 
 def test_scratch_is_gone_and_files_are_there(workspace: Path):
     names = {path.name for path in (workspace / "dense").iterdir()}
-    rasters = {f"{name}.tif" for name in ("dem", "sigma", "slope", "count", "stations")}
+    bands = ("dem", "sigma", "slope", "count", "stations", "surfaces", "lower")
+    rasters = {f"{name}.tif" for name in bands}
     clouds = {"cloud.ply", "cloud.laz", "cloud.json"}
-    assert names == rasters | clouds | {"dem.png", "light.json", "surface.json", "stage.json"}
+    others = {"dem.png", "light.json", "surface.json", "plane.json", "stage.json"}
+    assert names == rasters | clouds | others
 
 
 def test_a_second_run_does_nothing(workspace: Path):
