@@ -82,9 +82,7 @@ def solid_mesh(solid: Solid) -> Mesh:
             return turn.apply(vertices) + np.asarray(solid.centre), triangles
 
 
-def _object(
-    name: str, mesh: Mesh, material: float, at_rest: Array | None = None
-) -> TerrainObject:
+def _object(name: str, mesh: Mesh, material: float, at_rest: Array | None = None) -> TerrainObject:
     """A mesh in NED as an object of the terrain."""
     below = np.array([0.0, 0.0, FLOOR_M])
     return TerrainObject(
@@ -188,8 +186,10 @@ def _upright(solid: Upright) -> Mesh:
     vertices, triangles, first = [walls[0]], [walls[1]], len(walls[0])
     for end in solid.depths:
         cap = np.column_stack([ring[:-1], np.full(count, end)]) - middle
-        fan = np.column_stack([np.zeros(count - 2), np.arange(1, count - 1), np.arange(2, count)])
-        _, fan = _outward(cap, fan.astype(np.int32))
+        corners = np.column_stack(
+            [np.zeros(count - 2), np.arange(1, count - 1), np.arange(2, count)]
+        )
+        _, fan = _outward(cap, corners.astype(np.int32))
         vertices.append(cap)
         triangles.append(fan + np.int32(first))
         first += len(cap)

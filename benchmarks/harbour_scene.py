@@ -60,7 +60,7 @@ Solid = RoundedBox | Upright | Ellipsoid
 
 HULL = RoundedBox(name="hull", centre=(0.5, 4.5, 2.5), half=(1.3, 1.5, 2.5), radius_m=0.9)
 PILE = Upright(name="pile", place_ne=(-1.5, -1.7), depths=(1.5, 6.5), radius_m=0.18)
-LADDER = (
+LADDER: tuple[Solid, ...] = (
     *(
         Upright(name="ladder", place_ne=(-0.16, e), depths=(1.5, 5.7), radius_m=0.025)
         for e in (0.6, 1.0)
@@ -138,7 +138,8 @@ class Fish:
         """(3,) its middle."""
         angle = 2 * np.pi * time_s / self.period_s + self.phase
         way = np.array([np.sin(angle), np.cos(angle), np.sin(2 * angle)])
-        return np.asarray(self.middle) + np.asarray(self.reach) * way
+        place: Array = np.asarray(self.middle) + np.asarray(self.reach) * way
+        return place
 
     def turn(self, time_s: float) -> Rotation:
         """From the fish's axes (forward, right, down) to NED."""
@@ -176,7 +177,7 @@ class Weed:
         north, east = self.foot_ne
         foot = float(floor_depth(np.array(north), np.array(east)))
         at = np.column_stack([self.lean(share, time_s), -self.length_m * share])
-        line: Array = at + [north, east, foot]
+        line: Array = at + np.array([north, east, foot])
         return line
 
 

@@ -21,7 +21,7 @@ FARTHEST_M = 3.5
 NEAREST_M = 0.5
 _MARGIN = 0.02
 """Share of the frame along its border that is left out for what the port shifts."""
-_STEPS = 120
+_STEPS = 480
 _TOUCH_M, _AHEAD_M = 4e-4, 0.008
 _VOXEL_M = 0.08
 _BLOCK = 50_000
@@ -35,7 +35,7 @@ def trace(origins: Array, directions: Array, longest: Array) -> Array:
     path = np.zeros(len(origins))
     going = np.arange(len(origins))
     hit = np.zeros(len(origins), bool)
-    for _ in range(_STEPS * 4):
+    for _ in range(_STEPS):
         if not len(going):
             break
         gap = clearance(origins[going] + path[going, None] * directions[going])
@@ -43,7 +43,8 @@ def trace(origins: Array, directions: Array, longest: Array) -> Array:
         hit[going[close]] = True
         path[going] += np.maximum(gap, 0.0)
         going = going[~close & (path[going] < longest[going])]
-    return np.where(hit, path, np.nan)
+    ended: Array = np.where(hit, path, np.nan)
+    return ended
 
 
 def surface_samples(low: Array, high: Array, spacing_m: float, rng: np.random.Generator) -> Array:
@@ -70,7 +71,8 @@ def surface_samples(low: Array, high: Array, spacing_m: float, rng: np.random.Ge
         distance = distances(points)[0]
     settled = np.abs(distance) < 1e-4
     inside = np.all((points > low) & (points < high), axis=1)
-    return points[settled & inside]
+    kept: Array = points[settled & inside]
+    return kept
 
 
 def instants_that_see(
@@ -115,7 +117,8 @@ def _in_sight(
     # A ray that grazes what it ends on stops a bit early: on its own surface.
     early = length[at] - blocked < _AHEAD_M / GRAZING
     good[at] = np.isnan(blocked) | early
-    return good
+    seen: NDArray[np.bool_] = good
+    return seen
 
 
 def box_of_interest() -> tuple[Array, Array]:

@@ -14,12 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, ImagingConfig, WaterConfig
 from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum, rotation_from_attitude
 from alice_survey.seafloor.as_built import true_rig
 from alice_survey.seafloor.light import CameraLight, camera_light
 from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, render
@@ -36,6 +37,9 @@ DISTANCE_M = 2.0
 EVERY_S = 2.0
 """Between stations."""
 _TILT_DEG = 45.0
+_BODY_FROM_RIG = RigidTransform.from_components(
+    [0.3, -0.05, 0.1], mount_rotation(f"forward+{_TILT_DEG:g}")
+)
 _REACH_M = 6.0
 _SEED = 19
 _START = datetime(2024, 7, 1, 12, tzinfo=UTC)
@@ -115,14 +119,13 @@ def quick_stations() -> list[Station]:
 def harbour_rig(scale: int) -> Rig:
     """The rig as built, on its mount; a picture's pixel is `scale` of the sensor's each way."""
     built = true_rig(CameraConfig(), WaterConfig(), scale=scale, seed=_SEED)
-    turn = mount_rotation(f"forward+{_TILT_DEG:g}")
-    return replace(built, body_from_rig=RigidTransform.from_components([0.3, -0.05, 0.1], turn))
+    return replace(built, body_from_rig=_BODY_FROM_RIG)
 
 
-def body_poses(planned: Sequence[Station], scale: int) -> RigidTransform:
+def body_poses(planned: Sequence[Station]) -> RigidTransform:
     """`ned_from_body` of the stations: as meant, but for the vehicle's wander and sway."""
     rng = np.random.default_rng([_SEED, 1])
-    rig_from_body = harbour_rig(scale).body_from_rig.inv()
+    rig_from_body = _BODY_FROM_RIG.inv()
     poses = []
     for one in planned:
         sway = rng.normal(0.0, _SWAY_DEG, 3)
@@ -151,9 +154,8 @@ class Shoot:
 @lru_cache(maxsize=2)
 def _light(scale: int, name: str) -> CameraLight:
     rig = harbour_rig(scale)
-    looks_down = true_rig(CameraConfig(), WaterConfig(), scale=scale, seed=_SEED).body_from_rig
     # Strobes are described on a body that looks down, with the left camera at its origin.
-    level = RigidTransform.from_rotation(looks_down.rotation)
+    level = RigidTransform.from_rotation(BODY_FROM_NADIR_CAM)
     pose = level * rig.cam_from_rig[name].inv()
     return camera_light(rig.cameras[name], pose, _STROBES, water_optics("II"), _REACH_M)
 
@@ -166,10 +168,10 @@ def _electrons(scale: int) -> float:
     return _MIDDLE_E / float(np.median(nominal.mean(axis=-1)))
 
 
-def picture_at(shoot: Shoot, station: int, name: str) -> Array:
+def picture_at(shoot: Shoot, station: int, name: str) -> NDArray[np.uint8]:
     """A picture in eight bits, blue, green, red."""
     rig = harbour_rig(shoot.scale)
-    pose = body_poses(shoot.planned, shoot.scale)[station] * rig.body_from_cam(name)
+    pose = body_poses(shoot.planned)[station] * rig.body_from_cam(name)
     still = still_harbour()
     terrain = replace(still, objects=still.objects + moving_at(time_of(station)))
     scene = Scene(terrain=terrain, texture=survey_texture(_SEED))
@@ -216,7 +218,7 @@ def _write_navigation(shoot: Shoot) -> None:
             "heading_deg", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg",
             "sigma_heading_deg",
         ])  # fmt: skip
-        for number, pose in enumerate(body_poses(shoot.planned, shoot.scale)):
+        for number, pose in enumerate(body_poses(shoot.planned)):
             at = _START + timedelta(seconds=time_of(number))
             roll, pitch, yaw = np.rad2deg(_attitude(pose.rotation)) + turns * rng.normal(0, 1, 3)
             read = pose.translation + bias + 0.44 * sigma * rng.standard_normal(3)
@@ -236,7 +238,9 @@ def _attitude(turn: Rotation) -> Array:
 
 def import_survey(folder: Path, workspace: Path) -> str:
     """Import as a user does; what the command said."""
-    cameras = [part for name in ("left", "right") for part in ("--camera", f"{name}={folder/name}")]
+    cameras = [
+        part for name in ("left", "right") for part in ("--camera", f"{name}={folder / name}")
+    ]
     files = ["--rig", str(folder / "rig.json"), "--navigation", str(folder / "navigation.csv")]
     return command("import-images", *cameras, *files, "-w", str(workspace))
 

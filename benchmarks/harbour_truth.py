@@ -46,9 +46,8 @@ def distances(points: Array) -> tuple[Array, NDArray[np.int64]]:
     """
     best = _field_distance(points, 2, floor_depth)
     part = np.zeros(len(points), np.int64)
-    others = [("wall", _wall_distance(points))]
-    for solid in SOLIDS:
-        others.append((solid.name, solid_distance(solid, points)))
+    others = [(one.name, solid_distance(one, points)) for one in SOLIDS]
+    others.append(("wall", _wall_distance(points)))
     for name, distance in others:
         nearer = distance < best
         best = np.where(nearer, distance, best)
@@ -94,7 +93,8 @@ def clearance(points: Array) -> Array:
         close = apart < 0.05
         apart[close] = solid_distance(solid, points[close])
         np.minimum(found, apart, out=found)
-    return np.minimum(found, ladder)
+    least: Array = np.minimum(found, ladder)
+    return least
 
 
 def solid_distance(solid: Solid, points: Array) -> Array:
@@ -173,7 +173,11 @@ def _field_distance(points: Array, axis: int, heights: Heights) -> Array:
                 trial = (at_u - u[search]) ** 2 + (at_v - v[search]) ** 2 + w**2
                 better = trial < best[search]
                 index = np.nonzero(search)[0][better]
-                best[index], best_u[index], best_v[index] = trial[better], at_u[better], at_v[better]
+                best[index], best_u[index], best_v[index] = (
+                    trial[better],
+                    at_u[better],
+                    at_v[better],
+                )
     distance: Array = np.sign(along) * np.sqrt(best)
     return distance
 

@@ -221,9 +221,9 @@ def ray_bands(camera: Camera, samples: int) -> list[tuple[int, int]]:
 def _patch_in_sight(
     terrain: Terrain, camera: Camera, poses: RigidTransform, reach_m: float
 ) -> Patch:
-    """The part of a terrain that the camera can see from any of the poses, and a bit around it.
+    """The part of a terrain that the camera can see from any of the poses, and some around it.
 
-    Rays down end below the deepest floor; where some look to the horizon or up, all end at `reach_m`
+    Rays down end below the deepest floor; where some look level or up, all end at `reach_m`
     at the latest.
     """
     origins, directions = camera.unproject(camera.border(8))
