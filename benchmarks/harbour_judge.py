@@ -31,7 +31,7 @@ SLOPES_DEG = (0.0, 27.0, 60.0, 100.0, 180.0)
 """Bounds of classes of slope: gentle, steep, walls, overhangs."""
 _BEYOND, _NEAR_PX = 5.0, 3.0
 _SPACING_M = 0.05
-_MOST = 60_000
+_MOST = 30_000
 _MOVING_M = 0.03
 _COLUMN_M, _COLUMN_STEP_M = 0.3, 0.004
 _SEED = 5

@@ -98,7 +98,11 @@ def stations(step_m: float) -> list[Station]:
     row("tie", (-2.8, 4.4, 4.2), (-2.0, 4.4, 4.0), ahead, (0.0, 90.0), tie)
     row("tie", (-2.0, 2.3, 4.4), (-2.8, 3.2, 4.3), ahead, level)
     row("tie", (-2.8, 4.4, 4.2), (-2.6, 4.4, 5.3), ahead, (0.0, -30.0), 4)
-    for depth, down in ((4.2, 0.0), (4.9, 20.0)):
+    # Around the pile the floor links to the other rows, and one ring to the other.
+    row("floor", (-2.8, -0.7, 4.0), (-2.8, -1.9, 4.0), (90.0, 90.0), nadir)
+    north, east = PILE.place_ne
+    row("tie", (north - 1.75, east, 4.4), (north - 1.3, east, 4.1), ahead, (0.0, 90.0), tie)
+    for depth, down in ((4.4, 0.0), (4.6, 18.0)):
         arc = 1.75 * np.deg2rad(200.0)
         for azimuth in np.linspace(-100.0, 100.0, round(arc / step_m) + 1).tolist():
             angle = np.deg2rad(azimuth)
