@@ -168,6 +168,12 @@ PARTS = (
         needs=_real("brighton_beach"),
     ),
     Part(
+        name="harbour",
+        module="harbour",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="mosaic",
         module="mosaic",
         arguments=lambda _, work: ("--work", str(work)),

@@ -30,6 +30,8 @@ _BAND_RAYS = 250_000
 _SHADOW_BLUR_PX = 3
 _PAD_M = 0.4
 """Distance beyond the frame from which terrain can cast a shadow into it, about."""
+_LEVEL = 0.05
+"""Descent of a ray, as a share of its length, below which it counts as looking to the horizon."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +66,8 @@ def render(
     Args:
         scene: what is there.
         camera: who looks.
-        light: the strobes in this camera's frame.
+        light: the strobes in this camera's frame. Terrain beyond its reach may be left out; a ray
+            that meets none shows the backscatter up to there.
         ned_from_cam: (T,) poses of the camera at moments spread evenly over the exposure.
         samples: rays along a side of a pixel.
 
@@ -72,9 +75,9 @@ def render(
         (H, W, 3) red, green and blue, W / (m^2 sr).
 
     Raises:
-        ImageError: the camera is in the sea floor or looks at none of it.
+        ImageError: the camera is in the sea floor.
     """
-    patch = _patch_in_sight(scene.terrain, camera, ned_from_cam)
+    patch = _patch_in_sight(scene.terrain, camera, ned_from_cam, light.reach_m)
     rotations = ned_from_cam.rotation.as_matrix().reshape(-1, 3, 3)
     places = ned_from_cam.translation.reshape(-1, 3) - patch.origin_ned
     picture = np.empty((camera.height_px, camera.width_px, 3), dtype=np.float32)
@@ -100,6 +103,8 @@ def render(
             patch.material,
         )
         footprint = _footprints(path, normals, world, np.float32(pixel_rad / samples))
+        if patch.to_rest is not None:
+            points += _between_corners(path, triangle, uv, patch.triangles, patch.to_rest)
         albedo = scene.texture.albedo(points + patch.origin_ned, material, footprint)
         _shade(
             rays.origins, rays.directions, rays.vignetting, path, normals, albedo, lit, moments,
@@ -109,19 +114,22 @@ def render(
     return picture
 
 
-def range_map(scene: Scene, camera: Camera, ned_from_cam: RigidTransform) -> Floats:
+def range_map(
+    scene: Scene, camera: Camera, ned_from_cam: RigidTransform, reach_m: float = 20.0
+) -> Floats:
     """Distance to the sea floor along the axis from the entrance pupil, through pixel centres.
 
     Args:
         scene: what is there.
         camera: who looks.
         ned_from_cam: one pose.
+        reach_m: path along rays to the horizon beyond which terrain may be left out.
 
     Returns:
         (H, W) metres; NaN where a ray meets nothing.
     """
     pose = RigidTransform.from_matrix(ned_from_cam.as_matrix().reshape(1, 4, 4))
-    patch = _patch_in_sight(scene.terrain, camera, pose)
+    patch = _patch_in_sight(scene.terrain, camera, pose, reach_m)
     places = pose.translation - patch.origin_ned
     result = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
     for first, last in ray_bands(camera, 1):
@@ -210,21 +218,32 @@ def ray_bands(camera: Camera, samples: int) -> list[tuple[int, int]]:
     return [(r, min(r + rows, camera.height_px)) for r in range(0, camera.height_px, rows)]
 
 
-def _patch_in_sight(terrain: Terrain, camera: Camera, poses: RigidTransform) -> Patch:
-    """The part of a terrain that the camera can see from any of the poses, and a bit around it."""
+def _patch_in_sight(
+    terrain: Terrain, camera: Camera, poses: RigidTransform, reach_m: float
+) -> Patch:
+    """The part of a terrain that the camera can see from any of the poses, and some around it.
+
+    Rays down end below the deepest floor; where some look level or up, all end at `reach_m`
+    at the latest.
+    """
     origins, directions = camera.unproject(camera.border(8))
     deepest = float(terrain.depths.max()) + terrain.offset_ned[2] + _PAD_M
+    level = bool(min(p.rotation.apply(directions)[:, 2].min() for p in poses) < _LEVEL)
+    if level:  # then rays within the frame can end farther out than those of its border
+        inner = camera.pixel_centres(max(camera.width_px // 16, 1)).reshape(-1, 2)
+        origins, directions = camera.unproject(np.concatenate([camera.border(8), inner]))
     corners = []
     for pose in poses:
         from_ned, along = pose.apply(origins), pose.rotation.apply(directions)
-        reach = deepest - from_ned[:, 2]
-        if reach.min() <= 0.0 or along[:, 2].min() < 0.05:
-            depth = float(from_ned[:, 2].mean())
+        down = deepest - from_ned[:, 2]
+        if down.min() <= 0.0:
             raise ImageError(
-                f"the camera at {depth:.2f} m depth is not above a sea floor of {deepest:.2f} m or "
-                "looks at the horizon; check altitude, roll and pitch"
+                f"the camera at {float(from_ned[:, 2].mean()):.2f} m depth is not above a sea "
+                f"floor of {deepest:.2f} m; check depth and altitude"
             )
-        corners += [from_ned[:, :2], (from_ned + (reach / along[:, 2])[:, None] * along)[:, :2]]
+        path = down / np.maximum(along[:, 2], _LEVEL)
+        path = np.minimum(path, reach_m) if level else path
+        corners += [from_ned[:, :2], (from_ned + path[:, None] * along)[:, :2]]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
     (south, west), (north, east) = (low - _PAD_M).tolist(), (high + _PAD_M).tolist()
     return terrain.patch((south, north, west, east))
@@ -359,6 +378,24 @@ def _surface(
             normals[i, axis] /= length
         material[i] = w * vertex_material[a] + u * vertex_material[b] + v * vertex_material[c]
     return points, normals, material
+
+
+@compiled
+def _between_corners(
+    path: Array, triangle: Array, uv: Array, triangles: Array, values: Array
+) -> Array:
+    """(N, 3) values of vertices, linear within the triangle of each hit; a miss gets zeros."""
+    found = np.zeros((len(path), 3))
+    for i in range(len(path)):
+        if not path[i] < np.inf:
+            continue
+        a, b, c = triangles[triangle[i]]
+        u, v = uv[i, 0], uv[i, 1]
+        for axis in range(3):
+            found[i, axis] = (
+                (1.0 - u - v) * values[a, axis] + u * values[b, axis] + v * values[c, axis]
+            )
+    return found
 
 
 @compiled

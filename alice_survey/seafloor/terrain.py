@@ -46,6 +46,9 @@ class TerrainObject:
     triangles: Triangles
     """(T, 3) counter-clockwise seen from outside."""
     material: float
+    at_rest: Floats | None = None
+    """(V, 3) where the texture of each vertex is: the shape at rest of what swims or sways; None
+    for what stays."""
 
     @cached_property
     def normals(self) -> Floats:
@@ -73,6 +76,8 @@ class Patch:
     """(V, 3) unit normals that point into the water."""
     material: Floats
     """(V,) see `DETRITUS`, `SAND`, `ROCK`, `CERAMIC`."""
+    to_rest: Floats | None = None
+    """(V, 3) from each vertex to where its texture is, metres; None where nothing moves."""
 
     @cached_property
     def scene(self) -> Any:
@@ -181,7 +186,8 @@ class Terrain:
         triangles = [_grid_triangles(*depths.shape)]
         normals = [self._normals(rows, columns).reshape(-1, 3)]
         material = [self.material[rows, columns].ravel()]
-        first = depths.size
+        first, moving = depths.size, False
+        to_rest = [np.zeros((first, 3), dtype=np.float32)]
         window = corners - self.offset_ned[:2]
         for item in self.objects:
             low, high = item.vertices[:, :2].min(axis=0), item.vertices[:, :2].max(axis=0)
@@ -191,6 +197,9 @@ class Terrain:
             triangles.append(item.triangles + np.int32(first))
             normals.append(item.normals)
             material.append(np.full(len(item.vertices), item.material, dtype=np.float32))
+            rest = item.vertices if item.at_rest is None else item.at_rest
+            to_rest.append(rest - item.vertices)
+            moving = moving or item.at_rest is not None
             first += len(item.vertices)
         return Patch(
             origin_ned=self.offset_ned + shift,
@@ -198,6 +207,7 @@ class Terrain:
             triangles=np.concatenate(triangles),
             normals=np.concatenate(normals),
             material=np.concatenate(material),
+            to_rest=np.concatenate(to_rest) if moving else None,
         )
 
     def _normals(self, rows: slice, columns: slice) -> Floats:
@@ -213,8 +223,14 @@ class Terrain:
         return inner
 
     def write(self, path: Path) -> None:
-        """Write the mesh as binary PLY, and next to it, with suffix `.json`, what else is known."""
+        """Write the mesh as binary PLY, and next to it, with suffix `.json`, what else is known.
+
+        Raises:
+            WorkspaceError: an object moves: the file has no place for its shape at rest.
+        """
         whole = self.patch()
+        if whole.to_rest is not None:
+            raise WorkspaceError(f"{path}: an object moves; write the terrain without it")
         header = (
             "ply\nformat binary_little_endian 1.0\n"
             f"comment add {self.offset_ned.tolist()} for north, east, down in metres\n"

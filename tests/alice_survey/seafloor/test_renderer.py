@@ -1,14 +1,15 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import SeafloorConfig, SurveyConfig
-from alice_survey.base.errors import ImageError
+from alice_survey.base.errors import ImageError, WorkspaceError
 from alice_survey.base.frames import rotation_from_attitude
 from alice_survey.seafloor.as_built import true_rig
-from alice_survey.seafloor.light import CameraLight, camera_light
+from alice_survey.seafloor.light import CameraLight, backscatter_at, camera_light
 from alice_survey.seafloor.renderer import (
     Scene,
     camera_rays,
@@ -16,7 +17,7 @@ from alice_survey.seafloor.renderer import (
     range_map,
     render,
 )
-from alice_survey.seafloor.terrain import Terrain, build_terrain
+from alice_survey.seafloor.terrain import Terrain, TerrainObject, build_terrain
 from alice_survey.seafloor.texture import Texture
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
@@ -250,8 +251,53 @@ def test_a_camera_that_sees_no_floor_is_refused() -> None:
     scene = Scene(terrain=flat(), texture=Even(seed=0))
     with pytest.raises(ImageError):
         render(scene, CAMERA, LIGHT, still(pose(altitude_m=-1.0)), 1)
-    with pytest.raises(ImageError):
-        range_map(scene, CAMERA, pose(roll_deg=80.0))
+
+
+def test_a_level_camera_sees_the_floor_below_the_horizon_and_backscatter_above() -> None:
+    scene = Scene(terrain=flat(), texture=Even(seed=0))
+    level = pose(pitch_deg=90.0, altitude_m=0.5)
+    rotation = level.rotation.as_matrix()
+    found = range_map(scene, CAMERA, level, reach_m=2.5)
+    origins, directions = CAMERA.unproject(CAMERA.pixel_centres())
+    down = directions @ rotation[2]
+    start = level.translation[2] + origins @ rotation[2]
+    path = np.where(down > 0, (FLOOR_M - start) / np.where(down > 0, down, 1.0), np.inf)
+    expected = origins[..., 2] + path * directions[..., 2]
+    near = path < 2.5
+    assert near.sum() > 100
+    np.testing.assert_allclose(found[near], expected[near], rtol=3e-6)
+    assert np.isnan(found[down <= 0]).all()
+
+    lit = render(scene, CAMERA, LIGHT, still(level), 1)
+    row, column = 3, CAMERA.width_px // 2
+    place = np.array([column + 0.5, row + 0.5]) / (CAMERA.width_px, CAMERA.height_px)
+    veil = np.empty(3)
+    last = np.array(LIGHT.backscatter.shape[1::-1]) - 1
+    backscatter_at(LIGHT.backscatter, LIGHT.reach_m, *(place * last), LIGHT.reach_m, veil)
+    cosine = CAMERA.in_air().unproject(np.array([column + 0.5, row + 0.5]))[1][2]
+    np.testing.assert_allclose(lit[row, column], veil * cosine**4, rtol=1e-5)
+
+
+def test_a_texture_moves_with_its_object() -> None:
+    box_m = np.array([[-0.4, -0.4, 3.9], [0.4, -0.4, 3.9], [0.4, 0.4, 3.9], [-0.4, 0.4, 3.9]])
+    sheet = np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)
+    shift = np.array([0.0, 0.23, 0.0])
+    below = np.array([0.0, 0.0, FLOOR_M])
+    views = []
+    for moved in (np.zeros(3), shift):
+        item = TerrainObject(
+            name="fish", vertices=(box_m - below + moved).astype(np.float32), triangles=sheet,
+            material=2.0, at_rest=(box_m - below).astype(np.float32),
+        )  # fmt: skip
+        terrain = replace(flat(), objects=(item,))
+        scene = Scene(terrain=terrain, texture=Texture(seed=4))
+        follow = pose(east_m=float(moved[1]), altitude_m=FLOOR_M - 3.0)
+        views.append(render(scene, CAMERA, LIGHT, still(follow), 1))
+    inside = np.s_[60:110, 80:130]
+    assert views[0][inside].std() > 0.05 * views[0][inside].mean()
+    np.testing.assert_allclose(views[1][inside], views[0][inside], rtol=2e-2)
+    with pytest.raises(WorkspaceError, match="moves"):
+        terrain.write(Path("never.ply"))
 
 
 def test_a_lens_without_an_inverse_is_refused() -> None:
