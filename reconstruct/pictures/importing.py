@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -16,21 +16,15 @@ from alice_survey.base.errors import (
     warn,
 )
 from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.base.manifest import read_manifest, write_manifest
 from alice_survey.base.records import PicturesRecord
 from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import read_rig, write_rig
-from missions.logs.navigation_csv import (
-    find_zone,
-    read_navigation,
-)
-from reconstruct.pictures.files import (
-    PictureFolder,
-    kind_of,
-    look_into,
-)
+from missions.logs.navigation_csv import find_zone, read_navigation
+from reconstruct.pictures.files import VIDEO, PictureFolder, look_into
 from reconstruct.pictures.incoming import (
+    by_camera,
     check_entries,
     copy_all,
     find_entries,
@@ -38,41 +32,24 @@ from reconstruct.pictures.incoming import (
     named_apart,
     record_of,
 )
-from reconstruct.pictures.video_frames import take_frames
-from reconstruct.pictures.when_where import checked_level, placed, readings_of
+from reconstruct.pictures.recordings import Recording, find_videos, read_recordings
+from reconstruct.pictures.summary import (
+    ImportedPictures,
+    ImportRecord,
+    import_record,
+    summary,
+    with_folders,
+)
+from reconstruct.pictures.video_frames import (
+    DEFAULT_OVERLAP,
+    LEAST_OVERLAP,
+    MOST_OVERLAP,
+    FrameSettings,
+    take_frames,
+)
+from reconstruct.pictures.when_where import checked_level, placed
 
 _MONO = "camera"
-_FRAMES = "frames of the video"
-_UNDECODABLE = "cannot be decoded"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportedPictures:
-    """What a workspace got, and what was left out."""
-
-    changed: bool
-    """False when all was there already."""
-    cameras: Mapping[str, int]
-    """Pictures by camera."""
-    kinds: Mapping[str, int]
-    """Pictures by kind of file."""
-    positions: int
-    """Number of pictures with a known position."""
-    readings: Mapping[str, int]
-    """Pictures by what navigation measured of them."""
-    left_out: Mapping[str, int]
-    """Files that were not imported, by reason."""
-
-    def __str__(self) -> str:
-        """One line, such as `68 pictures (68 PNG) of left and right, 0 with a position`."""
-        total = sum(self.cameras.values())
-        *others, last = self.cameras
-        of = f" of {', '.join(others)} and {last}" if others else ""
-        text = f"{total} pictures ({_counted(self.kinds)}){of}"
-        text += f", {self.positions} with a position"
-        for name, count in self.readings.items():
-            text += f", {count} with {name}" if count > self.positions else ""
-        return text + (f"; left out: {_counted(self.left_out)}" if self.left_out else "")
 
 
 def import_images(
@@ -80,8 +57,10 @@ def import_images(
     folders: Sequence[Path],
     *,
     cameras: Mapping[str, Path] = MappingProxyType({}),
-    video: Path | None = None,
-    every_s: float = 1.0,
+    videos: Sequence[Path] = (),
+    overlap: float | None = None,
+    every_s: float | None = None,
+    recursive: bool = False,
     navigation: Path | None = None,
     clock_offset_s: float = 0.0,
     time_zone: str = "UTC",
@@ -90,21 +69,27 @@ def import_images(
     masks: Path | None = None,
     executor: Executor = SERIAL,
 ) -> ImportedPictures:
-    """Write `images/` from pictures of one camera, of cameras on a rig, or from a video.
+    """Write `images/` from pictures, of cameras on a rig or not, or from videos.
 
-    A picture that cannot be decoded to its end is left out with a warning; the others of its
-    station stay. HEIC, videos, folders inside and other files are left out with a warning
-    for each kind. Where each picture was taken comes from the navigation log, else from
-    GPS in EXIF, else from nothing: then the model will have neither scale nor CRS.
+    A picture that cannot be decoded to its end, a copy of another and a mirror image are left out
+    with a warning; the others of the station stay. Videos, folders inside and other files are left
+    out with a warning for each kind. Pixels are those that are stored: an EXIF orientation does not
+    turn them. Without a rig, pictures of one folder that EXIF or sizes show to be of several
+    cameras are those of `camera`, `camera-2` and so on.
+
+    Where each picture was taken comes from the navigation log, else from GPS in EXIF or in the
+    video, else from nothing: then the model will have neither scale nor CRS.
 
     Args:
         workspace: folder of the survey.
-        folders: folders of one camera's pictures, in order.
+        folders: folders of pictures that are taken one by one, in order; or videos.
         cameras: folder of each camera of a rig by its name, such as left and right; the pictures of
             one moment are those of one place in the order of names or, where a camera lacks some,
             of one number in them.
-        video: a video to take frames from.
-        every_s: seconds between frames.
+        videos: to take frames from, or folders of them; chapters of a GoPro are one recording.
+        overlap: of neighbouring frames; None for 0.7 unless there is an interval.
+        every_s: seconds between frames, instead of an overlap.
+        recursive: take pictures of folders inside too.
         navigation: CSV with time and any of position, depth, attitude and altitude (see
             `read_navigation`).
         clock_offset_s: what to add to the times of pictures to get those of navigation.
@@ -125,7 +110,10 @@ def import_images(
         NavigationError: the navigation log cannot be used, or a level is named without one.
         CalibrationError: the rig file is wrong or not that of the pictures.
     """
-    _check_sources(folders, cameras, video, every_s)
+    videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in VIDEO)]
+    folders = [folder for folder in folders if folder not in videos]
+    _check_sources(folders, cameras, videos)
+    frames = _frame_settings(overlap, every_s, videos)
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
     zone = find_zone(time_zone)
@@ -133,7 +121,8 @@ def import_images(
     given = [
         *folders,
         *cameras.values(),
-        *(p for p in (video, navigation, rig, masks) if p is not None),
+        *videos,
+        *(p for p in (navigation, rig, masks) if p is not None),
     ]
     for path in given:
         if not path.exists():
@@ -149,18 +138,22 @@ def import_images(
             )
     known_rig = None if rig is None else read_rig(rig)
     mono = _MONO if known_rig is None else known_rig.reference
-    sides = _look_into(folders, cameras, mono, [*given, workspace])
+    found_videos = find_videos(videos)
+    sides = _look_into(folders, cameras, mono, [*given, workspace], recursive)
     stations = _stations(sides)
     folders_read = [each for side in sides.values() for each in side]
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
         name="images",
-        version=2,
+        version=3,
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),
             **({} if set(cameras) in (set(), {"left", "right"}) else {"cameras": list(cameras)}),
-            "every_s": every_s if video is not None else None,
+            "every_s": frames.every_s,
+            "overlap": frames.overlap if videos else None,
+            "videos": [path.name for path in found_videos],
+            "recursive": recursive,
             "navigation": navigation is not None,
             "clock_offset_s": clock_offset_s,
             "time_zone": time_zone,
@@ -168,23 +161,33 @@ def import_images(
             "rig": rig is not None,
             "masks": masks is not None,
         },
-        inputs=[*files, *(path for path in given if path not in (*folders, *cameras.values()))],
+        inputs=[
+            *files,
+            *found_videos,
+            *(path for path in (navigation, rig, masks) if path is not None),
+        ],
     )
 
     def work(partial: Path) -> None:
         notes: list[str] = []
         log = None if navigation is None else read_navigation(navigation, zone, ())
-        if video is not None:
-            entries = take_frames(video, every_s, partial, mono)
+        recordings: list[Recording] = []
+        left_out: dict[str, list[str]] = {}
+        if found_videos:
+            recordings = read_recordings(found_videos, zone)
+            names = [mono] * len(recordings) if known_rig else _cameras_of(recordings, mono)
+            entries = take_frames(recordings, names, frames, partial)
         else:
             for each in folders_read:
                 for line in each.warnings():
                     warn(line)
-            entries = find_entries(stations, executor)
+            entries, left_out = find_entries(stations, executor)
+            if folders and known_rig is None:
+                entries = by_camera(entries, mono)
         check_entries(entries, known_rig)
         entries = named_apart(entries)
         entries = [replace(e, mask=mask_of(e, masks, bool(cameras))) for e in entries]
-        if video is None:
+        if not found_videos:
             notes += copy_all(entries, partial, executor)
         records = [record_of(entry, partial) for entry in entries]
         records, datum, level = placed(
@@ -196,6 +199,9 @@ def import_images(
             taken = {entry.camera for entry in entries}
             names = [name for name in known_rig.cameras if name in taken]
             write_rig(partial / "rig.json", part_of_rig(known_rig, names))
+        record = import_record(entries, list(sides), recordings, left_out)
+        record.write(partial / Path(ImportRecord.path).name)
+        notes += with_folders(record, folders_read).lines()
         PicturesRecord.save(
             partial / "survey.json",
             {"source": "imported", "datum": datum, "vertical_datum": level, "notes": notes},
@@ -203,46 +209,35 @@ def import_images(
 
     changed = run_stage(workspace, stage, work)
     records = read_manifest(workspace / "images" / "manifest.csv")
-    return _imported(records, sides, stations, changed=changed)
-
-
-def _imported(
-    records: Sequence[ImageRecord],
-    sides: Mapping[str, Sequence[PictureFolder]],
-    stations: Sequence[Mapping[str, Path]],
-    *,
-    changed: bool,
-) -> ImportedPictures:
-    """Counts by the manifest, whose stations number the pictures that were found."""
-    left_out: Counter[str] = Counter()
-    kinds = Counter({_FRAMES: len(records)})
-    if stations:
-        kinds = Counter(kind_of(stations[r.station][r.camera]) for r in records)
-        left_out += Counter({_UNDECODABLE: sum(map(len, stations)) - len(records)})
-        for one in (one for folders in sides.values() for one in folders):
-            left_out += Counter({reason: len(paths) for reason, paths in one.left_out.items()})
-    counts = Counter(record.camera for record in records)
-    return ImportedPictures(
-        changed=changed,
-        cameras={name: counts[name] for name in (*sides, *counts) if counts[name]},
-        kinds=dict(kinds),
-        positions=sum(record.has_position for record in records),
-        readings=readings_of(records),
-        left_out=dict(left_out),
-    )
-
-
-def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {what}" for what, count in counts.items())
+    return summary(workspace, records, folders_read, changed=changed)
 
 
 def _look_into(
-    folders: Sequence[Path], cameras: Mapping[str, Path], mono: str, apart: Sequence[Path]
+    folders: Sequence[Path],
+    cameras: Mapping[str, Path],
+    mono: str,
+    apart: Sequence[Path],
+    recursive: bool,
 ) -> dict[str, list[PictureFolder]]:
     """Contents of the folders of each camera; `mono` names the one camera of unnamed folders."""
     if cameras:
-        return {name: [look_into(folder, apart)] for name, folder in cameras.items()}
-    return {mono: [look_into(folder, apart) for folder in folders]} if folders else {}
+        return {
+            name: [look_into(folder, apart, recursive=recursive)]
+            for name, folder in cameras.items()
+        }
+    if not folders:
+        return {}
+    return {mono: [look_into(folder, apart, recursive=recursive) for folder in folders]}
+
+
+def _cameras_of(recordings: Sequence[Recording], mono: str) -> list[str]:
+    """Camera of each recording: those of one size are one; that of most seconds has the name."""
+    seconds: Counter[tuple[int, int]] = Counter()
+    for recording in recordings:
+        seconds[recording.size] += round(sum(file.duration_s for file in recording.files) + 1)
+    names = [mono, *(f"{mono}-{number}" for number in range(2, len(seconds) + 1))]
+    by_size = {size: name for (size, _), name in zip(seconds.most_common(), names, strict=True)}
+    return [by_size[recording.size] for recording in recordings]
 
 
 def _stations(sides: Mapping[str, Sequence[PictureFolder]]) -> list[Mapping[str, Path]]:
@@ -257,17 +252,31 @@ def _stations(sides: Mapping[str, Sequence[PictureFolder]]) -> list[Mapping[str,
 
 
 def _check_sources(
-    folders: Sequence[Path], cameras: Mapping[str, Path], video: Path | None, every_s: float
+    folders: Sequence[Path], cameras: Mapping[str, Path], videos: Sequence[Path]
 ) -> None:
-    if sum([bool(folders), bool(cameras), video is not None]) != 1:
+    if sum([bool(folders), bool(cameras), bool(videos)]) != 1:
         raise ImageError(
             "give folders of pictures, or --left and --right, or --camera for each camera, or "
             "--video: one of them"
         )
-    if not every_s > 0:
-        raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
     every = [*folders, *cameras.values()]
     places = [folder.resolve() for folder in every]
     twice = [folder for folder in every if places.count(folder.resolve()) > 1]
     if twice:
         raise ImageError(f"{twice[0]} is given twice")
+
+
+def _frame_settings(
+    overlap: float | None, every_s: float | None, videos: Sequence[Path]
+) -> FrameSettings:
+    if not videos and (overlap is not None or every_s is not None):
+        raise ImageError("--overlap and --every choose frames of a video: give --video too")
+    if overlap is not None and every_s is not None:
+        raise ImageError("--overlap and --every exclude each other: give one of them")
+    if every_s is not None and not every_s > 0:
+        raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
+    if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
+        raise ImageError(
+            f"--overlap {overlap}: neighbouring frames share {LEAST_OVERLAP} to {MOST_OVERLAP}"
+        )
+    return FrameSettings(overlap=DEFAULT_OVERLAP if overlap is None else overlap, every_s=every_s)

@@ -1,5 +1,7 @@
 """Pictures on their way into a workspace: checked, named, masked and copied."""
 
+import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +23,10 @@ from reconstruct.pictures.files import (
 )
 from reconstruct.pictures.undistorted import read_mask
 
+UNDECODABLE = "cannot be decoded"
+MIRRORED = "mirror images"
+COPIES = "copies of others"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Incoming:
@@ -33,23 +39,81 @@ class Incoming:
     image: str = ""
     mask: Path | None = None
     video_time_s: float | None = None
+    """Of a frame, since the start of the first recording; NaN where that is unknown."""
+    recording: str = ""
+    """Name of the recording that a frame is of."""
 
 
-def find_entries(stations: Sequence[Mapping[str, Path]], executor: Executor) -> list[Incoming]:
-    """Pictures of all stations that can be decoded; others are left out with a warning."""
+def find_entries(
+    stations: Sequence[Mapping[str, Path]], executor: Executor
+) -> tuple[list[Incoming], dict[str, list[str]]]:
+    """Pictures of all stations that can be used; the others are named in warnings.
+
+    Returns:
+        Those that can be used, and names of the others by reason.
+    """
     listed = [
         (camera, station, path)
         for station, paths in enumerate(stations)
         for camera, path in paths.items()
     ]
+    copies = same_bytes([path for _, _, path in listed])
+    owners = {path: camera for camera, _, path in listed}
+    for copy, first in copies.items():
+        if owners[copy] != owners[first]:
+            raise ImageError(
+                f"{owners[first]} and {owners[copy]} have the same picture, {first} and {copy}: "
+                "give each camera the pictures that it took"
+            )
+    listed = [one for one in listed if one[2] not in copies]
     facts = executor.map(inspect, [path for _, _, path in listed], label="checking pictures")
     entries = []
+    left_out: dict[str, list[str]] = {}
+    for copy, first in copies.items():
+        warn(f"{copy} is left out: it is the same file as {first}")
+        left_out.setdefault(COPIES, []).append(copy.name)
     for (camera, station, path), known in zip(listed, facts, strict=True):
         if known.fault:
             warn(f"{path} is left out: {known.fault}")
+            reason = MIRRORED if known.width_px else UNDECODABLE
+            left_out.setdefault(reason, []).append(path.name)
             continue
         entries.append(Incoming(source=path, camera=camera, station=station, facts=known))
-    return entries
+    return entries, left_out
+
+
+def same_bytes(paths: Sequence[Path]) -> dict[Path, Path]:
+    """Files that are copies, each with the first of the same bytes."""
+    sizes = {path: path.stat().st_size if path.is_file() else 0 for path in paths}
+    often = Counter(sizes.values())
+    first: dict[bytes, Path] = {}
+    copies = {}
+    for path in paths:
+        if sizes[path] == 0 or often[sizes[path]] == 1:
+            continue
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").digest()
+        other = first.setdefault(digest, path)
+        if other != path:
+            copies[path] = other
+    return copies
+
+
+def by_camera(entries: Sequence[Incoming], name: str) -> list[Incoming]:
+    """Name the cameras that took pictures, as far as EXIF and sizes distinguish them.
+
+    The camera of most pictures has the name that is given; the next ones a number more.
+    """
+    counts = Counter(_camera_key(entry) for entry in entries)
+    names = {
+        key: name if number == 1 else f"{name}-{number}"
+        for number, (key, _) in enumerate(counts.most_common(), 1)
+    }
+    return [replace(entry, camera=names[_camera_key(entry)]) for entry in entries]
+
+
+def _camera_key(entry: Incoming) -> tuple[str, int, int]:
+    return entry.facts.device, entry.facts.width_px, entry.facts.height_px
 
 
 def check_entries(entries: Sequence[Incoming], rig: Rig | None) -> None:

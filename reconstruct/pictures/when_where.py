@@ -58,18 +58,16 @@ def placed(
     records = [replace(r, time_s=float(t)) for r, t in zip(records, times, strict=True)]
     if log is not None:
         if not np.isfinite(times).any():
-            raise ImageError(
-                "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied"
-            )
+            raise ImageError(_without_times(entries))
         if from_first:
-            notes.append("picture times count from the first picture, plus the clock offset")
+            notes.append(f"picture times count from {from_first}, plus the clock offset")
         records = _with_navigation(records, times, log)
         level = logged_level
         if level == _LOGGED_LEVEL:
             _warn_of_heights(records)
     else:
         records = _with_gps(records, entries)
-        level = "EXIF GPS altitude"
+        level = f"{_gps_of(entries)} altitude"
     counted = readings_of(records)
     if not counted:
         if log is not None:
@@ -81,7 +79,7 @@ def placed(
         notes.append("no positions: no CRS, and unscaled unless a rig or a known length scales it")
         return list(records), None, "none"
     if log is None:
-        notes.append("positions from EXIF GPS, of unknown accuracy")
+        notes.append(f"positions from {_gps_of(entries)}, of unknown accuracy")
     complete = {name for name, count in counted.items() if count == len(records)}
     if complete != set(records[0].readings):
         counts = ", ".join(f"{name} of {counted[name]}" for name in records[0].readings)
@@ -103,27 +101,40 @@ def _warn_of_heights(records: Sequence[ImageRecord]) -> None:
         )
 
 
+def _gps_of(entries: Sequence[Incoming]) -> str:
+    return "the video's GPS" if entries[0].recording else "EXIF GPS"
+
+
+def _without_times(entries: Sequence[Incoming]) -> str:
+    recordings = list(dict.fromkeys(e.recording for e in entries if e.recording))
+    if recordings:
+        return (
+            f"{named(recordings)} do not say when they began, so navigation cannot be tied: import "
+            "each into a workspace of its own with --clock-offset, then 'join' them"
+        )
+    return "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied"
+
+
 def _times(
     entries: Sequence[Incoming], log: NavigationLog | None, clock_offset_s: float, zone: tzinfo
-) -> tuple[Array, bool]:
+) -> tuple[Array, str]:
     """Seconds of every picture on the clock of navigation (else since the first), NaN if unknown.
 
-    Also whether they count from the first picture though there is a log (which then has no dates).
+    Also where they count from if the clocks of pictures and log have no dates in common.
     """
-    if all(e.video_time_s is not None for e in entries):
-        times = np.array([e.video_time_s for e in entries], dtype=np.float64)
-        return times + clock_offset_s, False
     dates = [
         None if e.facts.time_local is None else to_utc(e.facts.time_local, zone) for e in entries
     ]
     known = [date for date in dates if date is not None]
+    log_start = None if log is None else log.start_utc
+    if all(e.video_time_s is not None for e in entries) and not (log_start and known):
+        times = np.array([e.video_time_s for e in entries], dtype=np.float64)
+        return times + clock_offset_s, "" if log is None else "the start of the first recording"
     if not known:
-        return np.full(len(entries), np.nan), False
-    start: datetime = min(known)
-    from_first = log is not None and log.start_utc is None
-    if log is not None and log.start_utc is not None:
-        start = log.start_utc
+        return np.full(len(entries), np.nan), ""
+    start: datetime = min(known) if log_start is None else log_start
     seconds = [np.nan if d is None else (d - start).total_seconds() for d in dates]
+    from_first = "the first picture" if log is not None and log_start is None else ""
     return np.array(seconds) + clock_offset_s, from_first
 
 
@@ -161,6 +172,6 @@ def _with_gps(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> li
                 sigma_depth_m=_EXIF_SIGMA_M[1],
             )
         )
-    if lost and len(lost) < len(records):
+    if lost and len(lost) < len(records) and not entries[0].recording:
         warn(f"{len(lost)} pictures have no complete GPS in EXIF: {named(lost)}")
     return placed
