@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from reconstruct.pictures.quality import measure
+from reconstruct.pictures.quality import sharpness
 
 Grey = NDArray[np.uint8]
 
@@ -33,7 +33,7 @@ _LEAST_INLIERS, _INLIER_SHARE = 12, 0.4
 _INLIER_PX, _BACK_PX = 1.0, 0.5
 _LARGEST_ZOOM = 2.0
 """Change of size from one frame to the next beyond which their motion is not believed."""
-_CROP_PX = (1024, 768)
+_CROP_PX = (640, 480)
 """Middle of a frame in which its sharpness is measured: all of it would take too long."""
 
 
@@ -137,7 +137,7 @@ class OverlapChooser:
         self._starting, self._followed = True, 1
         self._start_s = self._last_s = frame.time_s
         self._before = None
-        self._best = _Candidate(frame=frame, sharpness=sharpness(frame.pixels))
+        self._best = _Candidate(frame=frame, sharpness=_sharpness(frame.pixels))
 
     def _gone(self) -> float:
         """Share of the picture that the last taken frame does not show."""
@@ -161,7 +161,7 @@ class OverlapChooser:
         if gone < near:
             self._before = _Candidate(frame=frame)
             return
-        sharp = sharpness(frame.pixels)
+        sharp = _sharpness(frame.pixels)
         if self._best is None or sharp > self._best.sharpness:
             self._best = _Candidate(frame=frame, sharpness=sharp)
 
@@ -176,12 +176,12 @@ def shrunk(pixels: NDArray[np.uint8]) -> Grey:
     return np.asarray(small, np.uint8)
 
 
-def sharpness(pixels: NDArray[np.uint8]) -> float:
+def _sharpness(pixels: NDArray[np.uint8]) -> float:
     """Sharpness of the middle of a frame, as the check of a survey's pictures measures it."""
     height, width = pixels.shape[:2]
     w, h = min(width, _CROP_PX[0]), min(height, _CROP_PX[1])
     x, y = (width - w) // 2, (height - h) // 2
-    return measure(np.ascontiguousarray(pixels[y : y + h, x : x + w]))["sharpness"]
+    return sharpness(pixels[y : y + h, x : x + w])
 
 
 def motion(before: Grey, after: Grey) -> Array | None:

@@ -19,7 +19,7 @@ from reconstruct.pictures.recordings import Recording, frame_count, frame_rate, 
 
 LEAST_OVERLAP, DEFAULT_OVERLAP, MOST_OVERLAP = 0.3, 0.7, 0.95
 """Of neighbouring frames. Below the least they hardly match; above the most, they hardly differ."""
-_MOST_HZ = 30.0
+_MOST_HZ = 15.0
 """Frames a second that are looked at."""
 _TOUCH_S = 1e-6
 
