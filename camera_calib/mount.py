@@ -131,6 +131,8 @@ def mount_report(
     lever_m: tuple[float, float, float] | None,
     output: Path | None,
     plot: Path | None,
+    *,
+    overwrite: bool = False,
 ) -> tuple[str, dict[str, Any]]:
     """Say and draw how a rig is mounted, or mount it.
 
@@ -140,15 +142,19 @@ def mount_report(
         lever_m: as of `with_mount`.
         output: `rig.json` to write, which may be the same.
         plot: figure to draw.
+        overwrite: whether `output` may replace a file other than `path`.
 
     Raises:
-        CalibrationError: the rig or the mount cannot be read, or nothing is known to draw.
+        CalibrationError: the rig or the mount cannot be read, `output` is another file that exists,
+            or nothing is known to draw.
     """
     rig = read_rig(path)
     if mount is not None:
         rig = with_mount(rig, mount, lever_m)
     elif lever_m is not None or output is not None:
         raise CalibrationError(f"name a mount: {MOUNTS}, or a file")
+    if output is not None and output.exists() and not (overwrite or output.samefile(path)):
+        raise CalibrationError(f"{output}: exists: name another, or add --overwrite")
     lines = [mount_line(rig)]
     if output is not None:
         write_rig(output, rig)

@@ -252,9 +252,9 @@ class SimilarityRecord(JsonRecord):
 
 
 class JointRecord(JsonRecord):
-    """How well stations that no picture links to the others are known to lie to the most of them.
+    """How well a group that no picture links to the largest one is placed relative to it.
 
-    Sigmas are of the vector between the middles of both, and of the turn of one to the other.
+    Sigmas are of the vector between the middles of both, and of the turn of one against the other.
     """
 
     stations: int

@@ -223,7 +223,7 @@ def mount(
     how: Annotated[
         str | None,
         typer.Argument(
-            metavar="[MOUNT]",
+            metavar="MOUNT",
             help="nadir-bow-up, -right, -down, -left; forward, aft, port, starboard; forward+30: "
             "30 degrees down; or a file of a pose or of another rig.",
         ),
@@ -233,8 +233,11 @@ def mount(
         typer.Option(metavar="X Y Z", help="First camera's glass: forward, right, down, m."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="rig.json to write.")
+        Path | None, typer.Option("-o", "--output", help="rig.json to write; may be RIG itself.")
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace another file with --output.")
+    ] = False,
     plot: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF of the mount.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -245,7 +248,7 @@ def mount(
     """
     from camera_calib.mount import mount_report
 
-    print_result(*mount_report(rig, how, lever, output, plot), as_json)
+    print_result(*mount_report(rig, how, lever, output, plot, overwrite=overwrite), as_json)
 
 
 @app.command(

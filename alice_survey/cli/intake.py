@@ -143,6 +143,7 @@ def import_control(
         "import-log sparus2.bag -o navigation.csv",
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
         "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
+        "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     ),
 )
 def import_log(
@@ -166,12 +167,29 @@ def import_log(
     start_utc: Annotated[str | None, typer.Option(help="Date of a log without dates.")] = None,
     time_zone: Annotated[str, typer.Option(help="Of a CSV's dates.")] = "UTC",
     vehicle_log: Annotated[Path | None, typer.Option(help="Vehicle log to write, too.")] = None,
+    dead_reckon: Annotated[
+        bool, typer.Option("--dead-reckon", help="Positions from velocities, tied to fixes.")
+    ] = False,
+    start_at: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Of the first velocity: latitude, longitude, deg, and sigma, m."),
+    ] = None,
+    speed_sigma: Annotated[
+        float, typer.Option(help="Of dead reckoning: relative error of speeds.")
+    ] = 0.005,
+    heading_sigma: Annotated[
+        float, typer.Option(help="Of dead reckoning: constant error of headings, deg.")
+    ] = 1.0,
+    velocity_noise: Annotated[
+        float, typer.Option(help="Of dead reckoning: over one second, m/s.")
+    ] = 0.02,
     as_json: AsJson = False,
 ) -> None:
     """Turn a vehicle's own log into the navigation CSV of import-images.
 
     ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs.
     """
+    from missions.logs.dead_reckoning import TrackErrors
     from missions.logs.import_log import ImportOptions
     from missions.logs.import_log import import_log as work
 
@@ -179,6 +197,10 @@ def import_log(
         declination_deg=declination, tide=tide, clock_offset_s=clock_offset, start_s=start,
         end_s=end, topics=topic or (), datum_deg=datum, lever_body_m=lever_arm,
         altitude_offset_m=altitude_offset, start_utc=start_utc, time_zone=time_zone,
-        vehicle_log=vehicle_log,
+        vehicle_log=vehicle_log, start_at=start_at,
+        dead_reckon=(
+            TrackErrors(scale=speed_sigma, heading_deg=heading_sigma, noise_mps=velocity_noise)
+            if dead_reckon else None
+        ),
     )  # fmt: skip
     print_result(*work(log, output, options), as_json)

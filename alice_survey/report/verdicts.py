@@ -126,7 +126,7 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
         yield Verdict(
             level="look",
             text=f"{count(joint.stations, 'station')} show nothing that the others show: "
-            f"navigation alone says where they lie to these, with a sigma of {length(away)}",
+            f"navigation alone places them relative to these, with a sigma of {length(away)}",
             action="Fly a line across the gap to join the parts as well as their pictures can.",
         )
     for note in () if found is None or found.acceptance is None else found.acceptance.notes:

@@ -1,5 +1,7 @@
 """A drawing of a rig on its vehicle: from above, and from starboard."""
 
+from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,9 @@ from alice_survey.base.frames import Array
 from alice_survey.kit.figure import (
     INK,
     INKS,
+    MARKS,
     SOFT,
+    Axes,
     figure_style,
     new_figure,
     plain_name,
@@ -21,6 +25,10 @@ _HEIGHT_IN, _WIDTH_IN = 4.4, 9.0
 _RAY_SHARE = 0.6
 """Length of rays over the size of what is drawn."""
 _LEAST_M = 0.3
+_FROM_ABOVE, _FROM_STARBOARD = [1, 0], [0, 2]
+"""Axes of the vehicle (forward, right, down) that each drawing has to the right and upright."""
+
+_Field = tuple[Array, Array, Array]
 
 
 @figure_style()
@@ -40,44 +48,36 @@ def plot_mount(rig: Rig, path: Path) -> None:
     places = np.stack([field[0] for field in fields.values()])
     reach = _RAY_SHARE * max(float(np.abs(places).max()), _LEAST_M)
     figure = new_figure(_HEIGHT_IN, _WIDTH_IN)
-    for axes, title, across, label in zip(
-        figure.subplots(1, 2),
-        ("from above", "from starboard"),
-        (1, 2),
-        ("right (m)", "down (m)"),
-        strict=True,
-    ):
-        vertical = across == 2
-        for ink, (name, (place, corners, top)) in zip(INKS, fields.items(), strict=False):
-            # From above forward is up; from starboard it is to the right and down is down.
-            ends = place + reach * np.vstack([corners, corners[:1]])
-            at, rim, mark = (_seen(v, across) for v in (place[None], ends, ends[:4] + 0.0))
-            axes.plot(*rim.T, color=ink, lw=1.0)
-            for corner in mark:
-                axes.plot(*np.vstack([at[0], corner]).T, color=ink, lw=0.6)
-            edge = _seen(np.vstack([place + reach * top]), across)[0]
-            axes.plot(*at[0], "o", color=ink, ms=5, label=plain_name(name))
-            axes.annotate("top", edge, color=ink, ha="center", va="center", fontsize=8)
-        axes.plot(0, 0, "+", color=INK, ms=11, mew=1.5)
-        axes.annotate("navigation", (0, 0), xytext=(6, -12), textcoords="offset points", color=INK)
-        bow = _seen(np.array([[0.0, 0, 0], [0.8 * reach, 0, 0]]), across)
-        axes.annotate("", bow[1], bow[0], arrowprops={"arrowstyle": "->", "color": SOFT})
-        axes.annotate("bow", bow[1], xytext=(4, 4), textcoords="offset points", color=SOFT)
-        axes.set(title=title, aspect="equal")
-        axes.set(**({"xlabel": "forward (m)", "ylabel": label} if vertical else
-                    {"xlabel": label, "ylabel": "forward (m)"}))  # fmt: skip
-        if vertical:
-            axes.invert_yaxis()
-    axes.legend(loc="best")
+    above, side = figure.subplots(1, 2)
+    _paint(above, fields, reach, _FROM_ABOVE)
+    _paint(side, fields, reach, _FROM_STARBOARD)
+    above.set(title="from above", xlabel="right (m)", ylabel="forward (m)")
+    side.set(title="from starboard", xlabel="forward (m)", ylabel="down (m)")
+    side.invert_yaxis()
+    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     save_figure(figure, path)
 
 
-def _seen(points: Array, across: int) -> Array:
-    """(N, 2) of the drawing: right and forward from above, forward and down from starboard."""
-    return points[:, [0, 2]] if across == 2 else points[:, [1, 0]]
+def _paint(axes: Axes, fields: Mapping[str, _Field], reach: float, shown: list[int]) -> None:
+    """Draw cameras by the two axes of the vehicle that are shown; rays have length `reach`, m."""
+    styles = product(MARKS, INKS)  # so that cameras of the same ink differ
+    for (mark, ink), (name, (place, corners, top)) in zip(styles, fields.items(), strict=False):
+        at, rim = place[shown], (place + reach * corners)[:, shown]
+        axes.plot(*np.vstack([rim, rim[:1]]).T, color=ink, lw=1.0)
+        for corner in rim:
+            axes.plot(*np.stack([at, corner]).T, color=ink, lw=0.6)
+        axes.plot(*at, mark, color=ink, ms=5, label=plain_name(name))
+        edge = (place + reach * top)[shown]
+        axes.annotate("top", edge, color=ink, ha="center", va="center", fontsize=8)
+    axes.plot(0, 0, "+", color=INK, ms=11, mew=1.5)
+    axes.annotate("navigation", (0, 0), xytext=(6, -12), textcoords="offset points", color=INK)
+    bow = np.array([0.8 * reach, 0.0, 0.0])[shown]
+    axes.annotate("", bow, (0, 0), arrowprops={"arrowstyle": "->", "color": SOFT})
+    axes.annotate("bow", bow, xytext=(4, 4), textcoords="offset points", color=SOFT)
+    axes.set_aspect("equal")
 
 
-def _field_of_view(rig: Rig, name: str) -> tuple[Array, Array, Array]:
+def _field_of_view(rig: Rig, name: str) -> _Field:
     """Place of a camera's front glass (3,), rays of its corners (4, 3), middle of the top (3,)."""
     camera, body_from_cam = rig.cameras[name], rig.body_from_cam(name)
     width, height = camera.width_px, camera.height_px

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from scipy.spatial.transform import RigidTransform
+
 from alice_survey.base.artefacts import need_stage, write_json
 from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError, warn
@@ -100,10 +102,12 @@ def check_log(
 def rig_of(workspace: Path, camera: CameraConfig, water: WaterConfig) -> Rig:
     """The cameras of a workspace in the survey's water: calibrated, or else as designed.
 
-    They are mounted as designed where the calibration does not say how.
+    Where the calibration does not state the mount it is that which a reconstruction found, or else
+    the designed one, as `source` says.
 
     Args:
-        workspace: with `calibration/rig.json` or `images/rig.json` where they were calibrated.
+        workspace: with `calibration/rig.json` or `images/rig.json` where they were calibrated, and
+            `sparse/rig.json` where their mount was found.
         camera: the design.
         water: of the survey.
     """
@@ -112,8 +116,23 @@ def rig_of(workspace: Path, camera: CameraConfig, water: WaterConfig) -> Rig:
         path = workspace / folder / "rig.json"
         if path.is_file():
             rig = read_rig(path).in_water(water.n_water)
-            return mounted(rig) or replace(rig, body_from_rig=designed.body_from_rig)
+            if mounted(rig) is not None:
+                return rig
+            mount, how = designed.body_from_rig, "as designed"
+            found = _found_mount(workspace, rig)
+            if found is not None:
+                mount, how = found, "as the reconstruction found"
+            return replace(rig, body_from_rig=mount, source=f"{rig.source}; mounted {how}")
     return designed
+
+
+def _found_mount(workspace: Path, rig: Rig) -> RigidTransform | None:
+    """The mount that a reconstruction found; None where none did of these cameras."""
+    path = workspace / "sparse" / "rig.json"
+    if not path.is_file():
+        return None
+    found = read_rig(path)
+    return found.body_from_rig if list(found.cameras) == list(rig.cameras) else None
 
 
 def check_report(

@@ -1,6 +1,7 @@
 """What a vehicle's own log records of a dive, in any format: series of numbers against time."""
 
 import bisect
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from alice_survey.base.frames import Array
 from missions.logs.navigation_csv import interpolated
 
-ROLES = ("navigation", "depth", "attitude", "altitude")
+ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")
 """What of a log may be chosen by name."""
 DATED_AFTER_S = 1e8
 """Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""
@@ -101,6 +102,15 @@ class LoggedDive:
                 )
                 times = np.union1d(times, signal.time_s[lacking])
         return times
+
+
+def finite_number(value: object) -> float:
+    """A number of a log that may hold anything; NaN for what is none."""
+    try:
+        number = float(value)  # type: ignore[arg-type]  # what is none raises
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+    return number if math.isfinite(number) and not isinstance(value, bool) else math.nan
 
 
 def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:

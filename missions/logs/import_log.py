@@ -15,11 +15,14 @@ from alice_survey.base.artefacts import read_csv
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
 from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
 from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
+_JSON = (".json", ".jsonl", ".log", ".txt", "")
+"""What files of JSON reports are called."""
 _LONGEST_S = 1e9
 _MICRO = 1e6
 
@@ -51,6 +54,10 @@ class ImportOptions:
     """Time zone of dates that name none (QGroundControl's CSV)."""
     vehicle_log: Path | None = None
     """Vehicle log to write, too."""
+    dead_reckon: TrackErrors | None = None
+    """How velocities err: positions are those of velocities and attitudes between fixes."""
+    start_at: tuple[float, float, float] | None = None
+    """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
     def __post_init__(self) -> None:
         numbers = (
@@ -64,6 +71,15 @@ class ImportOptions:
             raise NavigationError(
                 f"a declination of {self.declination_deg:g} degrees: give -180 to 180"
             )
+        if self.start_at is not None:
+            latitude, longitude, sigma = self.start_at
+            if self.dead_reckon is None:
+                raise NavigationError("--start-at is where dead reckoning starts: give it too")
+            if not (abs(latitude) <= 85 and abs(longitude) <= 360 and 0 < sigma < math.inf):
+                raise NavigationError(
+                    f"--start-at {latitude:g} {longitude:g} {sigma:g}: give latitude, longitude "
+                    "(degrees) and a sigma above 0 (metres)"
+                )
 
 
 def import_log(
@@ -92,6 +108,10 @@ def import_log(
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
     dive = read_dive(path, options)
+    if options.dead_reckon is not None:
+        dive = with_dead_reckoning(
+            dive, options.dead_reckon, options.start_at, options.declination_deg
+        )
     dated = dive.dated or options.start_utc is not None
     if options.start_utc is not None:
         dive = _dated(dive, options.start_utc)
@@ -137,6 +157,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
     from missions.logs.qgc_csv import read_qgc_csv
     from missions.logs.ros_bag import is_bag, read_ros_bag
+    from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
@@ -147,6 +168,8 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     if path.is_dir() or is_bag(path):
         datum = None if options.datum_deg is None else Datum(*options.datum_deg)
         return read_ros_bag(path, chosen, datum)
+    if suffix in _JSON and is_waterlinked(path):
+        return read_waterlinked(path, chosen)
     if suffix in (".bin", ".log"):
         return read_ardusub_bin(path, chosen)
     if suffix == ".tlog":
@@ -155,7 +178,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_qgc_csv(path, chosen, options.time_zone)
     raise NavigationError(
         f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
-        ".log or .tlog, or QGroundControl's .csv"
+        ".log or .tlog, QGroundControl's .csv, or JSON reports of a Water Linked DVL"
     )
 
 

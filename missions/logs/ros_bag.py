@@ -1,9 +1,10 @@
 """A ROS 1 or ROS 2 bag as a logged dive.
 
 Understood are `NavSts` (COLA2's cola2_msgs, and auv_msgs), nav_msgs/Odometry, and sensor_msgs
-NavSatFix with Imu; depth from FluidPressure or a number; altitude from Range; thrusters from
-JointState. Orientations and velocities are ENU and FLU (REP-103) unless the frame's name holds
-`ned`, as in COLA2 and Stonefish.
+NavSatFix with Imu; depth from FluidPressure or a number; altitude from Range; velocity over ground
+from a Doppler log's `DVL` (dvl_msgs, cola2_msgs), TwistStamped or TwistWithCovarianceStamped;
+thrusters from JointState. Orientations and velocities are ENU and FLU (REP-103) unless the frame's
+name holds `ned`, as in COLA2 and Stonefish; those of a `DVL` are forward, right, down.
 """
 
 import bz2
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 NAV_STS, ODOMETRY, FIX = "NavSts", "Odometry", "NavSatFix"
 IMU, PRESSURE, RANGE, JOINTS = "Imu", "FluidPressure", "Range", "JointState"
 NUMBERS = ("Float32", "Float64")
+DVL, TWIST, TWIST_COVARIANCE = "DVL", "TwistStamped", "TwistWithCovarianceStamped"
 
 VARIANCES = ("var_north", "var_east", "var_depth", "var_roll", "var_pitch", "var_heading")
 ANGLES = ("roll", "pitch", "heading")
@@ -46,11 +48,14 @@ _TAKES: Mapping[str, tuple[str, ...]] = {
     "navigation": (NAV_STS, ODOMETRY, FIX),
     "depth": (PRESSURE, *NUMBERS, NAV_STS, ODOMETRY),
     "attitude": (IMU, NAV_STS, ODOMETRY),
-    "altitude": (RANGE, *NUMBERS, NAV_STS),
+    "altitude": (RANGE, *NUMBERS, NAV_STS, DVL),
+    "velocity": (DVL, TWIST_COVARIANCE, TWIST, NAV_STS, ODOMETRY),
 }
 """Types that serve each role, the best first."""
 _TRUTH = ("truth", "ground_truth", "_gt", "/gt")
 _ORIGIN = ("datum", "origin")
+_WORLDS = ("map", "odom", "world", "earth")
+"""Frames that do not turn with the body."""
 _NOT_ALTITUDE = ("beam", "front", "forward", "fls", "obstacle")
 
 _DENSITY_KG_M3, _SURFACE_PA, _GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
@@ -227,13 +232,21 @@ def _choose(
                 raise NavigationError(
                     f"{path}: {_listed(found)} could give {role}: choose with --topic {role}=NAME"
                 )
+    velocities = [
+        t for t in present
+        if t.kind in (DVL, TWIST_COVARIANCE, TWIST)
+        and not any(word in t.name.lower() for word in (*_TRUTH, "cmd", "command"))
+    ]  # fmt: skip
+    dvls = [t for t in velocities if t.kind == DVL]
+    if "velocity" not in chosen and len(dvls or velocities) == 1:
+        chosen["velocity"] = (dvls or velocities)[0]
     if "altitude" not in chosen and kind != NAV_STS:
         ranges = [
             t for t in present
             if t.kind == RANGE and not any(word in t.name.lower() for word in _NOT_ALTITUDE)
         ]  # fmt: skip
-        if len(ranges) == 1:
-            chosen["altitude"] = ranges[0]
+        if len(ranges) == 1 or (not ranges and len(dvls) == 1):
+            chosen["altitude"] = (ranges or dvls)[0]
     if not chosen:
         known = dict.fromkeys(kind for kinds in _TAKES.values() for kind in kinds)
         raise NavigationError(
@@ -364,10 +377,12 @@ class _BagReading:
             attitude=self._attitude(),
             altitude=self._altitude(),
             altitude_slant=(
-                ranged is not None and ranged.kind == RANGE and not ranged.name.endswith("altitude")
+                ranged is not None
+                and ranged.kind in (RANGE, DVL)
+                and not ranged.name.endswith("altitude")
             ),
             sigmas=self._sigmas(navigation),
-            velocity_body=self._signal(navigation, VELOCITY),
+            velocity_body=self._signal(self._of("velocity"), VELOCITY),
             rates=self._signal(navigation, RATES),
             rpm=rpm,
             thrusters=thrusters,
@@ -516,6 +531,31 @@ def _fix(m: Any) -> list[float]:
     return [m.latitude, m.longitude, m.altitude, *variances]
 
 
+def _dvl(m: Any) -> list[float]:
+    """Forward, right, down and the range along the last; nothing without bottom lock."""
+    if not getattr(m, "velocity_valid", True):
+        return [_NOTHING] * 4
+    v = m.velocity
+    return [v.x, v.y, v.z, m.altitude]
+
+
+def _twist(m: Any) -> list[float]:
+    """A velocity in the frame of the body; a covariance that begins below 0 is not given."""
+    frame = m.header.frame_id.lower().strip("/").rsplit("/", 1)[-1]
+    if frame.removesuffix("_ned") in _WORLDS:
+        raise NavigationError(
+            f"a {type(m).__name__} is of the frame {frame}, which does not turn with the body: "
+            "choose another topic with --topic velocity=NAME"
+        )
+    twist = m.twist
+    if hasattr(twist, "covariance"):
+        if twist.covariance[0] < 0:
+            return [_NOTHING] * 3
+        twist = twist.twist
+    v = np.array([twist.linear.x, twist.linear.y, twist.linear.z])
+    return list(v if _is_ned(m) else flipped_body(v))
+
+
 def _imu(m: Any) -> list[float]:
     q = m.orientation
     if m.orientation_covariance[0] < 0:
@@ -540,9 +580,13 @@ ROWS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], list[float]]]] = {
     IMU: (QUATERNION, _imu),
     PRESSURE: (("pressure",), lambda m: [m.fluid_pressure]),
     RANGE: (("altitude",), _range),
+    DVL: ((*VELOCITY, "altitude"), _dvl),
+    TWIST: (VELOCITY, _twist),
+    TWIST_COVARIANCE: (VELOCITY, _twist),
 } | {kind: (("number",), lambda m: [m.data]) for kind in NUMBERS}  # fmt: skip
 """For each type: the names of the columns, and what takes them from a message."""
 
 
 def _is_ned(m: Any) -> bool:
-    return "ned" in m.header.frame_id.lower()
+    frame = m.header.frame_id.lower()
+    return "ned" in frame or "frd" in frame

@@ -17,8 +17,9 @@ from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig
+from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
-from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, estimate
+from reconstruct.adjustment.uncertainty import Uncertainty, estimate
 from reconstruct.mapping.arrays import frames_of, observed, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
@@ -57,7 +58,7 @@ class AdjustedSurvey:
     """How well its shape is known; None where it is not."""
 
     def deformed(self, sizes: Array, left: Array) -> Self:
-        """The same after measurements from outside have said how its soft modes lie.
+        """The same after measurements from outside have said how large its soft modes are.
 
         Args:
             sizes: (K,) of every mode of the `shape`, in its sigmas.

@@ -41,7 +41,7 @@ from reconstruct.adjustment.normal_equations import (
     PointEquations,
     reduce_parts,
 )
-from reconstruct.adjustment.uncertainty import Motions, SoftModes
+from reconstruct.adjustment.soft_modes import Motions, SoftModes
 from reconstruct.mapping.arrays import (
     LEAST_POINTS,
     Indices,
@@ -110,7 +110,7 @@ class SurveyFit:
         )
 
     def deformed(self, modes: SoftModes, point_ids: Indices, sizes: Array, left: Array) -> Self:
-        """The survey after measurements from outside have said how its soft modes lie.
+        """The survey after measurements from outside have said how large its soft modes are.
 
         Args:
             modes: of the block.
@@ -229,7 +229,7 @@ class _Guess:
 
 
 class _Linearised:
-    """Weighted observations from one guess, part by part; anew each time, but for a single part."""
+    """Weighted observations from one guess, part by part; a single part is computed once only."""
 
     def __init__(self, state: RigState, pixels: Pixels, fields: Sequence[str], noise: Array):
         self.state, self.fields, self.noise = state, fields, noise

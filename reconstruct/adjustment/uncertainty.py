@@ -3,33 +3,25 @@
 The covariance is that of the last adjustment: the inverse of its weighted normal equations, scaled
 by the variance of the keypoints that its residuals show (see `reconstruct.mapping.robust`), and
 what errors of the calibration add to it. A model of pictures has no place of its own, so that what
-is stated is its shape: the covariance of what is left when all stations together are laid onto the
+is stated is its shape: the covariance of what is left when all stations together are moved onto the
 truth by a rigid motion (and by a scale, where nothing fixes that) with the least squares error (the
 inner constraints of a free network; Baarda's S-transformation, 1973). Where the whole lies in the
 world is for the georeference to say. Stations that no point links make groups, and the shape is
-that of each; how a group lies to the largest is a mode of which pictures know nothing.
+that of each; where a group is relative to the largest is a mode of which pictures know nothing.
 
 Rig and ports are not exact: a lens that is off by its sigma bends the whole block a little, and
 every picture more does the same again. To first order stations and points move with the rig's
 parameters as the adjustment's normal equations say (implicit function theorem), and the covariance
 of the calibration moves with them.
-
-Pictures leave few deformations of a block soft: its bends, its twist, its scale. These soft modes,
-the leading eigenvectors of the covariance, are what measurements from outside can improve; all
-others are known better from the pictures. Updating them alone is the best approximation of its rank
-to the joint estimate (Spantini et al. 2015, "Optimal low-rank approximations of Bayesian linear
-inverse problems").
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -45,6 +37,7 @@ from reconstruct.adjustment.normal_equations import (
     PointEquations,
     reduce_points,
 )
+from reconstruct.adjustment.soft_modes import Motions, SoftModes, no_modes, soft_modes, spread
 from reconstruct.mapping.arrays import (
     LEAST_POINTS,
     Indices,
@@ -56,14 +49,6 @@ from reconstruct.mapping.arrays import (
 )
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
-
-_MODES = 32
-"""Soft modes at most: of a block of lines the tenth is known a hundred times as well as the first.
-"""
-_MODES_TOLERANCE = 1e-4
-_LEAST_MODE = 1e-13
-"""Variance of a mode over that of the softest, above rounding: where two parts of a model hardly
-hang together, one mode is kilometres large and others are millimetres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,8 +81,8 @@ class Uncertainty:
         gain = np.diag(modes.known) - left
         return replace(
             self,
-            frame_cov=self.frame_cov - _spread(modes.stations, gain),
-            point_cov=self.point_cov - _spread(modes.points, gain),
+            frame_cov=self.frame_cov - spread(modes.stations, gain),
+            point_cov=self.point_cov - spread(modes.points, gain),
         )
 
     def moved(self, scale: float, rotation: Rotation) -> Self:
@@ -118,147 +103,6 @@ class Uncertainty:
                 points=scale * turn @ self.modes.points, groups=None,
             ),
         )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Groups:
-    """Groups of stations that no point links; the first is the largest."""
-
-    station: Indices
-    """(F,) the group of each station."""
-    point: Indices
-    """(P,) that of each point."""
-    middles: Array
-    """(N, 3) about which groups turn and grow."""
-
-    def carried(self, motions: Array, places: Array, group: Indices) -> Array:
-        """Places (M, 3) of groups (M,) that lie otherwise to the first.
-
-        Args:
-            motions: (N - 1, 6 or 7) of the other groups: turn, shift, logarithm of the scale.
-            places: to carry, in the model.
-            group: of each.
-        """
-        every = np.concatenate([np.zeros((1, motions.shape[1])), motions])[group]
-        arms = Rotation.from_rotvec(every[:, :3]).apply(places - self.middles[group])
-        grown = arms * np.exp(every[:, 6:].sum(axis=1, keepdims=True))
-        carried: Array = self.middles[group] + every[:, 3:6] + grown
-        return carried
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SoftModes:
-    """Deformations of a block that pictures determine least, the softest first, each by a sigma.
-
-    They are independent of each other and of what else the covariance holds. After them come
-    motions of the groups of stations that nothing links to the first: turns about the axes of the
-    model (radians), shifts and, where it is free, the logarithm of the scale. Pictures know nothing
-    of these.
-    """
-
-    stations: Array
-    """(F, 6, K) turns and motions of the stations, in the model's axes."""
-    points: Array | NDArray[np.float32]
-    """(P, 3, K) motions of the points; in single precision, as there are many."""
-    calibration: Array
-    """(G, K) changes of the parameters of the rig; G is 0 where it is held."""
-    joints: int = 0
-    """How many of the K are motions of groups."""
-    groups: Groups | None = None
-    """The groups, where there are several."""
-
-    @property
-    def known(self) -> Array:
-        """(K,) 1 of modes with a variance by pictures, 0 of motions of groups, which have none."""
-        count = self.stations.shape[2]
-        return np.repeat([1.0, 0.0], [count - self.joints, self.joints])
-
-    def moved(
-        self, sizes: Array, centres: Array, points: Array, rows: Indices | slice
-    ) -> tuple[Rotation, Array, Array]:
-        """Turns (F,) of the stations, and where these and the points are, with modes of a size.
-
-        Groups stay as they are in themselves, however far they turn.
-
-        Args:
-            sizes: (K,).
-            centres: (F, 3) of the stations before.
-            points: (N, 3) of some points before.
-            rows: which these are.
-        """
-        soft = sizes * self.known
-        step = self.stations @ soft
-        turns, centres = Rotation.from_rotvec(step[:, :3]), centres + step[:, 3:]
-        points = points + self.points[rows] @ soft
-        if self.groups is None:
-            return turns, centres, points
-        motions = sizes[-self.joints :].reshape(len(self.groups.middles) - 1, -1)
-        every = np.concatenate([np.zeros((1, 3)), motions[:, :3]])[self.groups.station]
-        return (
-            Rotation.from_rotvec(every) * turns,
-            self.groups.carried(motions, centres, self.groups.station),
-            self.groups.carried(motions, points, self.groups.point[rows]),
-        )
-
-
-def no_modes(stations: int, points: int) -> SoftModes:
-    """Those of a stiff model."""
-    return SoftModes(
-        stations=np.zeros((stations, POSE, 0)),
-        points=np.zeros((points, 3, 0), np.float32),
-        calibration=np.zeros((0, 0)),
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Motions:
-    """How a block moves with the parameters of its rig, and how uncertain those are."""
-
-    stations: Array
-    """(F, 6, G) turns and motions of the stations by the parameters, in the model's axes."""
-    places: Array
-    """(P, 3) points at which the motion is known: enough of them, not all."""
-    points: Array
-    """(P, 3, G) motions of those points by the parameters."""
-    covariance: Array
-    """(G, G) covariance of the parameters."""
-    group: Indices | None = None
-    """(P,) of the `places`; None where all are of one."""
-
-    def of_stations(self) -> Array:
-        """Covariances (F, 6, 6) of the stations."""
-        return _spread(self.stations, self.covariance)
-
-    def of_points(self, points: Array, group: Indices | None = None) -> Array:
-        """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
-        given, which = np.unique(self.nearest(points, group), return_inverse=True)
-        found: Array = _spread(self.points[given], self.covariance)[which]
-        return found
-
-    def nearest(self, points: Array, group: Indices | None = None) -> Indices:
-        """(N,) which of `places` are nearest to (N, 3) points, of groups (N,) where there are some.
-
-        A group without a place takes those of the others.
-        """
-        if group is None or self.group is None:
-            found: Indices = np.asarray(KDTree(self.places).query(points)[1])
-            return found
-        found = np.empty(len(points), np.int64)
-        for number in np.unique(group):
-            own = np.flatnonzero(self.group == number)
-            own = own if len(own) else np.arange(len(self.places))
-            mine = group == number
-            found[mine] = own[KDTree(self.places[own]).query(points[mine])[1]]
-        return found
-
-    def without(self, gauge: Gauge) -> "Motions":
-        """The same minus what motions of whole groups do, which do not change their shape."""
-        whole = gauge.motion_in(self.stations)
-        return replace(
-            self,
-            stations=self.stations - gauge.motions @ whole,
-            points=self.points - gauge.of_points(self.places, self.group) @ whole,
-        )
 
 
 def estimate(
@@ -388,80 +232,6 @@ def shape_of_block(
     )
 
 
-def soft_modes(
-    equations: PointEquations,
-    gauge: Gauge,
-    calibration: Motions | None,
-    points: Array,
-    group: Indices,
-) -> SoftModes:
-    """The leading eigenvectors of the covariance of the shape, then motions of groups.
-
-    Turns count as what they move at the usual distance, like the gauge's. A mode of the stations
-    takes with it what it makes likely of the points and of the rig.
-
-    Args:
-        equations: of the stations, with nothing shared.
-        gauge: motions of whole groups, which are no change of their shape.
-        calibration: what errors of the rig do; None without.
-        points: (P, 3) in the model.
-        group: (P,) of them.
-    """
-    weigh = np.sqrt(gauge.weights)
-    stations, width = equations.free.shape
-
-    def moved(weighed: Array) -> tuple[Array, Array, Array]:
-        """Covariance times (F, 6): of stations in a fixed rig, in all, and of the rig."""
-        kick = gauge.shape_weights(weigh * weighed)
-        own = equations.covariance_times(kick[..., None])[..., 0]
-        if calibration is None:
-            return own, own, np.zeros(0)
-        rig = calibration.covariance @ np.tensordot(
-            calibration.stations, kick, axes=([0, 1], [0, 1])
-        )
-        return own, own + calibration.stations @ rig, rig
-
-    def product(flat: Array) -> Array:
-        step = moved(flat.reshape(stations, width))[1]
-        shape: Array = weigh * (step - gauge.motions @ gauge.motion_in(step))
-        return shape.ravel()
-
-    size = stations * width
-    count = min(_MODES, size - gauge.motions.shape[2] - 1)
-    operator: Any = LinearOperator((size, size), matvec=product, dtype=np.float64)
-    start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
-    values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
-    kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
-    shape, rigs, rigid = [], [], gauge.of_points(points, group)
-    places = np.empty((*points.shape, len(kept)), np.float32)
-    nearest = None if calibration is None else calibration.nearest(points, group)
-    for n, k in enumerate(kept.tolist()):
-        own, step, rig = moved(vectors[:, k].reshape(stations, width))
-        place = equations.follow(own, np.zeros(1))
-        if calibration is not None:
-            place = place + calibration.points[nearest] @ rig
-        whole = gauge.motion_in(step)
-        size_of = np.sqrt(values[k])
-        shape.append((step - gauge.motions @ whole) / size_of)
-        places[..., n] = (place - rigid @ whole) / size_of
-        rigs.append(rig / size_of)
-    soft = SoftModes(
-        stations=np.stack(shape, axis=-1),
-        points=places,
-        calibration=np.stack(rigs, axis=-1),
-    )
-    joints = gauge.motions.shape[2] - gauge.each
-    if not joints:
-        return soft
-    return SoftModes(
-        stations=np.concatenate([soft.stations, gauge.motions[..., -joints:]], axis=2),
-        points=np.concatenate([places, rigid[..., -joints:].astype(np.float32)], axis=2),
-        calibration=np.pad(soft.calibration, ((0, 0), (0, joints))),
-        joints=joints,
-        groups=Groups(station=gauge.group, point=group, middles=gauge.middles),
-    )
-
-
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
     """Write `covariance.npz`: fields of `Uncertainty` but the modes; points as float32."""
     np.savez(
@@ -543,9 +313,3 @@ def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indi
         rank = (not image.is_ref_in_frame(), number)
         chosen[image.frame_id] = min(rank, chosen.get(image.frame_id, rank))
     return [chosen[int(f)][1] for f in frames]
-
-
-def _spread(motions: Array | NDArray[np.float32], covariance: Array) -> Array:
-    """Covariances (N, k, k) of what moves by (N, k, G)."""
-    spread: Array = motions @ covariance @ motions.swapaxes(1, 2)
-    return spread

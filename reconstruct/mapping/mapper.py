@@ -3,8 +3,8 @@
 Stations of a known stereo rig are mapped all at once (`global_mapper`), everything else, and what
 that does not explain, incrementally. Adjustments run on one core, so that the same input gives
 the same bytes whatever the number of threads; only work on single pictures and pairs is spread.
-Of several models those that share stations become one. Others lie apart in it where a rig gives
-them the same scale, for navigation to join; else they are left out and reported by name.
+Of several models those that share stations become one. Others are kept apart in it where a rig
+gives them the same scale, for navigation to join; else they are left out and reported by name.
 """
 
 import shutil
@@ -58,7 +58,7 @@ class Mapped:
     """What the pictures gave."""
 
     model: pycolmap.Reconstruction
-    """The largest model; on a calibrated rig also the others, wherever they lie."""
+    """The largest model; on a calibrated rig also the others, wherever they are."""
     warps: Mapping[str, PinholeWarp]
     """Each camera of the model, and its pinhole."""
     models: tuple[int, ...]

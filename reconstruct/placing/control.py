@@ -11,9 +11,9 @@ from alice_survey.base.frames import Array, Datum
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
 from reconstruct.placing.control_file import Control, KnownLength
-from reconstruct.placing.generalised_fit import Extra
 from reconstruct.placing.navigation_equations import PARAMETERS, SCALE
 from reconstruct.placing.picked_points import Spot
+from reconstruct.placing.placement_problem import Extra
 
 _CONTRADICTED_SIGMAS = 4.0
 _LEAST_SPREAD = 1e-3

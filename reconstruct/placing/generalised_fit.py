@@ -3,33 +3,23 @@
 Errors of navigation are correlated: weights that take readings as independent give sigmas that are
 far too small. Here every group of channels (horizontal position, depth, tilt, heading) has the
 marginal sigma that navigation states, and a correlation time and white and constant shares that the
-misfit between navigation and the model gives, the model being stiff. Whether errors begin anew with
-a dive, and how far the constants of dives are apart, is found in the same way. They are found by
+misfit between navigation and the model gives, the model being stiff. Whether errors restart with a
+dive, and how far the constants of dives are apart, is found in the same way. They are found by
 restricted maximum likelihood (Patterson & Thompson 1971), which counts what the placement itself
 has absorbed, and the covariance of the placement is averaged over all that are likely.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.placing.correlated_errors import (
-    LEAST_WHITE,
-    correlated_share,
-    standard_residuals,
-    whiten,
-)
-from reconstruct.placing.navigation_equations import (
-    GROUP_OF,
-    GROUPS,
-    PARAMETERS,
-    NavigationEquations,
-)
+from reconstruct.placing.correlated_errors import LEAST_WHITE, standard_residuals
+from reconstruct.placing.navigation_equations import GROUPS, NavigationEquations
+from reconstruct.placing.placement_problem import Correlation, Extra, PlacementProblem, channels_of
 
 _WHITE = (LEAST_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
 _CONSTANT = (0.0, 0.5, 0.75, 0.9)
@@ -49,37 +39,6 @@ _ROUNDS = 6
 _DRAWS = 64
 _CHI_SIGMAS = 3.0
 """A misfit larger than stated sigmas allow, at this significance, makes them larger."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Correlation:
-    """How the errors of a group of channels are correlated in time."""
-
-    tau: float
-    """Correlation time of the varying part, in the unit of the epochs' time."""
-    white: float
-    """Share of the varying part's variance that is white."""
-    constant: float = 0.0
-    """Share of all variance that one constant error has."""
-    factor: float = 1.0
-    """Factor by which the stated sigmas are too small."""
-    restart: float = 0.0
-    """Constant error of each dive over what the constant share allows; 0: errors outlast gaps."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Extra:
-    """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
-
-    misfit: Array
-    """(E,) misfits."""
-    jacobian: Array
-    """(E, P) their slopes."""
-
-
-def no_extra(columns: int = PARAMETERS) -> Extra:
-    """No further equations, in so many parameters."""
-    return Extra(misfit=np.zeros(0), jacobian=np.zeros((0, columns)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,7 +81,7 @@ def estimate(
         correlation: of errors, where that is known: then no reading is left out either, and the
             covariance is that of this one alone.
     """
-    problem = _PlacementProblem(
+    problem = PlacementProblem(
         time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds,
         widened=widened or {}, dives=dives_of(time),
     )  # fmt: skip
@@ -134,7 +93,7 @@ def estimate(
     correlation = {
         group: Correlation(tau=float(np.ptp(time)) or 1.0, white=0.1)
         for group in GROUPS
-        if used[:, _channels(group)].any()
+        if used[:, channels_of(group)].any()
     }
     for _ in range(_ROUNDS):
         correlation = _likeliest(problem, used, correlation)
@@ -144,13 +103,6 @@ def estimate(
         used = kept
     change, covariance = _averaged(problem, used, correlation)
     return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
-
-
-def frame_sigma(bound: float, time: Array, how: Correlation) -> float:
-    """Sigma of a turn or stretch of navigation's own frame, from that of errors that last."""
-    share = correlated_share(time, how.tau, how.white)
-    share = how.constant + (1.0 - how.constant) * share
-    return max(bound * how.factor * float(np.sqrt(share)), 1e-9)
 
 
 def dives_of(time: Array) -> NDArray[np.int64]:
@@ -168,7 +120,7 @@ def without_gross_errors(time: Array, misfit: Array, known: NDArray[np.bool_]) -
     """
     used, dives = known.copy(), dives_of(time)
     for group in GROUPS:
-        channels = _channels(group)
+        channels = channels_of(group)
         for channel in channels:
             for dive in range(dives[-1] + 1):
                 rows = known[:, channel] & (dives == dive)
@@ -181,159 +133,7 @@ def without_gross_errors(time: Array, misfit: Array, known: NDArray[np.bool_]) -
     return used
 
 
-class _Normal(NamedTuple):
-    """Normal equations and likelihood of a group."""
-
-    matrix: Array
-    vector: Array
-    square: float
-    log_det: float
-    rows: int
-
-    def plus(self, other: "_Normal") -> "_Normal":
-        return _Normal(
-            self.matrix + other.matrix,
-            self.vector + other.vector,
-            self.square + other.square,
-            self.log_det + other.log_det,
-            self.rows + other.rows,
-        )
-
-    def solve(self) -> tuple[Array, Array]:
-        """Parameters and their covariance."""
-        size = np.sqrt(np.diag(self.matrix))
-        size = np.where(size > 0, size, 1.0)
-        inverse = np.linalg.pinv(self.matrix / np.outer(size, size), rcond=1e-14, hermitian=True)
-        covariance = inverse / np.outer(size, size)
-        return -covariance @ self.vector, covariance
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PlacementProblem:
-    time: Array
-    found: NavigationEquations
-    free: NDArray[np.int64]
-    extra: Extra
-    frame_bounds: Mapping[int, float]
-    widened: Mapping[str, float]
-    dives: NDArray[np.int64]
-    cache: dict[Any, _Normal] = field(default_factory=dict)
-
-    def group(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
-        """Normal equations of one group.
-
-        Constant errors of variance 1 with columns C add `C C'` to the covariance matrix: its
-        inverse is that of the varying part minus a product (Woodbury 1950).
-        """
-        key = group, used.tobytes(), replace(correlation, factor=1.0)
-        if key not in self.cache:
-            self.cache[key] = self._unscaled(group, used, correlation)
-        found, square = self.cache[key], correlation.factor**2
-        return _Normal(
-            matrix=found.matrix / square,
-            vector=found.vector / square,
-            square=found.square / square,
-            log_det=found.log_det + found.rows * float(np.log(square)),
-            rows=found.rows,
-        )
-
-    def _unscaled(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
-        size = len(self.free)
-        total = _Normal(
-            matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
-        )
-        for channel in _channels(group):
-            rows = used[:, channel]
-            if not rows.any():
-                continue
-            product, log_det, count = self._products(channel, rows, correlation)
-            matrix, steady = product[: size + 1, : size + 1], product[: size + 1, size + 1 :]
-            inner = np.eye(steady.shape[1]) + product[size + 1 :, size + 1 :]
-            kept = matrix - steady @ np.linalg.solve(inner, steady.T)
-            total = total.plus(
-                _Normal(
-                    matrix=kept[:-1, :-1],
-                    vector=kept[:-1, -1],
-                    square=float(kept[-1, -1]),
-                    log_det=log_det + float(np.linalg.slogdet(inner)[1]),
-                    rows=count,
-                )
-            )
-        return total
-
-    def _products(
-        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
-    ) -> tuple[Array, float, int]:
-        """Products of all white columns, the last those of constant errors; log det; readings."""
-        varying, constants = self.shares(channel, rows, correlation)
-        misfit = self.found.misfit[:, channel]
-        columns = np.column_stack([self.found.jacobian[:, channel][:, self.free], misfit])
-        even, log_det = self.whitened(
-            channel, rows, correlation, varying, np.column_stack([columns, constants])
-        )
-        return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
-
-    def whitened(
-        self,
-        channel: int,
-        rows: NDArray[np.bool_],
-        how: Correlation,
-        varying: Array,
-        columns: Array,
-    ) -> tuple[Array, float]:
-        """Columns (M, C) over the stated sigma, made white; log det of what is used."""
-        columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
-        sigma = varying * self.found.sigma[:, channel]
-        return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)
-
-    def times(self, how: Correlation) -> Array:
-        """(M,) times; dives after which errors begin anew lie too far apart for any correlation."""
-        if not how.restart:
-            return self.time
-        apart = 100.0 * how.tau + float(np.ptp(self.time))
-        return self.time + apart * self.dives
-
-    def shares(
-        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
-    ) -> tuple[Array, Array]:
-        """Sigmas of the varying (M,) and the constant parts (M, D) over the stated one.
-
-        The constant part is as large as the least of the stated sigmas allows.
-        """
-        sigma = self.found.sigma[:, channel]
-        constant = np.sqrt(correlation.constant) * sigma[rows].min() / sigma
-        constant = np.minimum(constant, np.sqrt(correlation.constant))
-        own = np.ones((len(sigma), 1))
-        if correlation.restart:
-            own = correlation.restart * np.eye(self.dives[-1] + 1)[self.dives]
-        return np.sqrt(1.0 - constant**2), constant[:, None] * own
-
-    def rest(self, correlation: Mapping[str, Correlation]) -> _Normal:
-        """Normal equations of what is not navigation, and of the turn of navigation's frame."""
-        jacobian, misfit = self.extra.jacobian[:, self.free], self.extra.misfit
-        matrix, vector = jacobian.T @ jacobian, jacobian.T @ misfit
-        if "horizontal" in correlation:
-            how = correlation["horizontal"]
-            for parameter, bound in self.frame_bounds.items():
-                at = np.flatnonzero(self.free == parameter)
-                matrix[at, at] += frame_sigma(bound, self.time, how) ** -2
-        return _Normal(
-            matrix=matrix, vector=vector, square=float(misfit @ misfit), log_det=0.0, rows=0
-        )
-
-    def total(self, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]) -> _Normal:
-        """Normal equations of all."""
-        total = self.rest(correlation)
-        for group, how in correlation.items():
-            total = total.plus(self.group(group, used, how))
-        return total
-
-
-def _channels(group: str) -> list[int]:
-    return [k for k, name in enumerate(GROUP_OF) if name == group]
-
-
-def _grid(problem: _PlacementProblem) -> list[Correlation]:
+def _grid(problem: PlacementProblem) -> list[Correlation]:
     time = problem.time
     steps = np.diff(np.unique(time))
     if not len(steps):
@@ -362,10 +162,10 @@ def _choices(grid: Sequence[Correlation], now: Correlation) -> list[Correlation]
 
 
 def _likeliest(
-    problem: _PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
+    problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
 ) -> dict[str, Correlation]:
     """The likeliest correlation of every group, one after the other, in several rounds."""
-    now = {group: how for group, how in correlation.items() if used[:, _channels(group)].any()}
+    now = {group: how for group, how in correlation.items() if used[:, channels_of(group)].any()}
     grid = _grid(problem)
     for _ in range(_SWEEPS):
         before = dict(now)
@@ -382,7 +182,7 @@ def _likeliest(
 
 
 def _with_jumps(
-    problem: _PlacementProblem,
+    problem: PlacementProblem,
     used: NDArray[np.bool_],
     now: Mapping[str, Correlation],
     group: str,
@@ -401,7 +201,7 @@ def _with_jumps(
 
 
 def _scores(
-    problem: _PlacementProblem,
+    problem: PlacementProblem,
     used: NDArray[np.bool_],
     now: Mapping[str, Correlation],
     group: str,
@@ -431,7 +231,7 @@ def _scores(
 
 
 def _factor(
-    problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Correlation], group: str
+    problem: PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Correlation], group: str
 ) -> float:
     """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
     least = problem.widened.get(group, 1.0)
@@ -447,7 +247,7 @@ def _factor(
 
 
 def _without_contradicted(
-    problem: _PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
+    problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
 ) -> NDArray[np.bool_]:
     """Leave out, of each group, readings that all others contradict, the worst of neighbours first.
 
@@ -456,7 +256,7 @@ def _without_contradicted(
     change, _ = problem.total(used, correlation).solve()
     kept = used.copy()
     for group, how in correlation.items():
-        channels = _channels(group)
+        channels = channels_of(group)
         worst = np.zeros(len(problem.time))
         for channel in channels:
             rows = used[:, channel]
@@ -483,7 +283,7 @@ def _without_contradicted(
 
 
 def _averaged(
-    problem: _PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
+    problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
 ) -> tuple[Array, Array]:
     """Parameters and covariance over all likely correlations of errors, (P,) and (P, P).
 
@@ -509,7 +309,7 @@ def _averaged(
     return _filled(problem, mean, covariance)
 
 
-def _filled(problem: _PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
+def _filled(problem: PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Parameters and covariance with zeros for what is held."""
     columns = problem.found.jacobian.shape[2]
     full, matrix = np.zeros(columns), np.zeros((columns, columns))

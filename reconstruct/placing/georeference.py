@@ -1,7 +1,6 @@
 """Where a model lies in the world: fitted to navigation, or levelled where there is none."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -10,75 +9,19 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
 from reconstruct.placing.first_placement import first_placement, observable
-from reconstruct.placing.generalised_fit import (
-    Correlation,
-    Estimate,
-    Extra,
-    estimate,
-    frame_sigma,
-    no_extra,
-    without_gross_errors,
-)
 from reconstruct.placing.navigation_equations import (
-    CLOCK,
-    DRIFT,
-    GROUPS,
-    LEVER,
-    MOUNT,
-    PARAMETERS,
-    PLACE,
     SCALE,
-    STRETCH,
-    TURN,
     USUAL_INSTALLATION,
-    Epochs,
     Installation,
-    equations,
     read_epochs,
     without_navigation,
 )
+from reconstruct.placing.navigation_task import SHRUNK, ExtraOf, NavigationTask
 from reconstruct.placing.placement_fit import PlacementFit
 
-_LEVEL_SIGMA_DEG = 10.0
-"""How far from level the sea floor's mean plane may be, where no attitude was measured."""
 _TRIMS = 5
 """Rounds of leaving out what is off the mean plane."""
-_ROBUST_STEPS = 30
-_ROBUST_SIGMAS = 2.0
-"""Sigmas beyond which the first placement lets a misfit pull only in proportion."""
-_STEPS = 8
-_SETTLED_SIGMAS = 0.01
-_LEAST_BOUND = 1e-9
-_SHRUNK = 1e-6
-"""Share of its first scale below which a model has shrunk to a point."""
-_SIGNIFICANT = 3.0
-"""Sigmas of its own by which a sum of squares must be too large to count as such."""
-_CONTRADICTION_SIGMAS = 3.0
-"""A nuisance this far from what is expected of it is reported."""
-_DRIFT_SIGMAS = 0.3
-"""Drift of depths that is likely over a survey, over their stated sigma."""
-_VAGUE_DRIFT_SIGMAS = 100.0
-_VAGUE_PER_M = 10.0
-"""Curvature that any model has less of by far."""
-_STRETCH = 0.005
-"""Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
-`vehicle.navigation.sensors`)."""
-
-
-_LEVERS = ("lever_forward_m", "lever_right_m", "lever_down_m")
-_NUISANCES = {
-    "turn_deg": (TURN, float(np.rad2deg(1.0))),
-    "stretch": (STRETCH, 1.0),
-    **{name: (LEVER.start + k, 1.0) for k, name in enumerate(_LEVERS)},
-    "clock_s": (CLOCK, 1.0),
-    "depth_drift_m": (DRIFT, 1.0),
-    **{
-        f"mount_{axis}_deg": (MOUNT.start + k, float(np.rad2deg(1.0)))
-        for k, axis in enumerate(("forward", "right", "down"))
-    },
-}
 
 
 def level(points: Array, centres: Array) -> Similarity:
@@ -111,11 +54,6 @@ def level(points: Array, centres: Array) -> Similarity:
     ahead = ahead / np.linalg.norm(ahead)
     rotation = Rotation.from_matrix(np.stack([ahead, np.cross(normal, ahead), normal]))
     return Similarity(scale=1.0, rotation=rotation, translation=-rotation.apply(middle))
-
-
-ExtraOf = Callable[[Similarity, Array, Array], Extra]
-"""Equations in addition to navigation's at a placement, whose rotation acts about a point (3,), and
-with soft modes of sizes (K,)."""
 
 
 def fit_navigation(
@@ -163,7 +101,7 @@ def fit_navigation(
     free = observable(epochs)
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
-    task = _NavigationTask(
+    task = NavigationTask(
         epochs=epochs,
         levelled=levelled,
         known_scale=known_scale,
@@ -173,7 +111,7 @@ def fit_navigation(
         joints=joints,
     )
     near = task.robust(start, free)
-    if near.scale < _SHRUNK * start.scale:
+    if near.scale < SHRUNK * start.scale:
         warn(
             "positions of navigation and model have no scale in common: it stays without CRS; are "
             "they of these pictures?"
@@ -208,7 +146,7 @@ def fit_control(
     free = [0, 1, 2, 3, 4, 5]
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
-    task = _NavigationTask(
+    task = NavigationTask(
         epochs=without_navigation(records, model_from_cam, modes),
         levelled=None,
         known_scale=known_scale,
@@ -218,389 +156,3 @@ def fit_control(
         joints=joints,
     )
     return task.fit(task.robust(start, free), free)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _NavigationTask:
-    epochs: Epochs
-    levelled: Similarity | None
-    """The levelled model; None where control holds the model level."""
-    known_scale: float | None
-    scale_sigma: float
-    installed: Installation
-    control: ExtraOf | None
-    joints: int
-
-    def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
-        """Iterate from a robust placement to the final one."""
-        epochs, sizes, factor = self.epochs, np.zeros(self.epochs.modes.shape[2]), 1.0
-        nuisances = np.zeros(PARAMETERS)
-        found = equations(epochs, place, self._middle(place))
-        used = without_gross_errors(epochs.time, found.misfit, epochs.known)
-        bounds = self._frame_bounds()
-        modes = range(PARAMETERS, PARAMETERS + len(sizes))
-        soft = len(sizes) - self.joints
-        solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND), *modes]
-        if epochs.has_attitude:
-            solved_for += range(LEVER.start, LEVER.stop)
-            if self.installed.mount_rad > 0:
-                solved_for += range(MOUNT.start, MOUNT.stop)
-        if epochs.timed and len(epochs.time) > 1:
-            solved_for.append(CLOCK)
-        settling = [*free, *modes]
-        widened: dict[str, float] = {}
-        drift_m = 0.0
-        for _ in range(_STEPS):
-            middle = self._middle(place)
-            bent = epochs.deformed(sizes)
-            found = equations(bent, place, middle)
-            got = estimate(
-                epochs.time,
-                found,
-                used,
-                solved_for,
-                self._extra(place, middle, sizes, factor, drift_m),
-                frame_bounds=bounds,
-                widened=widened,
-            )
-            place = _moved(place, got.change, middle)
-            sizes = sizes + got.change[PARAMETERS:]
-            nuisances = got.change[:PARAMETERS]
-            sigma = np.sqrt(np.diag(got.covariance))
-            before = factor
-            factor = _mode_factor(sizes[:soft], sigma[PARAMETERS:][:soft], factor)
-            still = np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma[settling]
-            if still.all() and abs(factor - before) <= _SETTLED_SIGMAS * factor:
-                if widened:
-                    break
-                drift_m = self._drift(place, middle, sizes, factor, got, solved_for, bounds)
-                widened = self._contradictions(nuisances[TURN], drift_m, bounds, got.correlation)
-                if not widened:
-                    break
-                if drift_m:
-                    solved_for.append(DRIFT)
-        middle = self._middle(place)
-        scaled = got
-        if SCALE not in free:
-            found = equations(epochs.deformed(sizes), place, middle)
-            stiff = [p for p in solved_for if p not in modes[:soft]]
-            scaled = estimate(
-                epochs.time,
-                found,
-                got.used,
-                [*stiff, SCALE],
-                self._extra(place, middle, sizes, factor, drift_m),
-                frame_bounds=bounds,
-                correlation=got.correlation,
-            )
-        return self._report(
-            place, middle, sizes, nuisances, got, scaled, free=solved_for, bounds=bounds,
-            mode_factor=factor,
-        )  # fmt: skip
-
-    def _report(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        nuisances: Array,
-        got: Estimate,
-        scaled: Estimate,
-        *,
-        free: Sequence[int],
-        bounds: Mapping[int, float],
-        mode_factor: float,
-    ) -> PlacementFit:
-        epochs = self.epochs.deformed(sizes)
-        kept = got.used[epochs.moment, :3].any(axis=1)
-        misses = (epochs.positions(place) - epochs.measured_ned)[kept]
-        misses = np.where(got.used[epochs.moment, :3][kept], misses, np.nan)
-        lost = epochs.known & ~got.used
-        first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
-        joint = [*range(PLACE), *range(PARAMETERS, len(got.change))]
-        sigmas = np.sqrt(np.diag(got.covariance))
-        named = {
-            name: (float(unit * nuisances[at]), float(unit * sigmas[at]))
-            for name, (at, unit) in _NUISANCES.items()
-            if at in free
-        }
-        self._warn_of_installation(named)
-        for group, how in got.correlation.items():
-            if how.restart > 1.0:
-                off = how.restart * how.factor * np.sqrt(how.constant)
-                warn(
-                    f"dives disagree on {group}, by {off:.0f} times the stated sigmas: the place "
-                    "is as unsure as that; correct the log of one, or add control points"
-                )
-        return PlacementFit(
-            ned_from_model=place,
-            used=int((got.used[:, 0] if got.used[:, 0].any() else got.used[:, 2]).sum()),
-            left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
-            rms_m=_rms(misses),
-            free_scale=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
-            free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
-            middle_ned=middle,
-            correlation=got.correlation,
-            time_unit="s" if epochs.timed else "stations",
-            installed=self.installed,
-            modes=sizes,
-            mode_factor=mode_factor,
-            joint=got.covariance[np.ix_(joint, joint)],
-            bends=self._bends(place, middle, sizes, got, free, bounds),
-            nuisances=named,
-        )
-
-    def _warn_of_installation(self, found: Mapping[str, tuple[float, float]]) -> None:
-        """Name what is off by more than is likely, and what may be off in its place."""
-        settings = [
-            *((name, "lever_sigma_m", self.installed.lever_m) for name in _LEVERS),
-            ("clock_s", "clock_sigma_s", self.installed.clock_s),
-        ]
-        off = [
-            (abs(found[name][0]) / sigma, f"{name} = {found[name][0]:+.3g} ({setting} = {sigma:g})")
-            for name, setting, sigma in settings
-            if name in found
-        ]
-        if off and max(off)[0] > _CONTRADICTION_SIGMAS:
-            likely = ", ".join(text for sigmas, text in sorted(off, reverse=True) if sigmas > 1.0)
-            warn(
-                f"navigation fits the pictures with {likely}: correct the log or the rig's mount, "
-                "or state a larger sigma, for the place is as unsure as that"
-            )
-
-    def _bends(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        got: Estimate,
-        free: Sequence[int],
-        bounds: Mapping[int, float],
-    ) -> tuple[Bend, ...]:
-        """How bent the placed model is by navigation alone, whatever its modes allow."""
-        epochs = self.epochs.deformed(sizes)
-        if got.used[:, 2].sum() < LEAST_STATIONS:
-            return ()
-        places = place.apply(epochs.centres)
-        modes = _VAGUE_PER_M * bend_modes(places, place)
-        count = modes.shape[2]
-        modes = np.concatenate([modes, epochs.modes[..., len(sizes) - self.joints :]], axis=2)
-        found = equations(replace(epochs, modes=modes), place, middle)
-        bent = estimate(
-            epochs.time,
-            found,
-            got.used,
-            [*(p for p in free if p < PARAMETERS), *range(PARAMETERS, PARAMETERS + modes.shape[2])],
-            replace(self, control=None)._extra(place, middle, np.zeros(modes.shape[2])),
-            frame_bounds=bounds,
-            correlation=got.correlation,
-        )
-        values = _VAGUE_PER_M * bent.change[PARAMETERS:]
-        sigmas = _VAGUE_PER_M * np.sqrt(np.diag(bent.covariance)[PARAMETERS:])
-        design, lengths, _ = quadratic(places[:, :2])
-        moved = place.scale * place.rotation.apply((self.epochs.modes @ sizes)[:, :3])[:, 2]
-        straightened = np.linalg.lstsq(design, moved, rcond=None)[0][2::2]
-        return tuple(
-            Bend(
-                curvature_per_m=float(values[k]),
-                sigma_per_m=float(sigmas[k]),
-                length_m=float(lengths[k]),
-                straightened_per_m=float(straightened[k]),
-            )
-            for k in range(min(count, 2))
-        )
-
-    def _drift(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        factor: float,
-        got: Estimate,
-        free: Sequence[int],
-        bounds: Mapping[int, float],
-    ) -> float:
-        """Drift of depths over the survey, metres, if it is more than is likely, else 0.
-
-        Only a known tilt tells it from one of the model.
-        """
-        epochs = self.epochs
-        if not (epochs.timed and epochs.has_tilt and got.used[:, 2].sum() >= LEAST_STATIONS):
-            return 0.0
-        usual = self._usual_sigma(2)
-        found = estimate(
-            epochs.time,
-            equations(epochs.deformed(sizes), place, middle),
-            got.used,
-            [*free, DRIFT],
-            self._extra(place, middle, sizes, factor, _VAGUE_DRIFT_SIGMAS * usual),
-            frame_bounds=bounds,
-        )
-        drift_m = float(found.change[DRIFT])
-        likely = np.hypot(_DRIFT_SIGMAS * usual, np.sqrt(found.covariance[DRIFT, DRIFT]))
-        return drift_m if abs(drift_m) > _CONTRADICTION_SIGMAS * likely else 0.0
-
-    def _usual_sigma(self, channel: int) -> float:
-        return float(np.median(self.epochs.sigma[self.epochs.known[:, channel], channel]))
-
-    def _contradictions(
-        self,
-        turn: float,
-        drift_m: float,
-        bounds: dict[int, float],
-        correlation: Mapping[str, Correlation],
-    ) -> dict[str, float]:
-        """Name what navigation says of itself in two ways, and make both as unsure as they differ.
-
-        Args:
-            turn: of navigation's frame against its headings, radians.
-            drift_m: of depths against attitudes and pictures; 0 where there is none.
-            bounds: of navigation's frame; widened in place.
-            correlation: of errors.
-
-        Returns:
-            Groups whose stated sigmas are too small, and by what factor.
-        """
-        widened = {}
-        if drift_m:
-            usual = self._usual_sigma(2)
-            warn(
-                f"depths of the navigation drift by {drift_m:+.2g} m against its attitudes and the "
-                f"pictures, where {_DRIFT_SIGMAS * usual:.2g} m is likely: depth counts as that "
-                "unsure; check the pressure sensor's zero and the tide"
-            )
-            # Its level may have been right at any time of the survey.
-            widened["depth"] = float(np.hypot(1.0, 0.5 * drift_m / usual))
-        if {"horizontal", "heading"} <= set(correlation) and bounds.get(TURN, 0.0) > 0:
-            expected = frame_sigma(bounds[TURN], self.epochs.time, correlation["horizontal"])
-            if abs(turn) > _CONTRADICTION_SIGMAS * expected:
-                stated = self._usual_sigma(5)
-                # Each takes its share of what they differ by.
-                differ = abs(turn) * (1.0 + (stated / expected) ** 2)
-                warn(
-                    "headings of the navigation and its positions disagree by "
-                    f"{np.rad2deg(differ):.2g} deg where "
-                    f"{np.rad2deg(np.hypot(expected, stated)):.2g} deg is likely: both count as "
-                    "that unsure; check the compass and the camera's mount (body_from_rig)"
-                )
-                widened["heading"] = max(differ / stated, 1.0)
-                bounds[TURN] *= differ / expected
-        return widened
-
-    def _middle(self, place: Similarity) -> Array:
-        middle: Array = place.apply(self.epochs.centres).mean(axis=0)
-        return middle
-
-    def _frame_bounds(self) -> dict[int, float]:
-        """How navigation's own frame may be turned and stretched within its positions' sigmas.
-
-        Positions by dead reckoning on a wrong heading are turned as a whole by its error; to
-        take their turn for a second, independent reading of the heading would count one error
-        twice as if it were two. In the same way a log's velocities are all wrong by one factor.
-        """
-        if not (self.epochs.known[:, 5].any() and self.epochs.has_horizontal):
-            return {}
-        plan = self.epochs.measured_ned[self.epochs.known[self.epochs.moment, 0], :2]
-        radius = float(np.sqrt(plan.var(axis=0).sum()))
-        sigma = float(np.median(self.epochs.sigma[:, 0]))
-        bound = sigma / radius if radius > sigma else 1.0
-        return {TURN: bound, STRETCH: min(bound, _STRETCH)}
-
-    def _extra(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        mode_factor: float = 1.0,
-        drift_m: float = 0.0,
-    ) -> Extra:
-        columns = PARAMETERS + len(sizes)
-        misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
-        if self.levelled is not None and not self.epochs.has_tilt:
-            down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
-            sigma = np.deg2rad(_LEVEL_SIGMA_DEG)
-            tilt = np.zeros((2, columns))
-            tilt[0, 1], tilt[0, 2] = down[2], -down[1]
-            tilt[1, 0], tilt[1, 2] = -down[2], down[0]
-            misfits.append(down[:2] / sigma)
-            rows.append(tilt / sigma)
-        if self.known_scale is not None and self.scale_sigma > 0:
-            scale = np.zeros((1, columns))
-            scale[0, SCALE] = 1.0 / self.scale_sigma
-            misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
-            rows.append(scale)
-        known = self.installed.weights(columns)
-        if drift_m:
-            known[DRIFT] = 1.0 / abs(drift_m)
-        known[PARAMETERS : columns - self.joints] = 1.0 / mode_factor
-        at = np.flatnonzero(known)
-        misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[at])
-        rows.append(np.diag(known)[at])
-        if self.control is not None:
-            more = self.control(place, middle, sizes)
-            misfits.append(more.misfit)
-            rows.append(more.jacobian)
-        return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
-
-    def robust(self, start: Similarity, free: list[int]) -> Similarity:
-        """A placement robust to a few wrong readings: readings as independent, soft L1.
-
-        It ends early where the model shrinks to a point.
-        """
-        place = start
-        for _ in range(_ROBUST_STEPS):
-            middle = self._middle(place)
-            found = equations(self.epochs, place, middle)
-            extra = self._extra(place, middle, np.zeros(self.epochs.modes.shape[2]))
-            known = self.epochs.known
-            misfit = np.concatenate([found.misfit[known], extra.misfit])
-            rows_of = np.concatenate([found.jacobian[known], extra.jacobian])
-            rows = rows_of[:, free]
-            weight = (1.0 + (misfit / _ROBUST_SIGMAS) ** 2) ** -0.25
-            size = np.linalg.norm(rows, axis=0)
-            size = np.where(size > 0, size, 1.0)
-            step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
-            change = np.zeros(rows_of.shape[1])
-            change[free] = step
-            if change[SCALE] > 0:  # a scale alone is solved by 1 + step; exp overshoots
-                change[SCALE] = np.log1p(change[SCALE])
-            place = _moved(place, change, middle)
-            if np.all(np.abs(step) * size < 1e-6) or place.scale < _SHRUNK * start.scale:
-                break
-        return place
-
-
-def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
-    """A placement after a small change of its first seven parameters about a point."""
-    turn, grow = Rotation.from_rotvec(change[:3]), float(np.exp(change[SCALE]))
-    shift = middle + grow * turn.apply(place.translation - middle) + change[3:6]
-    return Similarity(scale=place.scale * grow, rotation=turn * place.rotation, translation=shift)
-
-
-def _mode_factor(sizes: Array, sigmas: Array, factor: float) -> float:
-    """How many times larger the model's soft modes are than its pictures say, 1 or more.
-
-    Keypoints err a little together, in ways that residuals do not show and that only the softest
-    deformations add up. The evidence for the variance of the modes that outside measurements
-    determine: their squares over the number so determined (MacKay 1992, "Bayesian interpolation").
-
-    Args:
-        sizes: (K,) of the modes, in the sigmas that the pictures give.
-        sigmas: (K,) after the fit.
-        factor: what was taken so far.
-    """
-    determined = float((1.0 - (sigmas / factor) ** 2).sum())
-    if determined < 1.0:
-        return factor
-    ratio = float(sizes @ sizes) / determined
-    if factor == 1.0 and ratio < 1.0 + _SIGNIFICANT * np.sqrt(2.0 / determined):
-        return 1.0
-    return max(1.0, float(np.sqrt(ratio)))
-
-
-def _rms(misses: Array) -> Array:
-    """(3,) root mean squares of (N, 3) that may be NaN; NaN where all are."""
-    known = np.isfinite(misses)
-    total = np.where(known, misses, 0.0) ** 2
-    counts = known.sum(axis=0)
-    return np.sqrt(np.where(counts > 0, total.sum(axis=0) / np.maximum(counts, 1), np.nan))

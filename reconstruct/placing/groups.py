@@ -1,8 +1,8 @@
 """Groups of stations that no point links, put where navigation has them.
 
-Pictures say nothing of how such groups lie to each other. Each is placed by its own navigation
-first, which brings it near enough for the adjustment's linear motions of groups (see
-`reconstruct.adjustment.uncertainty.SoftModes`); the model's place then finds these motions, with
+Pictures do not show where such groups are relative to each other. Each is placed by its own
+navigation first, which brings it near enough for the adjustment's linear motions of groups (see
+`reconstruct.adjustment.soft_modes.SoftModes`); the model's place then finds these motions, with
 navigation's errors correlated between groups as along the track.
 """
 
@@ -19,7 +19,7 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import JointRecord
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.normal_equations import POSE
-from reconstruct.adjustment.uncertainty import SoftModes
+from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.pictures.files import named
@@ -47,7 +47,7 @@ def join_groups(
     """Move groups of linked stations to where navigation has them, seen from the largest.
 
     Args:
-        mapped: its groups may lie anywhere.
+        mapped: its groups may be anywhere.
         records: pictures.
         rig: as calibrated; None where it is unknown.
         datum: origin of the local frame; None where no latitude and longitude are known.
@@ -81,7 +81,7 @@ def join_groups(
 
 
 def joints_of(fit: PlacementFit, modes: SoftModes) -> tuple[JointRecord, ...]:
-    """How well each group after the first is known to lie to the first.
+    """How well the place of each group after the first is known relative to the first.
 
     Args:
         fit: of the place and the modes.

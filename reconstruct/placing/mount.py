@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.errors import Level, collected_by, note, warn
 from alice_survey.base.frames import rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.navigation_equations import Installation
@@ -48,11 +49,42 @@ def fit_with_mount(
 
     Returns:
         The fit, with the mount where there are attitudes; None where positions do not place the
-        model.
+        model. Of all fits on the way only this one's notes and warnings are reported.
     """
-    fit = navigate(None, usual)
-    if fit is None:
-        return None
+    fit, messages = _collected(navigate, None, usual)
+    first = None if fit is None else _first_mount(records, model_from_cam, cam_from_rig, fit)
+    if first is not None:
+        known = replace(usual, mount_rad=_UNKNOWN_RAD, lever_m=max(usual.lever_m, _UNKNOWN_LEVER_M))
+        mount = RigidTransform.from_rotation(first)
+        for _ in range(_STEPS):
+            mounts = {name: mount * pose.inv() for name, pose in cam_from_rig.items()}
+            found, said = _collected(navigate, mounts, known)
+            if found is None:
+                break
+            turn_deg, turn_sigma_deg = np.array([found.nuisances[name] for name in _AXES]).T
+            arm_m, arm_sigma_m = np.array([found.nuisances[name] for name in _ARMS]).T
+            mount = RigidTransform.from_components(
+                mount.translation - arm_m,
+                Rotation.from_rotvec(-turn_deg, degrees=True) * mount.rotation,
+            )
+            corrected = FoundMount(
+                body_from_rig=mount, turn_sigma_deg=turn_sigma_deg, lever_sigma_m=arm_sigma_m
+            )
+            fit, messages = replace(found, mount=corrected), said
+            if np.abs(turn_deg).max() < _SETTLED_DEG:
+                break
+    for level, text in messages:
+        (warn if level == "warning" else note)(text)
+    return fit
+
+
+def _first_mount(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    cam_from_rig: Mapping[str, RigidTransform],
+    fit: PlacementFit,
+) -> Rotation | None:
+    """Rotation from rig to body by attitudes at a place; None where there are too few."""
     turns = [
         rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg])).inv()
         * fit.ned_from_model.rotation
@@ -61,30 +93,16 @@ def fit_with_mount(
         for r, pose in zip(records, model_from_cam, strict=True)
         if r.has_attitude
     ]
-    if len(turns) < _LEAST_PICTURES:
-        return fit
-    mount = RigidTransform.from_rotation(_usual(Rotation.concatenate(turns)))
-    installed = replace(usual, mount_rad=_UNKNOWN_RAD, lever_m=max(usual.lever_m, _UNKNOWN_LEVER_M))
-    for _ in range(_STEPS):
-        mounts = {name: mount * pose.inv() for name, pose in cam_from_rig.items()}
-        found = navigate(mounts, installed)
-        if found is None:
-            return fit
-        fit = found
-        turn_deg, turn_sigma_deg = np.array([found.nuisances[name] for name in _AXES]).T
-        arm_m, arm_sigma_m = np.array([found.nuisances[name] for name in _ARMS]).T
-        mount = RigidTransform.from_components(
-            mount.translation - arm_m,
-            Rotation.from_rotvec(-turn_deg, degrees=True) * mount.rotation,
-        )
-        if np.abs(turn_deg).max() < _SETTLED_DEG:
-            break
-    return replace(
-        fit,
-        mount=FoundMount(
-            body_from_rig=mount, turn_sigma_deg=turn_sigma_deg, lever_sigma_m=arm_sigma_m
-        ),
-    )
+    return _usual(Rotation.concatenate(turns)) if len(turns) >= _LEAST_PICTURES else None
+
+
+def _collected(
+    navigate: Navigate, mounts: Mapping[str, RigidTransform] | None, installed: Installation
+) -> tuple[PlacementFit | None, list[tuple[Level, str]]]:
+    """A fit, and its notes and warnings, which are not reported yet."""
+    messages: list[tuple[Level, str]] = []
+    with collected_by(lambda *message: messages.append(message)):
+        return navigate(mounts, installed), messages
 
 
 def _usual(turns: Rotation) -> Rotation:

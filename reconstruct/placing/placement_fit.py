@@ -12,8 +12,8 @@ from alice_survey.base.frames import Array, pose_to_json
 from camera_calib.mount import nearest_mount
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import Bend
-from reconstruct.placing.generalised_fit import Correlation
 from reconstruct.placing.navigation_equations import PLACE, SCALE, Installation
+from reconstruct.placing.placement_problem import Correlation
 
 _METHOD = (
     "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "

@@ -27,8 +27,8 @@ from missions.fly.check import rig_of
 from reconstruct.adjustment.exact_observations import Pixels, RigState, exact_observations
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.correlated_errors import LEAST_WHITE
-from reconstruct.placing.generalised_fit import Correlation
 from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
+from reconstruct.placing.placement_problem import Correlation
 
 CORNER_PX = 0.01
 """Sigma of a corner's coordinate in a calibration that is yet to be made; rendered pools of the

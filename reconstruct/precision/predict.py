@@ -15,12 +15,13 @@ from alice_survey.base.block_solver import inverse_of, product_of
 from alice_survey.base.frames import Array
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
 from reconstruct.adjustment.normal_equations import LinearObservations, reduce_points
+from reconstruct.adjustment.soft_modes import Motions
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
-from reconstruct.adjustment.uncertainty import BlockShape, Motions, shape_of_block
+from reconstruct.adjustment.uncertainty import BlockShape, shape_of_block
 from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import sag_weights
-from reconstruct.placing.generalised_fit import Extra, estimate
+from reconstruct.placing.generalised_fit import estimate
 from reconstruct.placing.navigation_equations import (
     GROUP_OF,
     PARAMETERS,
@@ -31,6 +32,7 @@ from reconstruct.placing.navigation_equations import (
     Epochs,
     equations,
 )
+from reconstruct.placing.placement_problem import Extra
 from reconstruct.precision.instruments import NavigationErrors
 from reconstruct.precision.tracks import ExpectedBlock
 

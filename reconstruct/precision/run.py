@@ -74,7 +74,7 @@ def precision_report(
 ) -> tuple[str, dict[str, Any]]:
     """What a workspace's plan is predicted to give, as text and as JSON values.
 
-    Writes `precision.json` and `precision.tif`, the sigmas of heights, beside the plan, and draws
+    Writes `precision.json` and `precision.tif`, the sigmas of heights, next to the plan, and draws
     them in its page.
 
     Args:
@@ -91,11 +91,9 @@ def precision_report(
     plan = read_plan(folder / "plan.json")
     rig = expected_rig(workspace, config.camera, config.water, config.imaging)
     base = Candidate(config=config, made=plan, rig=rig)
-    block, errors, found = (
-        base.block(),
-        NavigationErrors.of(config.navigation, config.reconstruct),
-        base.precision,
-    )
+    block = base.block()
+    errors = NavigationErrors.of(config.navigation, config.reconstruct)
+    found = base.precision
     without = {
         "calibration": predict(block, errors, calibration=False),
         "navigation": predict(block, errors.times(_EXACT)),

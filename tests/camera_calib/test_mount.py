@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from typer.testing import CliRunner
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array
+from alice_survey.cli.camera import app as camera_commands
+from camera_calib.judge.mount_figure import plot_mount
 from camera_calib.mount import mount_line, mount_report, mount_rotation, with_mount
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
 
@@ -107,3 +110,45 @@ def test_a_mount_is_stated_shown_drawn_and_taken_from_another_rig(rig: Rig, tmp_
     assert "1.1 deg from forward+30" in mount_line(turned)
     with pytest.raises(CalibrationError, match="name a mount"):
         mount_report(path, None, lever, None, None)
+
+
+def test_only_the_rig_itself_is_replaced_without_being_asked(rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    path, other, same = (
+        tmp_path / name for name in ("rig.json", "other.json", "folder/../rig.json")
+    )
+    write_rig(path, rig)
+    write_rig(other, rig)
+    before = other.read_bytes()
+    arguments = ["mount", str(path), "forward+30", "-o"]
+
+    refused = CliRunner().invoke(camera_commands, [*arguments, str(other)])
+    assert "exists: name another, or add --overwrite" in str(refused.exception)
+    assert other.read_bytes() == before
+
+    for output, options in ((other, ["--overwrite"]), (same, []), (tmp_path / "new.json", [])):
+        done = CliRunner().invoke(camera_commands, [*arguments, str(output), *options])
+        assert done.exit_code == 0
+        assert "from forward+30" in mount_line(read_rig(output))
+
+
+def test_the_mount_is_shown_as_an_argument_that_may_be_left_out() -> None:
+    usage = CliRunner().invoke(camera_commands, ["mount", "--help"]).output
+    assert " [MOUNT]" in usage
+    assert "[[" not in usage
+
+
+def test_a_drawing_shows_all_of_eight_cameras(rig: Rig, tmp_path: Path) -> None:
+    names = [f"number{k}" for k in range(8)]
+    ring = RigidTransform.from_rotation(
+        Rotation.from_rotvec([[0, 0, k * np.pi / 4] for k in range(8)])
+    )
+    many = replace(
+        rig,
+        cameras=dict.fromkeys(names, rig.cameras["left"]),
+        cam_from_rig=dict(zip(names, ring, strict=True)),
+        body_from_rig=RigidTransform.from_rotation(mount_rotation("forward")),
+    )
+    plot_mount(many, tmp_path / "mount.svg")
+    drawn = (tmp_path / "mount.svg").read_text()
+    assert all(name in drawn for name in names)

@@ -18,13 +18,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array
+from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.vehicle.files import vehicle_from_file
 from alice_survey.vehicle.log import write_vehicle_log
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig, design_rig, write_rig
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target
+from missions.logs.ros_frames import flipped_quaternion
 from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.cameras import changed
@@ -247,7 +248,7 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
         {name: float(value or "nan") for name, value in row.items()}
         for row in rows_of(reef / "flight/navigation.csv")[::10]
     ]
-    bag = Bag(1)
+    bag, dvl = Bag(1), Bag(1)
     boot_us = 20_000_000
     messages: list[tuple[object, ...]] = []
     records: list[tuple[float, object]] = []
@@ -262,6 +263,10 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
         bag.add_nav_sts(
             round(now.timestamp() * 1e9), place, turned, row["altitude_m"] if heard else -1.0
         )
+        stamp = round(now.timestamp() * 1e9)
+        dvl.add_dvl(stamp, "/dvl/data", (0.2, 0.0, 0.0), slant_m, valid=heard)
+        attitude = flipped_quaternion(rotation_from_attitude(*turned).as_quat())
+        dvl.add_imu(stamp, "/imu", "imu", attitude)
         t = boot_us + round(row["time_s"] * 1e6)
         if not messages:
             since_ms = round(((now - WEEK_BEGAN).total_seconds() + LEAP_S) * 1e3)
@@ -282,6 +287,7 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
             (at, mavlink.MAVLink_vfr_hud_message(*said)),
         ]
     bag.write(folder / "sparus2.bag")
+    dvl.write(folder / "dvl.bag")
     (folder / "00000042.BIN").write_bytes(dataflash_log(messages))
     (folder / "dive.tlog").write_bytes(tlog(records))
     with (folder / "tides.csv").open("w", newline="") as file:

@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
-from camera_calib.rig import design_rig
+from camera_calib.mount import mount_rotation
+from camera_calib.rig import Rig, design_rig, write_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import Stations, joined, plan_pattern, stations_of_plan
-from missions.fly.check import check_report
+from missions.fly.check import check_report, rig_of
 from missions.fly.refly import refly_plan, to_see
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
@@ -45,6 +47,23 @@ def survey(shape: shapely.Geometry) -> Plan:
     """A plan over a shape within the box from 0 to 8 and 6 m, with a metre of lines beyond."""
     area = area_of(shape)
     return plan_of(area, lawnmower(8.0, 6.0, 1.0, 0.46, over_m=1.0))
+
+
+def one_camera(mount: RigidTransform) -> Rig:
+    """The left camera alone, mounted."""
+    return Rig(
+        cameras={"left": RIG.cameras["left"]},
+        cam_from_rig={"left": RIG.cam_from_rig["left"]},
+        body_from_rig=mount,
+        source="another rig",
+    )
+
+
+def same(one: RigidTransform | None, other: RigidTransform | None) -> bool:
+    """Whether two mounts are one, to a file's digits."""
+    assert one is not None
+    assert other is not None
+    return bool(np.allclose(one.as_matrix(), other.as_matrix(), atol=1e-9))
 
 
 def without(plan: Plan, index: int) -> Stations:
@@ -179,6 +198,37 @@ def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:
     assert "refly" not in data
     assert not (tmp_path / "out" / "refly").exists()
     assert json.loads((tmp_path / "out" / "holes.geojson").read_text())["features"] == []
+
+
+def test_the_mount_is_the_calibrated_else_the_found_else_the_designed_one(tmp_path: Path) -> None:
+    """Each place says in `source` which one it took."""
+    calibrated = replace(RIG, body_from_rig=None, source="a pool")
+    found = RigidTransform.from_components([0.2, 0.3, 0.4], mount_rotation("aft+60"))
+    stated = RigidTransform.from_components([0.1, 0.0, 0.4], mount_rotation("nadir-bow-left"))
+    for folder in ("calibration", "sparse"):
+        (tmp_path / folder).mkdir()
+
+    def taken() -> tuple[RigidTransform | None, str]:
+        rig = rig_of(tmp_path, CONFIG.camera, CONFIG.water)
+        return rig.body_from_rig, rig.source
+
+    assert taken()[1] == RIG.source
+    write_rig(tmp_path / "calibration" / "rig.json", calibrated)
+    for of_other in (None, replace(calibrated, body_from_rig=None), one_camera(found)):
+        if of_other is not None:
+            write_rig(tmp_path / "sparse" / "rig.json", of_other)
+        mount, source = taken()
+        assert same(mount, RIG.body_from_rig)
+        assert "a pool" in source
+        assert source.endswith("mounted as designed")
+    write_rig(tmp_path / "sparse" / "rig.json", replace(calibrated, body_from_rig=found))
+    mount, source = taken()
+    assert same(mount, found)
+    assert source.endswith("mounted as the reconstruction found")
+    write_rig(tmp_path / "calibration" / "rig.json", replace(calibrated, body_from_rig=stated))
+    mount, source = taken()
+    assert same(mount, stated)
+    assert "mounted" not in source
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

@@ -28,6 +28,15 @@ cola2_msgs/NED position_variance
 cola2_msgs/RPY orientation_variance
 """,
 }
+_DVL = "dvl_msgs/msg/DVL"
+_DVL_TEXT = """std_msgs/Header header
+float64 time
+geometry_msgs/Vector3 velocity
+float64 fom
+float64 altitude
+bool velocity_valid
+int64 status
+"""
 
 
 class Bag:
@@ -167,6 +176,34 @@ class Bag:
             range=range_m,
         )
         self.add(topic, "sensor_msgs/msg/Range", stamp_ns, message)
+
+    def add_dvl(
+        self, stamp_ns: int, topic: str, velocity_frd: Sequence[float], altitude_m: float,
+        *, valid: bool = True,
+    ) -> None:  # fmt: skip
+        """What a Water Linked DVL's driver publishes (the fields of dvl_msgs that matter)."""
+        if _DVL not in self.store.types:
+            self.store.register(get_types_from_msg(_DVL_TEXT, _DVL))
+        message = self.make(
+            _DVL,
+            header=self.header(stamp_ns, "dvl"),
+            time=0.1,
+            velocity=self.point(*map(float, velocity_frd), kind="Vector3"),
+            fom=0.01,
+            altitude=altitude_m,
+            velocity_valid=valid,
+            status=0,
+        )
+        self.add(topic, _DVL, stamp_ns, message)
+
+    def add_twist(self, stamp_ns: int, topic: str, frame: str, velocity: Sequence[float]) -> None:
+        zero = self.point(0.0, 0.0, 0.0, kind="Vector3")
+        linear = self.point(*map(float, velocity), kind="Vector3")
+        twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=zero)
+        message = self.make(
+            "geometry_msgs/msg/TwistStamped", header=self.header(stamp_ns, frame), twist=twist
+        )
+        self.add(topic, "geometry_msgs/msg/TwistStamped", stamp_ns, message)
 
     def add_pressure(self, stamp_ns: int, topic: str, pressure_pa: float) -> None:
         message = self.make(

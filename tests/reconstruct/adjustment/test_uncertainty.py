@@ -17,9 +17,9 @@ from reconstruct.adjustment.normal_equations import (
     LinearObservations,
     reduce_points,
 )
+from reconstruct.adjustment.soft_modes import Motions
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
-    Motions,
     estimate,
     pinhole_observations,
     read_uncertainty,

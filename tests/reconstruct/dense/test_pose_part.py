@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import heard
-from reconstruct.adjustment.uncertainty import Uncertainty, no_modes, write_uncertainty
+from reconstruct.adjustment.soft_modes import no_modes
+from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views

@@ -1,4 +1,4 @@
-"""Navigation of several dives: errors begin anew with each, if the readings say so."""
+"""Navigation of several dives: errors restart with each, if the readings show it."""
 
 from dataclasses import replace
 
@@ -8,18 +8,18 @@ import pytest
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.generalised_fit import dives_of
-from tests.reconstruct.placing.test_sigmas import SIGMA, STEP_S, flight, place, records_of
+from tests.reconstruct.placing.test_sigmas import SIGMA, flight, place, records_of
 
 BODY = flight(8, 15)
 SECOND = len(BODY) // 2
 GAP_S = 1800.0
 
 
-def two_dives(seed: int, jump_m: float, *, anew: bool = True) -> list[ImageRecord]:
+def two_dives(seed: int, jump_m: float, *, restart: bool = True) -> list[ImageRecord]:
     """Constant errors, a fifth of their variance white; positions of the second dive jump."""
-    rng = np.random.default_rng([seed, int(10 * jump_m), anew])
+    rng = np.random.default_rng([seed, int(10 * jump_m), restart])
     constants = rng.normal(size=(2, 6))
-    if not anew:
+    if not restart:
         constants[1] = constants[0]
     dive = (np.arange(len(BODY)) >= SECOND).astype(int)
     errors: Array = np.sqrt(0.8) * constants[dive] + np.sqrt(0.2) * rng.normal(size=(len(BODY), 6))
@@ -38,18 +38,18 @@ def test_long_gaps_lie_between_dives() -> None:
     assert dives_of(400.0 * np.arange(5)).tolist() == [0] * 5
 
 
-@pytest.mark.parametrize("anew", [True, False])
-def test_two_dives_are_as_sure_as_their_errors_are_independent(anew: bool) -> None:
+@pytest.mark.parametrize("restart", [True, False])
+def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) -> None:
     found, stated, restarts = [], [], []
     for seed in range(8):
-        fit, errors, sigma = place(BODY, two_dives(seed, 0.0, anew=anew), seed)
+        fit, errors, sigma = place(BODY, two_dives(seed, 0.0, restart=restart), seed)
         found.append(errors[:3] / SIGMA[:3])
         stated.append(sigma[:3] / SIGMA[:3])
         restarts.append(fit.correlation["horizontal"].restart)
     ratio = np.sqrt(np.mean((np.array(found) / np.array(stated)) ** 2))
     assert 0.7 < ratio < 1.4
     share = np.mean(stated)
-    if anew:  # the mean of two constants
+    if restart:  # the mean of two constants
         assert 0.6 < share < 0.85
         assert np.mean(restarts) > 0.5
     else:
@@ -69,4 +69,3 @@ def test_dives_that_contradict_each_other_leave_the_place_that_unsure(jump_m: fl
         assert abs(errors[5]) < 4.0 * sigma[5]  # nor the heading
         ratios.append(errors[:2] / sigma[:2])
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.6
-    assert STEP_S < GAP_S

@@ -113,7 +113,7 @@ class Found:
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def joint(self, group: int) -> tuple[Array, Array]:
-        """How a group lies wrongly to the first, (6,) turn and shift in NED, and the covariance."""
+        """Error of a group relative to the first, (6,) turn and shift in NED, and covariance."""
         off = np.column_stack([
             (self.true.rotation * self.poses.rotation.inv()).as_rotvec(),
             self.true.translation - self.poses.translation,

@@ -15,8 +15,9 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import MappingRecord, PicturesRecord
 from camera_calib.freedom import part_of_rig
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
-from reconstruct.placing.run import Placed, Placing, find_place
+from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.place import Placed, Placing, find_place
+from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.views.model_files import as_transform
 from tests.reconstruct.placing.test_georeference import (
     exact,

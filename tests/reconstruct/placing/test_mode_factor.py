@@ -24,21 +24,24 @@ def waves(centres: Array) -> Array:
     return _SIGMA_M * modes
 
 
-def fitted(seed: int, factor: float, apart_mm: float | None = None) -> tuple[PlacementFit, Array]:
+def fitted(
+    seed: int, factor: float, *, apart_m: float | None = None, unit_m: float = 1e-3
+) -> tuple[PlacementFit, Array]:
     """A model deformed by this many times its sigmas, placed; its errors, in the fit's order.
 
-    With `apart_mm` its second half lies so far east of where it ought to, and nothing links it.
+    With `apart_m` its second half is so far east of where it ought to be, and nothing links it: its
+    motions are counted in this unit.
     """
     rng = np.random.default_rng([7, seed])
     body = flight(8, 40)
     cameras = body * BODY_FROM_CAM["cam"]
     modes = waves(cameras.translation)
     sizes = factor * rng.normal(size=_MODES)
-    if apart_mm is not None:
+    if apart_m is not None:
         joint = np.zeros((len(modes), 6, 3))
-        joint[len(modes) // 2 :, :3] = 1e-3 * np.eye(3)
+        joint[len(modes) // 2 :, :3] = unit_m * np.eye(3)
         modes = np.concatenate([modes, joint], axis=2)
-        sizes = np.append(sizes, [0.0, apart_mm, 0.0])
+        sizes = np.append(sizes, [0.0, apart_m / unit_m, 0.0])
     bent = RigidTransform.from_components(
         cameras.translation - (modes @ sizes)[:, :3], cameras.rotation
     )
@@ -50,7 +53,7 @@ def fitted(seed: int, factor: float, apart_mm: float | None = None) -> tuple[Pla
     levelled = level(own.inv().apply(floor), np.stack([pose.translation for pose in poses]))
     fit = fit_navigation(
         flown(body, [4, seed], 1.0), poses, BODY_FROM_CAM, DATUM, levelled,
-        known_scale=1.0, modes=modes, joints=0 if apart_mm is None else 3,
+        known_scale=1.0, modes=modes, joints=0 if apart_m is None else 3,
     )  # fmt: skip
     assert fit is not None
     return fit, fit.modes - sizes
@@ -79,14 +82,19 @@ def test_modes_larger_than_stated_are_found_and_their_sigmas_are_true(factor: fl
     assert 0.75 < np.sqrt((off**2).mean()) < 1.3
 
 
-def test_half_a_model_that_lies_apart_is_no_sign_of_larger_modes() -> None:
-    """Nothing is known of where it lies: not 200 mm in units of one, which a prior would shrink."""
+@pytest.mark.parametrize(("apart_m", "unit_m"), [(0.2, 1e-3), (1.0, 0.1)])
+def test_half_a_model_apart_is_no_sign_of_larger_modes(apart_m: float, unit_m: float) -> None:
+    """Nothing is known of where it is: neither a prior shrinks its motions nor do they count.
+
+    A prior of one unit would shrink 200 mm in units of 1 mm. 1 m in units of 0.1 m, known to less
+    than one unit, would count as modes ten times as large as stated.
+    """
     found, off, sigmas = [], [], []
     for seed in range(12):
-        fit, error = fitted(seed, 1.0, apart_mm=200.0)
+        fit, error = fitted(seed, 1.0, apart_m=apart_m, unit_m=unit_m)
         found.append(fit.mode_factor)
         sigmas.append(np.sqrt(np.diag(fit.joint)[_FIRST + _MODES :]))
         off.append(error[_MODES:] / sigmas[-1])
     assert np.count_nonzero(np.array(found) > 1.0) <= 1
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
-    assert np.all((np.array(sigmas) > 2.0) & (np.array(sigmas) < 60.0))
+    assert np.all((unit_m * np.array(sigmas) > 2e-3) & (unit_m * np.array(sigmas) < 0.06))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.errors import collected_by, warn
 from alice_survey.base.frames import Array
 from camera_calib.mount import mount_rotation
 from reconstruct.placing.georeference import fit_navigation, level
@@ -19,9 +20,12 @@ BODY = flight(8, 15)
 
 
 def placed(
-    words: str, seed: int, *, tau_s: float = 1.0
+    words: str, seed: int, *, tau_s: float = 1.0, calls: list[str] | None = None
 ) -> tuple[PlacementFit, RigidTransform, Array]:
-    """Fit with an unknown mount: the fit, the true mount, errors of turn (rad) and place (m)."""
+    """Fit with an unknown mount: the fit, the true mount, errors of turn (rad) and place (m).
+
+    With `calls` each fit on the way adds its number to them, and warns of it.
+    """
     rng = np.random.default_rng([seed, 7])
     mount = RigidTransform.from_components(
         rng.uniform([0.2, -0.3, 0.0], [0.6, 0.3, 0.3]),
@@ -46,6 +50,9 @@ def placed(
     def navigate(
         mounts: Mapping[str, RigidTransform] | None, installed: Installation
     ) -> PlacementFit | None:
+        if calls is not None:
+            calls.append(f"fit {len(calls)}")
+            warn(calls[-1])
         return fit_to(mounts, DATUM, installed=installed)
 
     fit = fit_with_mount(
@@ -75,3 +82,13 @@ def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
         places.append(error / np.sqrt(np.diag(fit.covariance))[:6])
     for ratios, low in ((turns, 0.4), (np.array(arms)[:, :2], 0.4), (places, 0.3)):
         assert low < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+def test_of_all_fits_on_the_way_the_last_alone_warns() -> None:
+    calls: list[str] = []
+    reported: list[tuple[str, str]] = []
+    with collected_by(lambda *message: reported.append(message)):
+        fit, _, _ = placed("nadir-bow-left", 0, calls=calls)
+    assert fit.mount is not None
+    assert len(calls) > 2
+    assert reported == [("warning", calls[-1])]

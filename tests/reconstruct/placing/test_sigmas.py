@@ -208,10 +208,11 @@ def test_a_clock_that_is_off_by_more_than_stated_is_named_with_its_setting(
     assert abs(abs(value) - 1.0) < 4 * sigma < 1.0
 
 
-@pytest.mark.parametrize("drift_m", [0.0, 0.4])
+@pytest.mark.parametrize("drift_m", [0.0, 0.036, 0.4])
 def test_a_drift_of_depths_is_named_and_costs_the_depth(
     drift_m: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """0.7 of the stated sigma, as the worst of 24 flights has it, is usual; 8 are not."""
     body, off, found = flight(6, 14), [], []
     share = np.linspace(0.0, 1.0, len(body))
     for seed in range(4):
@@ -220,11 +221,11 @@ def test_a_drift_of_depths_is_named_and_costs_the_depth(
         fit, error, sigma = place(body, records_of(body, errors, SIGMA), seed)
         off.append(error[2] / sigma[2])
         found.append(fit.nuisances.get("depth_drift_m", (0.0, 0.0))[0])
-        assert ("drift" in capsys.readouterr().err) == (drift_m > 0)
+        assert ("drift" in capsys.readouterr().err) == (drift_m > 0.1)
         assert np.all(np.abs(error[3:5]) < 4.0 * sigma[3:5])  # nor does it tilt the model
     np.testing.assert_allclose(found, drift_m, atol=0.1)
     assert np.sqrt(np.mean(np.square(off))) < 1.6
-    assert drift_m == 0.0 or np.sqrt(np.mean(np.square(off))) > 0.4
+    assert drift_m < 0.1 or np.sqrt(np.mean(np.square(off))) > 0.4
 
 
 def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:

@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
-from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, no_modes
+from reconstruct.adjustment.soft_modes import SoftModes, no_modes
+from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, attitude_axes

@@ -1,0 +1,370 @@
+"""The place of a model in the world: by navigation, control points, a scale or the sea floor."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.spatial import KDTree
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
+from alice_survey.base.frames import Array, Datum
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.records import MappingRecord, PicturesRecord, ScaleRecord
+from alice_survey.base.run import progress
+from alice_survey.stages import SCALE_FILE
+from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.rig import Rig, mounted
+from reconstruct.adjustment.soft_modes import SoftModes
+from reconstruct.adjustment.uncertainty import Uncertainty
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.altitude_scale import scale_by_altitudes
+from reconstruct.placing.control import ControlFit, tie_control
+from reconstruct.placing.control_file import (
+    CONTROL_FILE,
+    MARKERS_FILE,
+    PICKS_FILE,
+    Control,
+    read_control,
+    read_picks,
+)
+from reconstruct.placing.georeference import fit_control, fit_navigation, level
+from reconstruct.placing.mount import fit_with_mount
+from reconstruct.placing.navigation_equations import Installation, body_from_pinhole
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.track import picture_modes
+from reconstruct.views.model import WorldFrame
+
+RIG_SCALE_SIGMA = 1e-3
+"""Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach
+(600 ppm in the built-in demo; the baseline's own sigma leaves out the angle between cameras)."""
+LENGTH_SCALE_SIGMA = 1e-2
+"""Relative sigma of a scale from one length that a person measured."""
+_VERTICAL_OF_CONTROL = "WGS 84 ellipsoid, or the level of the control points' depths"
+_VERTICAL_OF_LEVEL = "mean plane of the sea floor in the pictures"
+_LOCAL = "placed by control points in their own north, east and depth; no CRS"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placed:
+    """A model's place in the world."""
+
+    world_from_model: Similarity
+    frame: WorldFrame
+    fit: PlacementFit | None
+    scale_source: str
+    control: ControlFit | None
+    """What is known of the site, where something is."""
+    located: bool
+    """Whether the world is that in which control points are known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placing:
+    """What a place is found from."""
+
+    workspace: Path
+    model: pycolmap.Reconstruction
+    records: Sequence[ImageRecord]
+    """Registered pictures."""
+    pinholes: Sequence[RigidTransform]
+    """`model_from_pinhole` of these."""
+    warps: Mapping[str, PinholeWarp]
+    rig: Rig | None
+    datum: Datum | None
+    survey: PicturesRecord
+    mapping: MappingRecord
+    settings: ReconstructConfig
+    shape: Uncertainty | None
+    """How well the model's shape is known; None where it is not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _KnownScale:
+    scale: float
+    """Metres in a unit of the mapped model."""
+    source: str
+    sigma: float
+    """Relative sigma of the scale."""
+    held: bool = True
+    """Whether the scale changes by control alone."""
+
+
+@progress.step("place the model")
+def find_place(task: Placing) -> Placed:
+    """Place a model.
+
+    Raises:
+        ReconstructionError: the model is too small, or `scale.json` is of another model.
+        WorkspaceError: a file of control is wrong.
+    """
+    points = np.array([p.xyz for _, p in sorted(task.model.points3D.items())]).reshape(-1, 3)
+    if len(points) < 3:
+        raise ReconstructionError(f"the model has {len(points)} points only")
+    centres = np.stack([p.translation for p in _by_station(task.records, task.pinholes)])
+    levelled = level(points, centres)
+    known = _known_scale(task.workspace, task.mapping)
+    if known is None and task.datum is None:
+        known = _altitude_scale(task, levelled, points)
+    scale = None if known is None else known.scale
+    path = task.workspace / CONTROL_FILE
+    control = read_control(path) if path.is_file() else Control()
+    datum = task.datum or control.datum()
+    ties = _tie(task, control, datum)
+    fit, local = _fit(task, levelled, scale, known, ties, datum)
+    notes = [*task.survey.notes, *task.mapping.notes]
+    if fit is not None:
+        place = fit.ned_from_model
+        source = _scale_source(known, ties)
+        scaled, vertical = True, _VERTICAL_OF_CONTROL
+        if local is not None:
+            datum = None
+        if local is not None or task.datum is not None:
+            if any(record.readings["depth"] for record in task.records):
+                vertical = str(task.survey.vertical_datum)
+            elif local is not None or not ties.used_points:
+                vertical = _VERTICAL_OF_LEVEL
+        notes += [source] if datum is not None else [source, local or _LOCAL]
+    else:
+        found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
+        factor = 1.0 if scale is None else scale
+        source = "unscaled" if known is None else known.source
+        if found is not None:
+            factor, source = found[0], _scale_source(known, ties)
+        place = replace(levelled, scale=factor, translation=factor * levelled.translation)
+        scaled, vertical = known is not None or found is not None, _VERTICAL_OF_LEVEL
+        turned = None if scaled else _turned(task, levelled)
+        if turned is not None:
+            place, note = turned
+            notes.append(f"unscaled; {note}")
+        else:
+            notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
+        datum = None
+    frame = WorldFrame(
+        name="model" if datum is None else "ned",
+        datum=datum,
+        scaled=scaled,
+        vertical_datum=vertical,
+        notes=tuple(notes),
+    )
+    if fit is not None:
+        ties = ties.deformed(fit.modes)
+    return Placed(
+        world_from_model=place,
+        frame=frame,
+        fit=fit,
+        scale_source=source,
+        control=ties if (control.points or control.lengths) and scaled else None,
+        located=fit is not None and local is None,
+    )
+
+
+def _fit(
+    task: Placing,
+    levelled: Similarity,
+    scale: float | None,
+    known: _KnownScale | None,
+    ties: ControlFit,
+    datum: Datum | None,
+) -> tuple[PlacementFit | None, str | None]:
+    """The fit to navigation and control, to one of them, or None where nothing places it.
+
+    Also, of a fit to navigation without positions, what of the place is the model's own.
+    """
+    # Control corrects a known scale within its sigma; without control it is held.
+    sigma = 0.0
+    if known is not None and (ties.informs_scale or not known.held):
+        sigma = known.sigma
+    fit, modes, joints = None, None, 0
+    if task.shape is not None:
+        joints = task.shape.modes.joints
+        modes = picture_modes(task.shape, task.records, task.pinholes)
+        if task.shape.modes.calibration.size:  # the rig's scale is one of them
+            sigma = 0.0
+    rig, installed = mounted(task.rig), Installation.of(task.settings)
+    fit_to = partial(
+        fit_navigation,
+        task.records,
+        task.pinholes,
+        levelled=levelled,
+        known_scale=scale,
+        scale_sigma=sigma,
+        modes=modes,
+        joints=joints,
+    )
+    mounts = None if rig is None else body_from_pinhole(rig, task.warps)
+    navigate = partial(fit_to, mounts, installed=installed)
+    if task.datum is not None:
+        control = ties.equations if ties.informs else None
+        pinhole_from_rig = _pinhole_from_rig(task)
+        if rig is not None or pinhole_from_rig is None:
+            fit = navigate(task.datum, control=control)
+        else:
+            fit = fit_with_mount(
+                task.records,
+                task.pinholes,
+                pinhole_from_rig,
+                lambda mounts, known: fit_to(mounts, task.datum, installed=known, control=control),
+                installed,
+            )
+    attitudes = any(_is_turned(record) for record in task.records)
+    if attitudes and rig is None and (fit is None or fit.mount is None):
+        warn(
+            "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
+            "state it with 'alice-survey camera mount', and import the pictures with that --rig"
+        )
+    if fit is not None:
+        return fit, None
+    start = ties.start(scale)
+    if start is None:
+        if ties.used_points:
+            warn(
+                f"{len(ties.used_points)} control points do not place the model without "
+                "navigation: three that are not on one line do"
+            )
+        bars = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
+        if bars is not None:
+            fit = navigate(None, known_scale=bars[0], scale_sigma=bars[1])
+        else:
+            fit = navigate(None)
+        note = None if fit is None else _local_note(task.records, headed=rig is not None)
+        return fit, note
+    fit = fit_control(
+        task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma,
+        modes=modes, joints=joints,
+    )  # fmt: skip
+    return fit, None
+
+
+def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | None:
+    """Where attitudes turn a model that has no scale, and a note; None where none is of use."""
+    nan = math.nan
+    records = [
+        replace(record, latitude_deg=nan, longitude_deg=nan, depth_m=nan) for record in task.records
+    ]
+    rig = mounted(task.rig)
+    if rig is None or not any(_is_turned(record) for record in records):
+        return None
+    fit = fit_navigation(
+        records, task.pinholes, body_from_pinhole(rig, task.warps), None, levelled=levelled,
+        known_scale=1.0, installed=Installation.of(task.settings),
+    )  # fmt: skip
+    return None if fit is None else (fit.ned_from_model, _local_note(records, headed=True))
+
+
+def _is_turned(record: ImageRecord) -> bool:
+    return record.readings["roll and pitch"] or record.readings["heading"]
+
+
+def _pinhole_from_rig(task: Placing) -> dict[str, RigidTransform] | None:
+    """Poses of the pinholes on the rig; None where several cameras are no rig."""
+    if task.rig is not None:
+        return {n: w.pinhole_from_cam * task.rig.cam_from_rig[n] for n, w in task.warps.items()}
+    names = {record.camera for record in task.records}
+    return {name: RigidTransform.identity() for name in names} if len(names) == 1 else None
+
+
+def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
+    """What of a place without positions is measured, and what is the model's own."""
+    known = {name for record in records for name, known in record.readings.items() if known}
+    axes = {
+        "level": bool(known & {"depth", "roll and pitch"}),
+        "depth": "depth" in known,
+        "heading": headed and "heading" in known,
+    }
+    measured = " and ".join(name for name, has in axes.items() if has)
+    own = " and ".join(["origin", *(name for name, has in axes.items() if not has)])
+    return f"no latitude and longitude: {measured} by navigation, {own} the model's own; no CRS"
+
+
+def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
+    """Find the known points in the pictures."""
+    if not (control.points or control.lengths):
+        return ControlFit(ties=(), bars=(), lost={})
+    files = [task.workspace / name for name in (PICKS_FILE, MARKERS_FILE)]
+    picks = [pick for path in files if path.is_file() for pick in read_picks(path)]
+    if not picks:
+        warn(
+            f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}; "
+            "'alice-survey control' finds markers and prepares picking"
+        )
+    picked = {p.image for p in picks}
+    if picked and picked.isdisjoint(r.image for r in task.records):
+        raise WorkspaceError(f"no picture of the model is picked; {min(picked)} is not in it")
+    cameras = {
+        record.image: RegisteredPicture(warp=task.warps[record.camera], model_from_pinhole=pose)
+        for record, pose in zip(task.records, task.pinholes, strict=True)
+    }
+    spots, lost = find_spots(picks, cameras)
+    wanted = {p.name for p in control.points} | {
+        end for length in control.lengths for end in length.ends or ()
+    }
+    lost = {name: why for name, why in lost.items() if name in wanted}
+    found = tie_control(control, spots, lost, datum)
+    if task.shape is None:
+        return found
+    xyz = np.array([p.xyz for _, p in sorted(task.model.points3D.items())])
+    return replace(found, motion_at=partial(_motions_near, KDTree(xyz), task.shape.modes))
+
+
+def _motions_near(tree: KDTree, modes: SoftModes, places: Array) -> Array:
+    """Motions (N, 3, K) of places (N, 3): those of the nearest points of the model."""
+    return modes.points[np.asarray(tree.query(places)[1])].astype(np.float64)
+
+
+def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
+    source = "scale from navigation" if known is None else known.source
+    if not ties.informs_scale:
+        return source
+    bars, points = len(ties.used_bars), len(ties.used_points)
+    found = " and ".join(
+        [
+            *([f"{points} control points"] if points > 1 else []),
+            *([f"{bars} known length{'s' * (bars > 1)}"] if bars else []),
+        ]
+    )
+    return f"scale from {found}" if known is None else f"{source}, corrected by {found}"
+
+
+def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
+    """The known scale; None where nothing but navigation or control gives it."""
+    if mapping.scaled:
+        return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
+    path = workspace / SCALE_FILE
+    measured = ScaleRecord.made(path)
+    if measured is None:
+        return None
+    if measured.gauge != mapping.gauge:
+        raise ReconstructionError(
+            f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "
+            "measure the known length again with 'alice-survey scale'"
+        )
+    return _KnownScale(
+        scale=measured.metres_per_unit,
+        source="scaled by one known length",
+        sigma=LENGTH_SCALE_SIGMA,
+    )
+
+
+def _altitude_scale(task: Placing, levelled: Similarity, points: Array) -> _KnownScale | None:
+    """The scale by altitudes, where neither a rig nor positions give one."""
+    centres = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
+    found = scale_by_altitudes(task.records, centres, levelled.apply(points))
+    if found is None:
+        return None
+    scale, sigma = found
+    source = f"scale from altitudes, sigma {sigma:.1%}"
+    return _KnownScale(scale=scale, source=source, sigma=sigma, held=False)
+
+
+def _by_station(
+    records: Sequence[ImageRecord], poses: Sequence[RigidTransform]
+) -> list[RigidTransform]:
+    order = sorted(range(len(records)), key=lambda i: (records[i].station, records[i].image))
+    return [poses[i] for i in order]

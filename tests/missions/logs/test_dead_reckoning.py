@@ -1,0 +1,188 @@
+"""Dead reckoning against dense least squares over all unknowns, and against its own sigmas."""
+
+import numpy as np
+import pytest
+
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.frames import Array, Datum
+from missions.logs.dead_reckoning import (
+    TrackErrors,
+    dead_reckoned,
+    with_dead_reckoning,
+)
+from missions.logs.dive import LoggedDive, Signal
+
+ERRORS = TrackErrors(scale=0.01, heading_deg=2.0, noise_mps=0.05)
+DATUM = Datum(43.0, 5.0)
+
+
+def lawnmower(count: int = 400, step_s: float = 0.5, seed: int = 0) -> tuple[Array, Array]:
+    """Times and velocities north and east of lines there and back with a drift across."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(count) * step_s
+    line = np.where((time_s // 40).astype(int) % 2 == 0, 0.4, -0.4)
+    drift = 0.05 + 0.02 * np.sin(time_s / 17)
+    return time_s, np.column_stack([line, drift]) + rng.normal(0, 0.01, (count, 2))
+
+
+def moves_of(time_s: Array, velocity: Array) -> Array:
+    return 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time_s)[:, None]
+
+
+def dense(
+    time_s: Array, velocity: Array, fixes: tuple[Array, Array, Array], errors: TrackErrors
+) -> tuple[Array, Array]:
+    """All places and both errors at once, by the normal equations of their residuals."""
+    at, places, sigmas = fixes
+    count, moves = len(time_s), moves_of(time_s, velocity)
+    rows, values = [], []
+    for k, (move, dt) in enumerate(zip(moves, np.diff(time_s), strict=True)):
+        for axis, other in ((0, -move[1]), (1, move[0])):
+            row = np.zeros(2 * count + 2)
+            row[2 * (k + 1) + axis], row[2 * k + axis] = 1.0, -1.0
+            row[-2:] = -move[axis], -other
+            rows.append(row / (errors.noise_mps * np.sqrt(dt)))
+            values.append(move[axis] / (errors.noise_mps * np.sqrt(dt)))
+    for i, (place, sigma) in enumerate(zip(places, sigmas, strict=True)):
+        for axis in (0, 1):
+            row = np.zeros(2 * count + 2)
+            row[2 * at[i] + axis] = 1.0 / sigma
+            rows.append(row)
+            values.append(place[axis] / sigma)
+    for column, sigma in ((-2, errors.scale), (-1, np.deg2rad(errors.heading_deg))):
+        row = np.zeros(2 * count + 2)
+        row[column] = 1.0 / sigma
+        rows.append(row)
+        values.append(0.0)
+    a, b = np.array(rows), np.array(values)
+    normal = a.T @ a
+    found = np.linalg.solve(normal, a.T @ b)
+    variances = np.diag(np.linalg.inv(normal))[:-2].reshape(-1, 2)
+    return found[:-2].reshape(-1, 2), np.sqrt(0.5 * variances.sum(axis=1))
+
+
+@pytest.mark.parametrize("at", [[0], [250], [3, 399], [0, 130, 260, 390]])
+def test_the_smoother_is_least_squares_over_all_places(at: list[int]) -> None:
+    time_s, velocity = lawnmower()
+    places = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])[at] * 1.02
+    sigmas = np.linspace(0.5, 2.0, len(at))
+    track = dead_reckoned(
+        Signal(source="dvl", time_s=time_s, values=velocity), (time_s[at], places, sigmas), ERRORS
+    )
+    expected, sigma = dense(time_s, velocity, (np.array(at), places, sigmas), ERRORS)
+    np.testing.assert_allclose(track.ne, expected, atol=2e-5)
+    np.testing.assert_allclose(track.sigma_m, sigma, rtol=1e-4)
+    assert track.refused == 0
+
+
+@pytest.mark.parametrize("at", [[0], [0, 399]])
+def test_sigmas_are_those_of_the_errors(at: list[int]) -> None:
+    time_s, velocity = lawnmower()
+    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
+    ratios = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        scale, turn = rng.normal(0, [ERRORS.scale, np.deg2rad(ERRORS.heading_deg)])
+        # Truth = (1 + scale) turned measured: the measured track is the inverse of that.
+        cos, sin = np.cos(turn), np.sin(turn)
+        measured = velocity @ np.array([[cos, -sin], [sin, cos]]) / (1 + scale)
+        # White noise of velocity over a step dt has a variance of noise^2 / dt.
+        measured = measured + rng.normal(0, ERRORS.noise_mps / np.sqrt(0.5), measured.shape)
+        fixes = true[at] + rng.normal(0, 0.3, (len(at), 2))
+        track = dead_reckoned(
+            Signal(source="dvl", time_s=time_s, values=measured),
+            (time_s[at], fixes, np.full(len(at), 0.3)),
+            ERRORS,
+        )
+        ratios.append((track.ne - true) / track.sigma_m[:, None])
+    rms = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
+    assert rms.min() > 0.85
+    assert rms.max() < 1.15
+
+
+def test_sigma_grows_away_from_a_fix_and_shrinks_towards_the_next() -> None:
+    time_s, velocity = lawnmower()
+    signal = Signal(source="dvl", time_s=time_s, values=velocity)
+    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
+    one = dead_reckoned(signal, (time_s[:1], true[:1], np.array([0.1])), ERRORS)
+    two = dead_reckoned(signal, (time_s[[0, -1]], true[[0, -1]], np.array([0.1, 0.1])), ERRORS)
+    assert one.sigma_m[0] == pytest.approx(0.1, rel=1e-3)
+    assert one.sigma_m[-1] > 0.6
+    assert two.sigma_m[-1] < 0.11
+    assert 0.2 < two.sigma_m.max() < 0.7 * one.sigma_m.max()
+
+
+def test_a_wild_fix_is_refused_and_many_at_once_count_as_one() -> None:
+    time_s, velocity = lawnmower()
+    signal = Signal(source="dvl", time_s=time_s, values=velocity)
+    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
+    places = true[[0, 200, 399]] + [[0, 0], [80, 0], [0, 0]]
+    track = dead_reckoned(signal, (time_s[[0, 200, 399]], places, np.full(3, 1.0)), ERRORS)
+    assert track.refused == 1
+    assert np.abs(track.ne - true).max() < 0.5
+    often = np.arange(0, 40)  # 20 s
+    many = dead_reckoned(signal, (time_s[often], true[often], np.full(40, 1.0)), ERRORS)
+    assert 0.9 < many.sigma_m[20] < 1.1
+
+
+def test_a_gap_breaks_the_track() -> None:
+    time_s, velocity = lawnmower()
+    time_s = np.where(time_s > 100, time_s + 60, time_s)
+    signal = Signal(source="dvl", time_s=time_s, values=velocity)
+    track = dead_reckoned(signal, (time_s[:1], np.zeros((1, 2)), np.ones(1)), ERRORS)
+    after = time_s > 150
+    assert np.isnan(track.sigma_m[after]).all()
+    assert np.isfinite(track.sigma_m[~after]).all()
+    both = dead_reckoned(
+        signal, (time_s[[0, -1]], np.array([[0, 0], [30.0, 9.0]]), np.ones(2)), ERRORS
+    )
+    assert np.isfinite(both.sigma_m).all()
+    np.testing.assert_allclose(both.ne[-1], [30, 9], atol=0.01)
+
+
+def dive_along(heading_deg: float, *, position: Signal | None = None) -> LoggedDive:
+    """Ahead at 0.5 m/s and rolled by 30 degrees, ten minutes; attitudes at another rate."""
+    time_s, slow_s = np.arange(0, 600, 0.25), np.arange(-1, 602, 0.4)
+    speed = np.tile([0.5, 0.0, 0.0], (len(time_s), 1))
+    angles = np.tile([30.0, 0.0, heading_deg], (len(slow_s), 1))
+    return LoggedDive(
+        kind="test", clock="test", dated=False, position=position,
+        velocity_body=Signal(source="/dvl", time_s=time_s, values=speed),
+        attitude=Signal(source="/imu", time_s=slow_s, values=angles),
+    )  # fmt: skip
+
+
+def test_a_dive_from_one_place_ends_where_its_speed_takes_it() -> None:
+    dive = with_dead_reckoning(dive_along(60.0), TrackErrors(), (43.0, 5.0, 2.0))
+    assert dive.position is not None
+    ends = np.column_stack([dive.position.values[[0, -1]], np.zeros(2)])
+    moved = np.diff(DATUM.ned_from_geodetic(ends), axis=0)[0, :2]
+    far = 0.5 * 599.75
+    np.testing.assert_allclose(moved, [0.5 * far, np.sqrt(0.75) * far], atol=2e-3)
+    sigma = dive.sigmas["sigma_horizontal_m"].values[:, 0]
+    grown = np.sqrt(sigma[-1] ** 2 - sigma[0] ** 2)
+    # scale 0.5 % along, heading 1 degree across, noise 0.02 sqrt(600 s): rms of both axes
+    along, across, noise = 0.005 * far, np.deg2rad(1.0) * far, 0.02 * np.sqrt(599.75)
+    assert grown == pytest.approx(np.sqrt(0.5 * (along**2 + across**2) + noise**2), rel=0.01)
+    assert any("dead reckoning" in note for note in dive.notes)
+
+
+def test_fixes_of_the_log_tie_it() -> None:
+    places = DATUM.geodetic_from_ned(np.array([[7.0, -3.0, 0.0]]))[:, :2]
+    fix = Signal(source="/gps", time_s=np.array([300.0]), values=places)
+    dive = with_dead_reckoning(dive_along(0.0, position=fix), TrackErrors(), None)
+    assert dive.position is not None
+    start = np.append(dive.position.values[0], 0.0)[None]
+    np.testing.assert_allclose(DATUM.ned_from_geodetic(start)[0, :2], [7 - 150, -3], atol=5e-3)
+
+
+@pytest.mark.parametrize("lacks", ["velocity_body", "attitude", "start"])
+def test_what_is_missing_is_named(lacks: str) -> None:
+    from dataclasses import replace
+
+    dive = dive_along(0.0)
+    if lacks != "start":
+        dive = replace(dive, **{lacks: None})
+    words = {"velocity_body": "velocity", "attitude": "attitude", "start": "--start-at"}[lacks]
+    with pytest.raises(NavigationError, match=words):
+        with_dead_reckoning(dive, TrackErrors(), None)
