@@ -24,6 +24,7 @@ app = typer.Typer()
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
         "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
+        "import-images --bag dive.mcap --every 0.5 --rig rig.json --navigation dive.csv -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
         "import-images photos --navigation dive.csv --vertical-datum NN2000 -w reef",
         "import-images phone cameras --recursive -w reef",
@@ -38,8 +39,10 @@ def import_images(
     left: Annotated[Path | None, typer.Option(help="Pictures of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="Pictures of the right camera.")] = None,
     camera: Annotated[
-        list[str] | None, typer.Option(help="NAME=FOLDER of a camera, for each of a rig.")
+        list[str] | None,
+        typer.Option(help="NAME=FOLDER of a camera, for each of a rig; of a bag NAME=TOPIC."),
     ] = None,
+    bag: Annotated[Path | None, typer.Option(help="ROS bag with pictures.")] = None,
     video: Annotated[
         list[Path] | None, typer.Option(help="Videos to take frames from, or a folder of them.")
     ] = None,
@@ -76,9 +79,11 @@ def import_images(
             "--left and --right go together; of one camera give the folder, or --camera NAME=FOLDER"
         )
     pair = {name: side for name, side in (("left", left), ("right", right)) if side is not None}
-    named = {name: Path(place) for name, place in places_of_cameras(camera or ()).items()}
+    named = places_of_cameras(camera or ())
+    folders_of = {} if bag is not None else {name: Path(place) for name, place in named.items()}
     found = work(
-        workspace, folders or [], cameras=pair | named, videos=video or (), overlap=overlap,
+        workspace, folders or [], cameras=pair | folders_of, bag=bag,
+        topics={} if bag is None else named, videos=video or (), overlap=overlap,
         every_s=every, recursive=recursive,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
         vertical_datum=vertical_datum, rig=rig, masks=masks, executor=executor_of(threads),

@@ -1,5 +1,6 @@
 """Real pictures into a workspace: checked, named, timed and placed; the stage `images/`."""
 
+import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,8 +23,10 @@ from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import read_rig, write_rig
 from missions.logs.navigation_csv import find_zone, read_navigation
+from reconstruct.pictures.bag_pictures import take_bag
 from reconstruct.pictures.files import VIDEO, PictureFolder, look_into
 from reconstruct.pictures.incoming import (
+    at_time,
     by_camera,
     check_entries,
     copy_all,
@@ -50,6 +53,8 @@ from reconstruct.pictures.video_frames import (
 from reconstruct.pictures.when_where import checked_level, placed
 
 _MONO = "camera"
+_SCRATCH = "bag"
+"""Folder for pictures of a bag until they are checked."""
 
 
 def import_images(
@@ -58,6 +63,8 @@ def import_images(
     *,
     cameras: Mapping[str, Path] = MappingProxyType({}),
     videos: Sequence[Path] = (),
+    bag: Path | None = None,
+    topics: Mapping[str, str] = MappingProxyType({}),
     overlap: float | None = None,
     every_s: float | None = None,
     recursive: bool = False,
@@ -87,8 +94,11 @@ def import_images(
             one moment are those of one place in the order of names or, where a camera lacks some,
             of one number in them.
         videos: to take frames from, or folders of them; chapters of a GoPro are one recording.
+        bag: a bag of ROS 1 or ROS 2 with pictures, which are paired by their times.
+        topics: of the bag's pictures, by camera; empty for those of one or of a left and a right.
         overlap: of neighbouring frames; None for 0.7 unless there is an interval.
-        every_s: seconds between frames, instead of an overlap.
+        every_s: seconds between frames of videos, instead of an overlap, or between moments of a
+            bag.
         recursive: take pictures of folders inside too.
         navigation: CSV with time and any of position, depth, attitude and altitude (see
             `read_navigation`).
@@ -112,8 +122,8 @@ def import_images(
     """
     videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in VIDEO)]
     folders = [folder for folder in folders if folder not in videos]
-    _check_sources(folders, cameras, videos)
-    frames = _frame_settings(overlap, every_s, videos)
+    _check_sources(folders, cameras, videos, bag)
+    frames = _frame_settings(overlap, every_s, videos, bag)
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
     zone = find_zone(time_zone)
@@ -122,7 +132,7 @@ def import_images(
         *folders,
         *cameras.values(),
         *videos,
-        *(p for p in (navigation, rig, masks) if p is not None),
+        *(p for p in (bag, navigation, rig, masks) if p is not None),
     ]
     for path in given:
         if not path.exists():
@@ -149,6 +159,7 @@ def import_images(
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),
+            **({} if bag is None else {"topics": dict(topics)}),
             **({} if set(cameras) in (set(), {"left", "right"}) else {"cameras": list(cameras)}),
             "every_s": frames.every_s,
             "overlap": frames.overlap if videos else None,
@@ -164,7 +175,7 @@ def import_images(
         inputs=[
             *files,
             *found_videos,
-            *(path for path in (navigation, rig, masks) if path is not None),
+            *(path for path in (bag, navigation, rig, masks) if path is not None),
         ],
     )
 
@@ -181,7 +192,14 @@ def import_images(
             for each in folders_read:
                 for line in each.warnings():
                     warn(line)
-            entries, left_out = find_entries(stations, executor)
+            taken_from_bag = None
+            if bag is not None:
+                taken_from_bag = take_bag(bag, topics, mono, partial / _SCRATCH, every_s)
+            entries, left_out = find_entries(
+                stations if taken_from_bag is None else taken_from_bag.stations, executor
+            )
+            if taken_from_bag is not None:
+                entries = [at_time(e, taken_from_bag.time_s[e.source]) for e in entries]
             if folders and known_rig is None:
                 entries = by_camera(entries, mono)
         check_entries(entries, known_rig)
@@ -189,6 +207,7 @@ def import_images(
         entries = [replace(e, mask=mask_of(e, masks, bool(cameras))) for e in entries]
         if not found_videos:
             notes += copy_all(entries, partial, executor)
+            shutil.rmtree(partial / _SCRATCH, ignore_errors=True)
         records = [record_of(entry, partial) for entry in entries]
         records, datum, level = placed(
             entries, records, log, logged_level, clock_offset_s, zone, notes
@@ -252,12 +271,15 @@ def _stations(sides: Mapping[str, Sequence[PictureFolder]]) -> list[Mapping[str,
 
 
 def _check_sources(
-    folders: Sequence[Path], cameras: Mapping[str, Path], videos: Sequence[Path]
+    folders: Sequence[Path],
+    cameras: Mapping[str, Path],
+    videos: Sequence[Path],
+    bag: Path | None,
 ) -> None:
-    if sum([bool(folders), bool(cameras), bool(videos)]) != 1:
+    if sum([bool(folders), bool(cameras), bool(videos), bag is not None]) != 1:
         raise ImageError(
             "give folders of pictures, or --left and --right, or --camera for each camera, or "
-            "--video: one of them"
+            "--video, or --bag: one of them"
         )
     every = [*folders, *cameras.values()]
     places = [folder.resolve() for folder in every]
@@ -267,9 +289,9 @@ def _check_sources(
 
 
 def _frame_settings(
-    overlap: float | None, every_s: float | None, videos: Sequence[Path]
+    overlap: float | None, every_s: float | None, videos: Sequence[Path], bag: Path | None
 ) -> FrameSettings:
-    if not videos and (overlap is not None or every_s is not None):
+    if not videos and (overlap is not None or (every_s is not None and bag is None)):
         raise ImageError("--overlap and --every choose frames of a video: give --video too")
     if overlap is not None and every_s is not None:
         raise ImageError("--overlap and --every exclude each other: give one of them")

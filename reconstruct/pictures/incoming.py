@@ -4,6 +4,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from alice_survey.base.errors import ImageError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
+from missions.logs.dive import DATED_AFTER_S
 from reconstruct.pictures.files import (
     PictureFacts,
     bits_used,
@@ -97,6 +99,14 @@ def same_bytes(paths: Sequence[Path]) -> dict[Path, Path]:
         if other != path:
             copies[path] = other
     return copies
+
+
+def at_time(entry: Incoming, time_s: float) -> Incoming:
+    """A picture with the time of its message: a date, or seconds of a clock without dates."""
+    if time_s < DATED_AFTER_S:
+        return replace(entry, video_time_s=time_s)
+    date = datetime.fromtimestamp(time_s, UTC)
+    return replace(entry, facts=replace(entry.facts, time_local=date))
 
 
 def by_camera(entries: Sequence[Incoming], name: str) -> list[Incoming]:
