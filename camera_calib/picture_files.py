@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.errors import ImageError, memory_shortage
@@ -26,6 +27,8 @@ PILLOW_FAULTS = (
 _YEARS = range(1970, 2200)
 """Years in which a digital camera can have taken a picture."""
 _EXIF, _DATE, _SUBSECOND, _OFFSET = 0x8769, 0x9003, 0x9291, 0x9011
+_ORIENTATION, _SHORT = 0x0112, 3
+_TIFF = (".tif", ".tiff")
 
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -72,8 +75,57 @@ def pixels_too_many(path: Path) -> int:
         return 0
 
 
+def without_orientation(data: bytes) -> bytes:
+    """A JPEG or TIFF whose tag of orientation says that pixels are to be shown as stored.
+
+    Everything else stays as it is, byte by byte; a file without that tag, or of another kind, too.
+    """
+    place = _place_of_orientation(data)
+    if place is None:
+        return data
+    at, order = place
+    return data[:at] + struct.pack(f"{order}H", 1) + data[at + 2 :]
+
+
+def _place_of_orientation(data: bytes) -> tuple[int, str] | None:
+    """Where the value of the tag stands, and in which order of bytes; None without it."""
+    start = 0
+    if data.startswith(b"\xff\xd8"):
+        found = _start_of_exif(data)
+        if found is None:
+            return None
+        start = found
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[start : start + 4])
+    if order is None or start + 8 > len(data):
+        return None
+    table = start + struct.unpack_from(f"{order}I", data, start + 4)[0]
+    if table + 2 > len(data):
+        return None
+    for entry in range(struct.unpack_from(f"{order}H", data, table)[0]):
+        at = table + 2 + 12 * entry
+        if at + 12 > len(data):
+            return None
+        if struct.unpack_from(f"{order}HHI", data, at) == (_ORIENTATION, _SHORT, 1):
+            return at + 8, order
+    return None
+
+
+def _start_of_exif(data: bytes) -> int | None:
+    """Where the tags of a JPEG's EXIF start, by its segments (ITU T.81, B.1.1)."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        size = struct.unpack_from(">H", data, at + 2)[0]
+        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
+            return at + 10
+        at += 2 + max(size, 2)
+    return None
+
+
 def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
     """A picture as OpenCV decodes it; None where it cannot, or of `pixels_too_many`.
+
+    OpenCV turns a TIFF, or fails on it, even where it is to ignore the orientation: so that tag is
+    taken off before.
 
     Raises:
         AliceError: there is no room for its pixels.
@@ -83,7 +135,13 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
     # OpenCV's own warnings would stand next to the line that the caller makes of it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
-        pixels: NDArray[Any] | None = cv2.imread(str(path), flags)
+        if path.suffix.lower() in _TIFF and flags & cv2.IMREAD_IGNORE_ORIENTATION:
+            data = without_orientation(path.read_bytes())
+            pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        else:
+            pixels = cv2.imread(str(path), flags)
+    except OSError:
+        return None
     except cv2.error as error:
         if error.code == cv2.Error.StsNoMem:
             raise memory_shortage(path) from None

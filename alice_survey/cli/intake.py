@@ -24,22 +24,36 @@ app = typer.Typer()
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
         "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
+        "import-images --bag dive.mcap --every 0.5 --rig rig.json --navigation dive.csv -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
         "import-images photos --navigation dive.csv --vertical-datum NN2000 -w reef",
-        "import-images --video GX010001.MP4 --every 0.5 -w reef",
+        "import-images phone cameras --recursive -w reef",
+        "import-images --video GX010042.MP4 --video GX020042.MP4 --overlap 0.7 -w reef",
+        "import-images --video CARD --navigation dive.csv --time-zone Europe/Oslo -w reef",
     ),
 )
 def import_images(
     folders: Annotated[
-        list[Path] | None, typer.Argument(metavar="DIR...", help="Folders of pictures.")
+        list[Path] | None, typer.Argument(metavar="DIR...", help="Folders of pictures; videos.")
     ] = None,
     left: Annotated[Path | None, typer.Option(help="Pictures of the left camera.")] = None,
     right: Annotated[Path | None, typer.Option(help="Pictures of the right camera.")] = None,
     camera: Annotated[
-        list[str] | None, typer.Option(help="NAME=FOLDER of a camera, for each of a rig.")
+        list[str] | None,
+        typer.Option(help="NAME=FOLDER of a camera, for each of a rig; of a bag NAME=TOPIC."),
     ] = None,
-    video: Annotated[Path | None, typer.Option(help="A video to take frames from.")] = None,
-    every: Annotated[float, typer.Option(min=0.01, help="Seconds between frames.")] = 1.0,
+    bag: Annotated[Path | None, typer.Option(help="ROS bag with pictures.")] = None,
+    video: Annotated[
+        list[Path] | None, typer.Option(help="Videos to take frames from, or a folder of them.")
+    ] = None,
+    overlap: Annotated[
+        float | None,
+        typer.Option(min=0.3, max=0.95, help="Of neighbouring frames; 0.7 without --every."),
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(min=0.01, help="Seconds between frames, at a fixed step.")
+    ] = None,
+    recursive: Annotated[bool, typer.Option(help="Also take folders inside.")] = False,
     navigation: Annotated[Path | None, typer.Option(help="CSV: time, position, ...")] = None,
     clock_offset: Annotated[float, typer.Option(help="Seconds to add to picture times.")] = 0.0,
     time_zone: Annotated[str, typer.Option(help="Of times that name none.")] = "UTC",
@@ -53,8 +67,8 @@ def import_images(
 ) -> None:
     """Bring in real pictures.
 
-    Pictures of one camera or of a rig of up to eight, or a video, with a navigation log, GPS from
-    EXIF, or nothing at all.
+    Pictures of one camera, of several or of a rig of up to eight, or videos, with a navigation log,
+    GPS from EXIF, or nothing at all.
     """
     from alice_survey.base.errors import ImageError
     from camera_calib.picture_files import places_of_cameras
@@ -65,9 +79,12 @@ def import_images(
             "--left and --right go together; of one camera give the folder, or --camera NAME=FOLDER"
         )
     pair = {name: side for name, side in (("left", left), ("right", right)) if side is not None}
-    named = {name: Path(place) for name, place in places_of_cameras(camera or ()).items()}
+    named = places_of_cameras(camera or ())
+    folders_of = {} if bag is not None else {name: Path(place) for name, place in named.items()}
     found = work(
-        workspace, folders or [], cameras=pair | named, video=video, every_s=every,
+        workspace, folders or [], cameras=pair | folders_of, bag=bag,
+        topics={} if bag is None else named, videos=video or (), overlap=overlap,
+        every_s=every, recursive=recursive,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
         vertical_datum=vertical_datum, rig=rig, masks=masks, executor=executor_of(threads),
     )  # fmt: skip

@@ -155,8 +155,9 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         NavigationError: it is missing, of no known format, or cannot be used.
     """
     from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
+    from missions.logs.bag_reader import is_bag
     from missions.logs.qgc_csv import read_qgc_csv
-    from missions.logs.ros_bag import is_bag, read_ros_bag
+    from missions.logs.ros_bag import read_ros_bag
     from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 
     if not path.exists():

@@ -1,5 +1,6 @@
 """Picture files as cameras write them: found, checked by decoding them whole, and copied."""
 
+import os
 import re
 import shutil
 import warnings
@@ -17,7 +18,14 @@ from numpy.typing import NDArray
 
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import ImageError
-from camera_calib.picture_files import PILLOW_FAULTS, exif_time, pixels_too_many, read_pixels
+from camera_calib.picture_files import (
+    PILLOW_FAULTS,
+    exif_time,
+    pixels_too_many,
+    read_pixels,
+    without_orientation,
+)
+from reconstruct.pictures.heic import HEIC, can_read_heic, stored_turns
 
 PLAIN = (".jpg", ".jpeg", ".png")
 TIFF = (".tif", ".tiff")
@@ -25,20 +33,23 @@ RAW = (
     ".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw",
     ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 )  # fmt: skip
-_HEIC = (".heic", ".heif", ".hif", ".avif")
-_VIDEO = (
+VIDEO = (
     ".360", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
     ".mts", ".webm", ".wmv",
 )  # fmt: skip
 IN_FOLDERS = "in folders inside"
-_ADVICE = {
-    "HEIC": "save them as JPEG first",
+ADVICE = {
+    "HEIC": "'pip install pillow-heif' makes them readable, or save them as JPEG",
     "video": "take its frames with --video, into a workspace of their own",
-    IN_FOLDERS: "give these folders too",
+    IN_FOLDERS: "take them with --recursive, or give these folders too",
     "other files": "their names are not those of pictures",
 }
 _NAMED = 3
 _GPS, _EXIF, _FOCAL_35 = 0x8825, 0x8769, 0xA405
+_MAKE, _MODEL, _SERIAL, _ORIENTATION = 0x010F, 0x0110, 0xA431, 0x0112
+_MIRRORED = (2, 4, 5, 7)
+"""EXIF orientations of mirror images, which no lens projects."""
+_LONGEST_DEVICE = 80
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +61,10 @@ class PictureFacts:
     height_px: int = 0
     highest: int = 255
     """Largest value of any pixel; above 255 in a picture of 16 bits."""
+    device: str = ""
+    """Make, model and serial number of the camera, as far as EXIF states them."""
+    orientation: int = 1
+    """As EXIF states it; pixels are used as they are stored."""
     time_local: datetime | None = None
     """Local time at which it was taken; with a zone if the camera wrote one."""
     latitude_deg: float | None = None
@@ -73,29 +88,33 @@ class PictureFolder:
     def warnings(self) -> list[str]:
         """A line for each reason: how many, such as which, and what to do."""
         return [
-            f"{self.folder}: {_named(reason, paths)} left out; {_ADVICE[reason]}"
+            f"{self.folder}: {_named(reason, paths)} left out; {ADVICE[reason]}"
             for reason, paths in self.left_out.items()
         ]
 
 
-def look_into(folder: Path, apart: Collection[Path] = ()) -> PictureFolder:
-    """List the pictures of a folder, not of folders inside, and what else is there.
+def look_into(
+    folder: Path, apart: Collection[Path] = (), *, recursive: bool = False
+) -> PictureFolder:
+    """List the pictures of a folder, and what else is there.
 
     Args:
         folder: to look into.
         apart: files and folders that the caller knows; they are not reported as left out.
+        recursive: list those of folders inside too, but not of folders in `apart`.
 
     Raises:
         ImageError: it is not a folder that can be read, or it holds no picture.
     """
     known = {path.resolve() for path in apart}
     try:
-        inside = sorted(folder.iterdir(), key=lambda p: (natural_key(p.name), p.name))
+        inside = _walked(folder, known) if recursive else list(folder.iterdir())
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
     inside = [p for p in inside if not p.name.startswith(".")]
+    inside.sort(key=lambda p: [(natural_key(part), part) for part in p.relative_to(folder).parts])
     files = [p for p in inside if not p.is_dir() and kind_of(p)]
-    stems = {p.stem for p in files}
+    stems = {p.with_suffix("") for p in files}
     masks = tuple(p for p in files if _is_mask(p, stems))
     pictures = tuple(p for p in files if p not in masks)
     left_out: dict[str, list[Path]] = {}
@@ -108,24 +127,29 @@ def look_into(folder: Path, apart: Collection[Path] = ()) -> PictureFolder:
                 left_out.setdefault(IN_FOLDERS, []).extend(deeper)
             continue
         suffix = path.suffix.lower()
-        reason = "HEIC" if suffix in _HEIC else "video" if suffix in _VIDEO else "other files"
+        reason = "HEIC" if suffix in HEIC else "video" if suffix in VIDEO else "other files"
         left_out.setdefault(reason, []).append(path)
     found = PictureFolder(
         folder=folder,
         pictures=pictures,
         masks=masks,
-        left_out={reason: tuple(left_out[reason]) for reason in _ADVICE if reason in left_out},
+        left_out={reason: tuple(left_out[reason]) for reason in ADVICE if reason in left_out},
     )
     if not pictures:
         held = [_named(reason, paths) for reason, paths in found.left_out.items()]
-        but = f", but {', '.join(held)}: {_ADVICE[next(iter(found.left_out))]}" if held else ""
+        but = f", but {', '.join(held)}: {ADVICE[next(iter(found.left_out))]}" if held else ""
         raise ImageError(f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW){but}")
     return found
 
 
 def kind_of(path: Path) -> str:
-    """`JPEG`, `PNG`, `TIFF` or `RAW` by the name of a file; empty for all others."""
+    """`JPEG`, `PNG`, `TIFF`, `RAW` or `HEIC` by the name of a file; empty for all others.
+
+    HEIC counts where the user has installed a decoder of it.
+    """
     kinds = {"PNG": (".png",), "JPEG": PLAIN, "TIFF": TIFF, "RAW": RAW}
+    if path.suffix.lower() in HEIC and can_read_heic():
+        return "HEIC"
     return next((kind for kind, names in kinds.items() if path.suffix.lower() in names), "")
 
 
@@ -144,8 +168,25 @@ def named(names: Sequence[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
-def _is_mask(path: Path, stems: set[str]) -> bool:
-    return path.stem.endswith("_mask") and path.stem[: -len("_mask")] in stems
+def _walked(folder: Path, apart: Collection[Path]) -> list[Path]:
+    """Files of a folder and of those inside, without hidden folders and those apart."""
+    found = []
+    for top, folders, names in os.walk(folder, onerror=_raise):
+        place = Path(top)
+        folders[:] = [
+            f for f in folders if not f.startswith(".") and (place / f).resolve() not in apart
+        ]
+        found += [place / name for name in names]
+    return found
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
+def _is_mask(path: Path, stems: set[Path]) -> bool:
+    name = path.stem
+    return name.endswith("_mask") and path.with_name(name.removesuffix("_mask")) in stems
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -171,7 +212,11 @@ def inspect(path: Path) -> PictureFacts:
     facts = PictureFacts(
         path=path, width_px=width, height_px=height, highest=int(pixels.max(initial=0))
     )
-    return _with_exif(facts)
+    facts = _with_exif(facts)
+    if facts.orientation in _MIRRORED:
+        fault = f"a mirror image by its EXIF orientation {facts.orientation}: save it as it is seen"
+        return replace(facts, fault=f"{fault}, without that tag")
+    return facts
 
 
 def decode(path: Path) -> NDArray[Any]:
@@ -181,8 +226,11 @@ def decode(path: Path) -> NDArray[Any]:
         ImageError: it cannot be decoded to its end.
     """
     suffix = path.suffix.lower()
+    heic = suffix in HEIC and can_read_heic()  # which makes Pillow know them
     if most := pixels_too_many(path):
         raise ImageError(f"states over {most / 1e6:.0f} million pixels: make it smaller")
+    if heic:
+        return _decode_heic(path)
     if suffix in RAW:
         return _develop(path)
     if suffix in PLAIN:
@@ -196,6 +244,13 @@ def decode(path: Path) -> NDArray[Any]:
     if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
         raise ImageError(f"has {pixels.shape[2]} channels; 1, 3 or 4 can be read")
     return np.ascontiguousarray(pixels[..., :3] if pixels.ndim == 3 else pixels)
+
+
+def _decode_heic(path: Path) -> NDArray[Any]:
+    """Pixels as the sensor saw them: decoders turn HEIC upright, and state by how much."""
+    with _pillow(path) as image:
+        rgb = np.asarray(image.convert("RGB"))
+        return np.ascontiguousarray(np.rot90(rgb, stored_turns(image.info))[..., ::-1])
 
 
 @contextmanager
@@ -237,15 +292,30 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
         with _pillow(facts.path) as image:
             exif = image.getexif()
             gps, time_local = exif.get_ifd(_GPS), exif_time(exif)
+            orientation = exif.get(_ORIENTATION, 1)
+            device = _device(exif)
     except ImageError:
         return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
     return replace(
         facts,
         time_local=time_local,
+        device=device,
+        orientation=orientation if orientation in range(1, 9) else 1,
         latitude_deg=_angle(gps, 2, 1, "S"),
         longitude_deg=_angle(gps, 4, 3, "W"),
         altitude_m=_altitude(gps),
     )
+
+
+def _device(exif: Any) -> str:
+    """Make, model and serial number; the make only where the model does not start with it."""
+    details = exif.get_ifd(_EXIF)
+    make, model, serial = (
+        "".join(c for c in str(value or "") if c.isprintable()).strip()[:_LONGEST_DEVICE]
+        for value in (exif.get(_MAKE), exif.get(_MODEL), details.get(_SERIAL))
+    )
+    words = [model if model.lower().startswith(make.lower()) else f"{make} {model}"]
+    return " ".join([*words, *([f"#{serial}"] if serial else [])]).strip()
 
 
 def _number(value: Any) -> float | None:
@@ -303,6 +373,8 @@ def bits_used(highest: int) -> int:
 def copy_picture(source: Path, target: Path, bits: int) -> None:
     """Import a picture: JPEG and PNG of 8 bits as they are, all else as PNG of 8 bits.
 
+    An EXIF orientation is taken off the copy, so that every program shows pixels as stored.
+
     Args:
         source: a file that `inspect` found whole.
         target: where it goes, with the suffix `target_suffix` gives.
@@ -310,8 +382,12 @@ def copy_picture(source: Path, target: Path, bits: int) -> None:
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     if source.suffix.lower() in PLAIN and target.suffix == source.suffix.lower() and bits == 8:
-        shutil.copyfile(source, target)
-        return
+        if _with_exif(PictureFacts(path=source)).orientation == 1:
+            shutil.copyfile(source, target)
+            return
+        if target.suffix != ".png":
+            target.write_bytes(without_orientation(source.read_bytes()))
+            return
     pixels = decode(source)
     if pixels.dtype == np.uint16:
         pixels = (pixels >> (bits - 8)).astype(np.uint8)

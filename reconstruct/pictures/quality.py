@@ -116,8 +116,7 @@ def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict
     Raises:
         ImageError: too little is left outside of the mask.
     """
-    full = float(np.iinfo(pixels.dtype).max)
-    eight = (pixels.astype(np.float32) * (255.0 / full)).round().astype(np.uint8)
+    eight = _in_eight_bits(pixels)
     grey = cv2.cvtColor(eight, cv2.COLOR_BGR2GRAY) if eight.ndim == 3 else eight
     use = np.full(grey.shape, True) if mask is None else mask
     blocks = np.asarray(_blocks_of(use).all(axis=(1, 3)))
@@ -125,26 +124,47 @@ def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict
         raise ImageError(
             f"no block of {_BLOCK_PX} px is free of the mask: nothing of it can be measured"
         )
-    ratio = even_light(eight)
-    noise = _noise(ratio, blocks)
-    fine = ratio - cv2.GaussianBlur(ratio, (0, 0), _FINE_PX)
-    band = cv2.GaussianBlur(ratio, (0, 0), _MID_PX) - cv2.GaussianBlur(ratio, (0, 0), _COARSE_PX)
-    fine_energy = float(np.median(_per_block(fine**2)[blocks])) - _fine_gain() * noise**2
-    band_energy = float(np.median(_per_block(band**2)[blocks]))
+    sharp, contrast = _detail(eight, blocks)
     level = grey.astype(np.float32) / 255.0
     mean = _per_block(level)[blocks]
     channels = eight.reshape(*grey.shape, -1)[use]
     smooth = cv2.GaussianBlur(level, (0, 0), _FINE_PX)  # the darkest pixel is otherwise noise
     darkest = _blocks_of(smooth).min(axis=(1, 3))[blocks]
     return {
-        "sharpness": math.sqrt(max(fine_energy, 0.0) / band_energy) if band_energy > 0 else 0.0,
-        "contrast": math.sqrt(band_energy),
+        "sharpness": sharp,
+        "contrast": contrast,
         "veil": float(np.median(darkest / np.maximum(mean, 1e-3))),
         "brightness": float(np.median(level[use])),
         "dark_share": float((channels.max(axis=1) <= 2).mean()),
         "bright_share": float((channels.max(axis=1) >= 254).mean()),
         "noise": _noise(level, blocks),
     }
+
+
+def sharpness(pixels: NDArray[Any]) -> float:
+    """The figure of `PictureQuality` of a picture, (H, W) or (H, W, 3) BGR, without a mask."""
+    eight = _in_eight_bits(pixels)
+    blocks = np.asarray(_blocks_of(np.full(eight.shape[:2], True)).all(axis=(1, 3)))
+    return _detail(eight, blocks)[0]
+
+
+def _in_eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    if pixels.dtype == np.uint8:
+        return pixels
+    full = float(np.iinfo(pixels.dtype).max)
+    return (pixels.astype(np.float32) * (255.0 / full)).round().astype(np.uint8)
+
+
+def _detail(eight: NDArray[np.uint8], blocks: NDArray[np.bool_]) -> tuple[float, float]:
+    """Sharpness and contrast of some blocks of a picture."""
+    ratio = even_light(eight)
+    noise = _noise(ratio, blocks)
+    fine = ratio - cv2.GaussianBlur(ratio, (0, 0), _FINE_PX)
+    band = cv2.GaussianBlur(ratio, (0, 0), _MID_PX) - cv2.GaussianBlur(ratio, (0, 0), _COARSE_PX)
+    fine_energy = float(np.median(_per_block(fine**2)[blocks])) - _fine_gain() * noise**2
+    band_energy = float(np.median(_per_block(band**2)[blocks]))
+    sharp = math.sqrt(max(fine_energy, 0.0) / band_energy) if band_energy > 0 else 0.0
+    return sharp, math.sqrt(band_energy)
 
 
 def _blocks_of(values: NDArray[Any]) -> NDArray[Any]:

@@ -176,6 +176,12 @@ def _own_pictures(folder: Path, made: Made) -> None:
     _few_features(folder)
 
 
+def _robots(folder: Path, made: Made) -> None:
+    files.robot_bag(made.reef, folder / "dive.bag", FEW, SMALL_PX)
+    shutil.copy(made.small_rig, folder / "rig.json")
+    _few_features(folder)
+
+
 def _no_navigation(folder: Path, made: Made) -> None:
     """The model that the page on real pictures made, without the length it was given."""
     shutil.copytree(made.after("real-pictures.md") / "dive", folder / "dive")
@@ -215,6 +221,7 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/own-camera.md": _own_camera,
     "how-to/own-pictures.md": _own_pictures,
     "how-to/own-vehicle.md": _own_vehicle,
+    "how-to/robots.md": _robots,
     "cameras.md": _cameras,
     "certificate.md": _certificate,
     "energy.md": _planned,

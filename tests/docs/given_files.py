@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.vehicle.files import vehicle_from_file
 from alice_survey.vehicle.log import write_vehicle_log
 from camera_calib.camera import Camera
@@ -295,6 +295,41 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
         writer.writerow(["time_utc", "height_m"])
         for hours, height_m in ((-1, 0.30), (0, 0.22), (1, 0.14)):
             writer.writerow([(SAID + timedelta(hours=hours)).isoformat(), height_m])
+
+
+def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) -> None:
+    """Write small pictures of some stations, and what a DVL, an IMU and a depth sensor said."""
+    rows = [
+        {name: float(value or "nan") for name, value in row.items()}
+        for row in rows_of(reef / "flight/navigation.csv")[::5]
+    ]
+    time_s = np.array([row["time_s"] for row in rows])
+    place = np.array(
+        [[row[n] for n in ("latitude_deg", "longitude_deg", "depth_m")] for row in rows]
+    )
+    speed = np.gradient(Datum(*place[0, :2]).ned_from_geodetic(place), time_s, axis=0)
+    bag = Bag(1)
+    for row, velocity in zip(rows, speed, strict=True):
+        stamp = round((SAID + timedelta(seconds=row["time_s"])).timestamp() * 1e9)
+        angles = (math.radians(row[n]) for n in ("roll_deg", "pitch_deg", "heading_deg"))
+        turn = rotation_from_attitude(*angles)
+        heard = math.isfinite(row["altitude_m"])
+        bag.add_dvl(
+            stamp, "/dvl/data", turn.inv().apply(velocity), row["altitude_m"] if heard else -1
+        )
+        bag.add_imu(stamp, "/imu", "imu", flipped_quaternion(turn.as_quat()))
+        bag.add_pressure(stamp, "/pressure", 101325.0 + 1025.0 * 9.80665 * row["depth_m"])
+    kind, wanted = "sensor_msgs/msg/CompressedImage", set(stations)
+    for row in rows_of(reef / "images/manifest.csv"):
+        if int(row["station"]) in wanted:
+            seen = shrunk(cv2.imread(str(reef / "images" / row["image"])), width_px)
+            stamp = round((SAID + timedelta(seconds=float(row["time_s"]))).timestamp() * 1e9)
+            data = cv2.imencode(".png", seen)[1].ravel()
+            picture = bag.make(
+                kind, header=bag.header(stamp, row["camera"]), format="png", data=data
+            )
+            bag.add(f"/camera/{row['camera']}/compressed", kind, stamp, picture)
+    bag.write(path)
 
 
 def manoeuvres(folder: Path) -> None:

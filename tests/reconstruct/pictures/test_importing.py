@@ -25,7 +25,7 @@ Draw = Callable[..., Path]
 
 @pytest.fixture
 def draw() -> Draw:
-    """Write a picture whose bytes depend on its number, with EXIF where a time is given."""
+    """Write a picture of bytes by its number and folder, with EXIF where a time is given."""
 
     def one(
         path: Path,
@@ -35,7 +35,8 @@ def draw() -> Draw:
         gps: tuple[float, float, float] | None = None,
     ) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.random.default_rng(number).integers(0, 256, (size[1], size[0], 3))
+        seed = [number, *path.parent.name.encode()]
+        pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3))
         image, exif = Image.fromarray(pixels.astype(np.uint8)), Image.Exif()
         if time is not None:
             exif.get_ifd(0x8769)[0x9003] = time
@@ -436,7 +437,8 @@ def test_names_stay_inside_and_apart(tmp_path: Path, draw: Draw) -> None:
     draw(tmp_path / "one" / "-x..jpg", 0)
     draw(tmp_path / "one" / "a b;c.jpg", 1)
     draw(tmp_path / "two" / "A b;c.JPG", 2)
-    (tmp_path / "two" / "link.jpg").symlink_to(tmp_path / "one" / "a b;c.jpg")
+    draw(tmp_path / "far" / "away.jpg", 3)
+    (tmp_path / "two" / "link.jpg").symlink_to(tmp_path / "far" / "away.jpg")
     (tmp_path / "two" / "folder.jpg").mkdir()
     import_images(tmp_path / "w", [tmp_path / "one", tmp_path / "two"])
     images = tmp_path / "w" / "images"
@@ -445,9 +447,8 @@ def test_names_stay_inside_and_apart(tmp_path: Path, draw: Draw) -> None:
         "camera/-x.jpg", "camera/a_b_c.jpg", "camera/A_b_c_2.jpg", "camera/link.jpg",
     ]  # fmt: skip
     assert not any(path.is_symlink() for path in images.rglob("*"))
-    assert (images / "camera" / "link.jpg").read_bytes() == (
-        tmp_path / "one" / "a b;c.jpg"
-    ).read_bytes()
+    linked = (images / "camera" / "link.jpg").read_bytes()
+    assert linked == (tmp_path / "far" / "away.jpg").read_bytes()
 
 
 def test_frames_of_a_video_are_taken_at_their_times(tmp_path: Path) -> None:
@@ -456,7 +457,7 @@ def test_frames_of_a_video_are_taken_at_their_times(tmp_path: Path) -> None:
     for frame in range(30):
         writer.write(np.full((48, 64, 3), 8 * frame, np.uint8))
     writer.release()
-    import_images(tmp_path / "w", [], video=path, every_s=0.5, clock_offset_s=100.0)
+    import_images(tmp_path / "w", [], videos=[path], every_s=0.5, clock_offset_s=100.0)
     images = tmp_path / "w" / "images"
     records = read_manifest(images / "manifest.csv")
     assert [r.time_s for r in records] == pytest.approx([100, 100.5, 101, 101.5, 102, 102.5])
@@ -494,14 +495,19 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
     faults: list[tuple[list[Path], dict[str, object], str]] = [
         ([tmp_path / "empty"], {}, "empty"),
         ([tmp_path / "one"], {}, "1"),
-        ([tmp_path / "sizes"], {}, "64 x 49 .* 64 x 48"),
+        ([], {"cameras": {"down": tmp_path / "sizes"}}, "64 x 49 .* 64 x 48"),
         ([tmp_path / "absent"], {}, "absent"),
         ([tmp_path / "nav.csv"], {}, "nav.csv"),
         ([], {}, "--left and --right"),
         ([three], {"cameras": {"left": three, "right": three}}, "--left and --right"),
         ([], {"cameras": {"left": three, "right": tmp_path / "one"}}, "3 of left .* 1 of right"),
-        ([], {"video": tmp_path / "no.mp4"}, "no.mp4"),
-        ([], {"video": tmp_path / "no.mp4", "every_s": 0.0}, "--every"),
+        ([], {"videos": [tmp_path / "no.mp4"]}, "no.mp4"),
+        ([], {"videos": [tmp_path / "no.mp4"], "every_s": 0.0}, "--every"),
+        ([], {"videos": [tmp_path / "no.mp4"], "every_s": 1.0, "overlap": 0.7}, "exclude"),
+        ([], {"videos": [tmp_path / "no.mp4"], "overlap": 1.0}, "--overlap 1.0"),
+        ([three], {"overlap": 0.7}, "--video too"),
+        ([], {"videos": [tmp_path / "no.mp4"] * 2}, "given twice"),
+        ([], {"videos": [three]}, "no videos"),
         ([three], {"navigation": nav}, "DateTimeOriginal"),
         ([three], {"time_zone": "Nowhere"}, "Nowhere"),
         ([three], {"clock_offset_s": float("nan")}, "--clock-offset"),

@@ -1,0 +1,202 @@
+"""What an MP4 says about itself next to its pictures: when it was made, and a camera's telemetry.
+
+Boxes as of ISO/IEC 14496-12; sizes and counts that a file states are bounded before they are used.
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.errors import ImageError
+
+_EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
+_YEARS = range(2000, 2200)
+"""Years in which a digital camera can have made a video."""
+_MOST_INDEX = 128 << 20
+"""Bytes of the index of a video: a day of it takes less."""
+_MOST_BOXES = 4096
+_MOST_SAMPLES = 1_000_000
+_MOST_PAYLOAD = 4 << 20
+"""Bytes of telemetry of one sample, which holds a second."""
+_MAKER = b"GoPro"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TelemetryTrack:
+    """Where the samples of the telemetry of a GoPro are in its file."""
+
+    offsets: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    """(N,) bytes."""
+    starts_s: NDArray[np.float64]
+    """(N + 1,) seconds from the start of the video; the last is where the last sample ends."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mp4Facts:
+    """What the index of an MP4 says."""
+
+    created: datetime | None = None
+    """As the container states it, in UTC; None where it states nothing that can be."""
+    is_gopro: bool = False
+    """Whether a GoPro made it, which writes its local time as if it were UTC."""
+    telemetry: TelemetryTrack | None = None
+
+
+def read_mp4(path: Path) -> Mp4Facts:
+    """The facts of an MP4 or MOV; of other files, and of damaged ones, nothing.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            index = _index(file)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        return _facts(index)
+    except (struct.error, ValueError, IndexError, OverflowError):
+        return Mp4Facts()  # OpenCV decides whether its pictures can be read all the same
+
+
+def payloads(path: Path, track: TelemetryTrack) -> Iterator[tuple[float, float, bytes]]:
+    """Start, end (seconds) and bytes of each sample of telemetry that the file holds.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            for i, (offset, size) in enumerate(zip(track.offsets, track.sizes, strict=True)):
+                if 0 < size <= _MOST_PAYLOAD and 0 <= offset < 1 << 62:
+                    file.seek(int(offset))
+                    yield float(track.starts_s[i]), float(track.starts_s[i + 1]), file.read(size)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _index(file: BinaryIO) -> bytes:
+    """Content of the box `moov`; empty where there is none."""
+    at = 0
+    for _ in range(_MOST_BOXES):
+        file.seek(at)
+        head = file.read(16)
+        if len(head) < 8:
+            return b""
+        size, kind = struct.unpack(">I4s", head[:8])
+        begin = at + 8
+        if size == 1 and len(head) == 16:
+            size, begin = struct.unpack(">Q", head[8:])[0], at + 16
+        if kind == b"moov":
+            file.seek(begin)
+            content = file.read(_MOST_INDEX if size == 0 else max(0, at + size - begin))
+            return content if len(content) < _MOST_INDEX else b""
+        if size < 8 or at + size > 1 << 62:
+            return b""
+        at += size
+    return b""
+
+
+def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Kinds and contents of the boxes that lie one after the other."""
+    at = 0
+    for _ in range(_MOST_BOXES):
+        if at + 8 > len(data):
+            return
+        size, kind = struct.unpack_from(">I4s", data, at)
+        head = 8
+        if size == 1:
+            size, head = struct.unpack_from(">Q", data, at + 8)[0], 16
+        if size == 0:
+            size = len(data) - at
+        if size < head or at + size > len(data):
+            return
+        yield kind, data[at + head : at + size]
+        at += size
+
+
+def _inside(data: bytes, *kinds: bytes) -> bytes:
+    """Content of the first box of a kind, in the first box of the kind before; else empty."""
+    for wanted in kinds:
+        data = next((content for kind, content in _boxes(data) if kind == wanted), b"")
+    return data
+
+
+def _facts(index: bytes) -> Mp4Facts:
+    tracks = [content for kind, content in _boxes(index) if kind == b"trak"]
+    names = [_inside(track, b"mdia", b"hdlr") for track in tracks]
+    telemetry = [t for t in tracks if _sample_format(t) == b"gpmd"]
+    return Mp4Facts(
+        created=_created(_inside(index, b"mvhd")),
+        is_gopro=bool(telemetry) or any(_MAKER in name for name in names),
+        telemetry=_telemetry(telemetry[0]) if telemetry else None,
+    )
+
+
+def _created(header: bytes) -> datetime | None:
+    if len(header) < 12:
+        return None
+    (seconds,) = struct.unpack_from(">Q" if header[0] == 1 else ">I", header, 4)
+    if seconds > 1 << 40:
+        return None
+    made = _EPOCH + timedelta(seconds=seconds)
+    return made if made.year in _YEARS else None
+
+
+def _sample_format(track: bytes) -> bytes:
+    return _inside(track, b"mdia", b"minf", b"stbl", b"stsd")[12:16]
+
+
+def _telemetry(track: bytes) -> TelemetryTrack | None:
+    header, table = _inside(track, b"mdia", b"mdhd"), _inside(track, b"mdia", b"minf", b"stbl")
+    (scale,) = struct.unpack_from(">I", header, 20 if header[0] == 1 else 12)
+    sizes = _sizes(_inside(table, b"stsz"))
+    offsets = _offsets(table, sizes)
+    count = min(len(sizes), len(offsets))
+    times = _rows(_inside(table, b"stts"), 4, 2)
+    if scale == 0 or count == 0 or times[:, 0].sum() > _MOST_SAMPLES:
+        return None
+    steps = np.repeat(times[:, 1], times[:, 0])[:count]
+    count = len(steps)
+    starts = np.concatenate([[0], np.cumsum(steps)]) / scale
+    return TelemetryTrack(offsets=offsets[:count], sizes=sizes[:count], starts_s=starts)
+
+
+def _sizes(box: bytes) -> NDArray[np.int64]:
+    same, count = struct.unpack_from(">II", box, 4)
+    if count > _MOST_SAMPLES:
+        return np.zeros(0, np.int64)
+    return np.full(count, same) if same else _rows(box, 8, 1)[:, 0]
+
+
+def _offsets(table: bytes, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where samples are: by chunks, in each of which some of them follow one another."""
+    narrow = _inside(table, b"stco")
+    wide = b"" if narrow else _inside(table, b"co64")
+    chunks = _rows(narrow, 4, 1)[:, 0] if narrow else _rows(wide, 4, 1, wide=True)[:, 0]
+    runs = _rows(_inside(table, b"stsc"), 4, 3)
+    found: list[int] = []
+    for chunk, offset in enumerate(chunks.tolist(), 1):
+        run = runs[runs[:, 0] <= chunk]
+        for _ in range(int(run[-1, 1]) if len(run) else 0):
+            if len(found) == len(sizes):
+                break
+            found.append(offset)
+            offset += int(sizes[len(found) - 1])
+    return np.array(found, np.int64)
+
+
+def _rows(box: bytes, at: int, columns: int, *, wide: bool = False) -> NDArray[np.int64]:
+    """(N, columns) numbers of a table, which follow their count at a place."""
+    (count,) = struct.unpack_from(">I", box, at)
+    kind = np.dtype(">u8" if wide else ">u4")
+    count = min(count, (len(box) - at - 4) // (columns * kind.itemsize), _MOST_SAMPLES)
+    flat = np.frombuffer(box, kind, count * columns, at + 4)
+    return flat.astype(np.int64).reshape(count, columns)
