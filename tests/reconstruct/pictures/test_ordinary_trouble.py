@@ -33,7 +33,8 @@ def smooth(seed: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
     """(H, W, 3) RGB that JPEG hardly changes, without symmetry."""
     rng = np.random.default_rng(seed)
     small = rng.uniform(30, 220, (4, 5, 3))
-    return cv2.resize(small, size, interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+    large = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
+    return np.clip(large, 0, 255).astype(np.uint8)
 
 
 def save(path: Path, pixels: np.ndarray, **tags: Any) -> Path:
