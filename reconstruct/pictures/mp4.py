@@ -99,8 +99,8 @@ def _index(file: BinaryIO) -> bytes:
             size, begin = struct.unpack(">Q", head[8:])[0], at + 16
         if kind == b"moov":
             file.seek(begin)
-            content = file.read(_MOST_INDEX if size == 0 else max(0, at + size - begin))
-            return content if len(content) < _MOST_INDEX else b""
+            long = (total if size == 0 else min(at + size, total)) - begin
+            return file.read(long) if 0 < long < _MOST_INDEX else b""
         if size < 8 or at + size > total:
             return b""
         at += size
