@@ -6,6 +6,7 @@ states is kept unless the pictures contradict it, and the full lens model is acc
 comes out sane.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,10 @@ def map_self_calibrated(
     model = largest(found, seen.images)
     notes: list[str] = []
     cam_from_rig = None
-    if len(seen.cameras) > 1:
+    stations = Counter(record.station for record in seen.images)
+    if len(seen.cameras) > 1 and max(stations.values()) == 1:
+        notes.append("cameras that took no pictures together: each calibrates itself")
+    elif len(seen.cameras) > 1:
         cam_from_rig = rig_from_model(model, seen.images, list(seen.cameras))
         if cam_from_rig is None:
             first, *others = seen.cameras

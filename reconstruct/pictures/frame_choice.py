@@ -28,9 +28,15 @@ _PATIENCE_S = 0.5
 """For how long a frame may be looked for that shows what was seen before."""
 _DARK = 12.0
 """Mean grey level below which a frame is black."""
-_CORNERS, _LEAST_CORNERS = 300, 20
-_LEAST_INLIERS, _INLIER_SHARE = 12, 0.4
-_INLIER_PX, _BACK_PX = 1.0, 0.5
+_CORNERS, _LEAST_CORNERS, _LEAST_TRACKED = 300, 20, 12
+_TRACKED_SHARE, _INLIER_SHARE = 0.25, 0.5
+"""Least share of corners that are tracked there and back, and of these that agree."""
+_BACK_PX = 0.5
+_INLIER_PX, _INLIER_OF_MOTION = 1.5, 0.25
+"""How far a corner may be from the common motion: relief moves near ground more than far."""
+_LEAST_LIKENESS = 0.3
+"""Correlation of two frames over each other: noise can be tracked too."""
+_DETAIL_PX = (2.0, 8.0)
 _LARGEST_ZOOM = 2.0
 """Change of size from one frame to the next beyond which their motion is not believed."""
 _CROP_PX = (640, 480)
@@ -217,18 +223,47 @@ def _similarity(before: Grey, after: Grey, corners: Array, shift: Array) -> Arra
     )
     away = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
     good = (seen.ravel() == 1) & (kept.ravel() == 1) & (away < _BACK_PX)
-    if good.sum() < _LEAST_INLIERS:
+    if good.sum() < max(_LEAST_TRACKED, _TRACKED_SHARE * len(corners)):
         return None
+    lengths = np.linalg.norm((there - corners)[good].reshape(-1, 2), axis=1)
+    near_px = max(_INLIER_PX, _INLIER_OF_MOTION * float(np.median(lengths)))
     found, inliers = cv2.estimateAffinePartial2D(
-        corners[good], there[good], method=cv2.RANSAC, ransacReprojThreshold=_INLIER_PX,
+        corners[good], there[good], method=cv2.RANSAC, ransacReprojThreshold=near_px,
         confidence=0.999,
     )  # fmt: skip
-    if found is None or inliers.sum() < max(_LEAST_INLIERS, _INLIER_SHARE * len(corners)):
+    if found is None or inliers.sum() < _INLIER_SHARE * good.sum():
         return None
     zoom = float(np.hypot(found[0, 0], found[1, 0]))
     if not 1.0 / _LARGEST_ZOOM < zoom < _LARGEST_ZOOM:
         return None
+    if likeness(before, after, found) < _LEAST_LIKENESS:
+        return None
     return np.vstack([found, [0.0, 0.0, 1.0]])
+
+
+def likeness(before: Grey, after: Grey, moved: Array) -> float:
+    """Correlation of the detail of two pictures where they overlap; near 0 for noise.
+
+    Args:
+        before: (H, W) grey.
+        after: of the same size.
+        moved: (2, 3) from the pixels of the one to those of the other.
+    """
+    size = (after.shape[1], after.shape[0])
+    there = cv2.warpAffine(_detail(before), moved, size)
+    inside = cv2.warpAffine(np.ones(before.shape, np.uint8), moved, size) > 0
+    if inside.sum() < _LEAST_TRACKED:
+        return 0.0
+    one, other = there[inside], _detail(after)[inside]
+    scale = float(np.sqrt(np.mean(one**2) * np.mean(other**2)))
+    return float(np.mean(one * other)) / scale if scale > 0 else 0.0
+
+
+def _detail(grey: Grey) -> NDArray[np.float32]:
+    """Detail of some pixels, without noise and uneven light."""
+    levels = grey.astype(np.float32)
+    fine, coarse = (cv2.GaussianBlur(levels, (0, 0), sigma) for sigma in _DETAIL_PX)
+    return np.asarray(fine - coarse, np.float32)
 
 
 def shared(moved: Array, size: tuple[int, int]) -> float:

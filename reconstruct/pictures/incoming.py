@@ -85,12 +85,12 @@ def find_entries(
 
 
 def same_bytes(paths: Sequence[Path]) -> dict[Path, Path]:
-    """Files that are copies, each with the first of the same bytes."""
+    """Files that are copies, each with the one of the shortest name of those of the same bytes."""
     sizes = {path: path.stat().st_size if path.is_file() else 0 for path in paths}
     often = Counter(sizes.values())
     first: dict[bytes, Path] = {}
     copies = {}
-    for path in paths:
+    for path in sorted(paths, key=lambda p: len(p.name)):
         if sizes[path] == 0 or often[sizes[path]] == 1:
             continue
         with path.open("rb") as file:

@@ -3,6 +3,7 @@
 Boxes as of ISO/IEC 14496-12; sizes and counts that a file states are bounded before they are used.
 """
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -74,8 +75,10 @@ def payloads(path: Path, track: TelemetryTrack) -> Iterator[tuple[float, float, 
     """
     try:
         with path.open("rb") as file:
+            total = rest = path.stat().st_size
             for i, (offset, size) in enumerate(zip(track.offsets, track.sizes, strict=True)):
-                if 0 < size <= _MOST_PAYLOAD and 0 <= offset < 1 << 62:
+                rest -= int(size)  # samples do not overlap
+                if 0 < size <= _MOST_PAYLOAD and 0 <= offset <= total - size and rest >= 0:
                     file.seek(int(offset))
                     yield float(track.starts_s[i]), float(track.starts_s[i + 1]), file.read(size)
     except OSError as error:
@@ -84,7 +87,7 @@ def payloads(path: Path, track: TelemetryTrack) -> Iterator[tuple[float, float, 
 
 def _index(file: BinaryIO) -> bytes:
     """Content of the box `moov`; empty where there is none."""
-    at = 0
+    at, total = 0, file.seek(0, os.SEEK_END)
     for _ in range(_MOST_BOXES):
         file.seek(at)
         head = file.read(16)
@@ -96,9 +99,9 @@ def _index(file: BinaryIO) -> bytes:
             size, begin = struct.unpack(">Q", head[8:])[0], at + 16
         if kind == b"moov":
             file.seek(begin)
-            content = file.read(_MOST_INDEX if size == 0 else max(0, at + size - begin))
-            return content if len(content) < _MOST_INDEX else b""
-        if size < 8 or at + size > 1 << 62:
+            long = (total if size == 0 else min(at + size, total)) - begin
+            return file.read(long) if 0 < long < _MOST_INDEX else b""
+        if size < 8 or at + size > total:
             return b""
         at += size
     return b""
@@ -144,7 +147,7 @@ def _created(header: bytes) -> datetime | None:
     if len(header) < 12:
         return None
     (seconds,) = struct.unpack_from(">Q" if header[0] == 1 else ">I", header, 4)
-    if seconds > 1 << 40:
+    if seconds > 1 << 34:
         return None
     made = _EPOCH + timedelta(seconds=seconds)
     return made if made.year in _YEARS else None
@@ -182,15 +185,14 @@ def _offsets(table: bytes, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     wide = b"" if narrow else _inside(table, b"co64")
     chunks = _rows(narrow, 4, 1)[:, 0] if narrow else _rows(wide, 4, 1, wide=True)[:, 0]
     runs = _rows(_inside(table, b"stsc"), 4, 3)
-    found: list[int] = []
-    for chunk, offset in enumerate(chunks.tolist(), 1):
-        run = runs[runs[:, 0] <= chunk]
-        for _ in range(int(run[-1, 1]) if len(run) else 0):
-            if len(found) == len(sizes):
-                break
-            found.append(offset)
-            offset += int(sizes[len(found) - 1])
-    return np.array(found, np.int64)
+    run = np.searchsorted(runs[:, 0], np.arange(1, len(chunks) + 1), side="right") - 1
+    held = np.where(run >= 0, runs[run, 1], 0) if len(runs) else np.zeros(len(chunks), np.int64)
+    first = np.concatenate([[0], np.cumsum(np.minimum(held, len(sizes)))])[:-1]
+    held = np.clip(len(sizes) - first, 0, held)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    in_chunk = starts[: held.sum()] - np.repeat(starts[np.minimum(first, len(sizes))], held)
+    found: NDArray[np.int64] = np.repeat(chunks, held) + in_chunk
+    return found
 
 
 def _rows(box: bytes, at: int, columns: int, *, wide: bool = False) -> NDArray[np.int64]:

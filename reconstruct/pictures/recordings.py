@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from alice_survey.base.errors import ImageError, warn
-from reconstruct.pictures.files import VIDEO, natural_key
+from reconstruct.pictures.files import VIDEO, natural_key, to_utc
 from reconstruct.pictures.gpmf import Fixes, read_fixes
 from reconstruct.pictures.mp4 import Mp4Facts, read_mp4
 
@@ -106,25 +106,15 @@ def read_recordings(paths: Sequence[Path], zone: tzinfo) -> list[Recording]:
     found = [_recording(family, sorted(group)) for (_, family, _), group in groups.items()]
     if len(found) == 1:
         return found
-    starts = [_to_utc(r.start, zone) for r in found if r.start is not None]
+    starts = [to_utc(r.start, zone) for r in found if r.start is not None]
     if len(starts) < len(found):
-        return [_placed(r, np.nan) for r in found]
+        return [replace(r, start_s=np.nan) for r in found]
     first = min(starts)
     placed = [
-        _placed(r, (start - first).total_seconds()) for r, start in zip(found, starts, strict=True)
+        replace(r, start_s=(start - first).total_seconds())
+        for r, start in zip(found, starts, strict=True)
     ]
     return sorted(placed, key=lambda r: r.start_s)
-
-
-def _placed(recording: Recording, start_s: float) -> Recording:
-    return Recording(
-        name=recording.name, files=recording.files, start=recording.start, clock=recording.clock,
-        start_s=start_s,
-    )  # fmt: skip
-
-
-def _to_utc(time: datetime, zone: tzinfo) -> datetime:
-    return (time.replace(tzinfo=zone) if time.tzinfo is None else time).astimezone(UTC)
 
 
 def _chapter_of(path: Path) -> tuple[str, int, int] | None:
@@ -159,12 +149,7 @@ def _recording(family: str, chapters: Sequence[tuple[int, Path]]) -> Recording:
     for chapter in range(first, last + 1):
         file = files.get(chapter)
         if file is not None:
-            placed.append(
-                VideoFile(
-                    path=file.path, width_px=file.width_px, height_px=file.height_px,
-                    duration_s=file.duration_s, facts=file.facts, fixes=file.fixes, start_s=start_s,
-                )
-            )  # fmt: skip
+            placed.append(replace(file, start_s=start_s))
         start_s += longest.duration_s if file is None else file.duration_s
     start, clock = _began(placed)
     return Recording(name=placed[0].path.stem, files=tuple(placed), start=start, clock=clock)

@@ -10,6 +10,7 @@ from functools import cache, cached_property
 from pathlib import Path
 
 from camera_calib.rig import read_rig, write_rig
+from tests.docs import given_divers
 from tests.docs import given_files as files
 from tests.docs.pages import DOCS, script_of
 
@@ -182,6 +183,12 @@ def _robots(folder: Path, made: Made) -> None:
     _few_features(folder)
 
 
+def _divers(folder: Path, made: Made) -> None:
+    given_divers.chapters(folder)
+    given_divers.card(folder / "card")
+    _few_features(folder)
+
+
 def _no_navigation(folder: Path, made: Made) -> None:
     """The model that the page on real pictures made, without the length it was given."""
     shutil.copytree(made.after("real-pictures.md") / "dive", folder / "dive")
@@ -217,6 +224,7 @@ def _reconstruction(folder: Path, made: Made) -> None:
 GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/big-survey.md": _big_survey,
     "how-to/colour-camera.md": _colour_camera,
+    "how-to/divers.md": _divers,
     "how-to/no-navigation.md": _no_navigation,
     "how-to/own-camera.md": _own_camera,
     "how-to/own-pictures.md": _own_pictures,

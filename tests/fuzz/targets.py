@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from tests.fuzz import areas, cameras, logs, workspace
+from tests.fuzz import areas, cameras, logs, videos, workspace
 from tests.fuzz.judge import Sandbox, Verdict, judge
 from tests.fuzz.target import Target
 
@@ -12,6 +12,7 @@ GROUPS: Mapping[str, tuple[Target, ...]] = {
     "logs": logs.TARGETS,
     "cameras": cameras.TARGETS,
     "workspace": workspace.TARGETS,
+    "videos": videos.TARGETS,
 }
 TARGETS: Mapping[str, Target] = {
     target.name: target for targets in GROUPS.values() for target in targets

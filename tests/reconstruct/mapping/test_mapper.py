@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.errors import ReconstructionError, heard
 from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
@@ -177,6 +177,35 @@ def test_self_calibration_finds_focal_length_distortion_and_rig(names: tuple[str
     assert mapped.model.compute_mean_reprojection_error() < 0.4
     for camera in mapped.model.cameras.values():
         assert camera.model_name == "PINHOLE"
+
+
+def test_cameras_that_took_no_pictures_together_calibrate_themselves() -> None:
+    """Two divers: every picture is a station of its own, and nobody has a rig."""
+    rng = np.random.default_rng(2)
+    truth = pycolmap.Camera(
+        model="OPENCV", width=800, height=600,
+        params=[760.0, 760.0, 400.0, 300.0, -0.08, 0.03, 0.0, 0.0],
+    )  # fmt: skip
+    names = ("left", "right")
+    scene = oblique_scene(truth, rng, names)
+    alone = [replace(record, station=i) for i, record in enumerate(scene.records)]
+    start = pycolmap.Camera(model="RADIAL", width=800, height=600, params=[960.0, 400, 300, 0, 0])
+    seen = Observations(
+        images=alone,
+        cameras={name: pycolmap.Camera(start.todict()) for name in names},
+        taken=scene.pixels,
+        pairs=scene.pairs,
+    )
+    with TemporaryDirectory() as folder, heard() as warnings:
+        mapped = map_self_calibrated(seen, (), Path(folder), 1)
+    assert warnings == [] and "each calibrates itself" in mapped.notes[0]
+    assert mapped.models[0] == len(alone) and set(mapped.warps) == set(names)
+    assert np.isnan(mapped.baseline)
+    for warp in mapped.warps.values():
+        assert warp.camera.fx_px == pytest.approx(760, rel=0.01)
+    found, true = pupils(mapped, scene)
+    fit = align_similarity(found, true)
+    assert np.sqrt((np.linalg.norm(fit.apply(found) - true, axis=1) ** 2).mean()) < 0.01
 
 
 def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequence[str]) -> Scene:

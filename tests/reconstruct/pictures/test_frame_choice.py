@@ -1,6 +1,7 @@
 """Frames of films whose motion is known: a window that moves over a textured floor."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,7 +54,7 @@ def chosen(frames: Sequence[Frame], overlap: float) -> tuple[list[int], FrameCou
     return [round(one.time_s * RATE_HZ) for one in taken], counts
 
 
-def overlaps(x_px: NDArray[np.float64], taken: Sequence[int]) -> NDArray[np.float64]:
+def overlaps(x_px: NDArray[Any], taken: Sequence[int]) -> NDArray[Any]:
     """Closed form: two frames a distance apart along x share the rest of the width."""
     return 1.0 - np.abs(np.diff(x_px[list(taken)])) / WIDTH
 

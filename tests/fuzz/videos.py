@@ -1,0 +1,63 @@
+"""Videos of cameras: the index of an MP4, telemetry in it, and tags of pictures."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from tests.fuzz.target import Target
+from tests.reconstruct.pictures import gopro
+
+_WHEN = datetime(2024, 7, 1, 12, tzinfo=UTC)
+_PLACES = [(60.0, 5.0, 1.0)] * 3
+
+
+def _film(folder: Path, payload: bytes) -> None:
+    """A short film of a GoPro."""
+    frames = [np.full((16, 16, 3), level, np.uint8) for level in range(3)]
+    gopro.film(folder / "GX010042.MP4", frames, 1.0, created=_WHEN, payloads=[payload] * 3)
+
+
+def read_video(path: Path) -> object:
+    """As `import-images` does next to the decoder of its frames."""
+    from reconstruct.pictures.gpmf import read_fixes
+    from reconstruct.pictures.mp4 import read_mp4
+
+    facts = read_mp4(path)
+    fixes = None if facts.telemetry is None else read_fixes(path, facts.telemetry)
+    return facts, fixes, None if fixes is None else (fixes.start_utc(), fixes.at(0.5))
+
+
+def _turned(folder: Path, name: str) -> None:
+    exif = Image.Exif()
+    exif[0x112] = 6
+    Image.new("RGB", (16, 16)).save(folder / name, exif=exif)
+
+
+def take_orientation_off(path: Path) -> object:
+    from camera_calib.picture_files import without_orientation
+
+    return without_orientation(path.read_bytes())
+
+
+TARGETS = (
+    Target(
+        name="MP4 with GPS5", syntax="binary", file="GX010042.MP4",
+        build=lambda folder: _film(folder, gopro.gps5(_PLACES, _WHEN)), read=read_video,
+        examples=60,
+    ),
+    Target(
+        name="MP4 with GPS9", syntax="binary", file="GX010042.MP4",
+        build=lambda folder: _film(folder, gopro.gps9(_PLACES, _WHEN)), read=read_video,
+        examples=60,
+    ),
+    Target(
+        name="JPEG with an orientation", syntax="binary", file="a.jpg",
+        build=lambda folder: _turned(folder, "a.jpg"), read=take_orientation_off,
+    ),
+    Target(
+        name="TIFF with an orientation", syntax="binary", file="a.tif",
+        build=lambda folder: _turned(folder, "a.tif"), read=take_orientation_off,
+    ),
+)  # fmt: skip

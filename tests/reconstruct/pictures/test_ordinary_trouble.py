@@ -1,0 +1,245 @@
+"""Folders as divers bring them: turned, mixed, doubled, nested, of phones."""
+
+import io
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageFile, JpegImagePlugin
+
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.errors import ImageError, heard
+from alice_survey.base.manifest import read_manifest
+from camera_calib.picture_files import without_orientation
+from reconstruct.pictures.files import decode, exif_focal_px, inspect
+from reconstruct.pictures.heic import can_read_heic
+from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.undistorted import read_colour
+
+DISPLAYED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda a: a, 2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud,
+    5: lambda a: a.swapaxes(0, 1), 6: lambda a: np.rot90(a, -1),
+    7: lambda a: np.rot90(a.swapaxes(0, 1), 2), 8: np.rot90,
+}  # fmt: skip
+"""What a viewer makes of stored pixels, by orientation (EXIF 2.32, 4.6.5.1.2)."""
+
+
+def smooth(seed: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
+    """(H, W, 3) RGB that JPEG hardly changes, without symmetry."""
+    rng = np.random.default_rng(seed)
+    small = rng.uniform(30, 220, (4, 5, 3))
+    large = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
+    return np.clip(large, 0, 255).astype(np.uint8)
+
+
+def save(path: Path, pixels: np.ndarray, **tags: Any) -> Path:
+    """Write a picture with `orientation`, `make`, `model`, `serial` in EXIF."""
+    exif = Image.Exif()
+    numbers = {"orientation": 0x112, "make": 0x10F, "model": 0x110}
+    for name, number in numbers.items():
+        if name in tags:
+            exif[number] = tags[name]
+    if "serial" in tags:
+        exif.get_ifd(0x8769)[0xA431] = tags["serial"]
+    exif.get_ifd(0x8769)[0xA405] = 28
+    path.parent.mkdir(parents=True, exist_ok=True)
+    more = {"quality": 98, "subsampling": 0} if path.suffix == ".jpg" else {}
+    Image.fromarray(pixels).save(path, exif=exif, **more)  # type: ignore[arg-type]
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_used_as_stored(tmp_path: Path, suffix: str, orientation: int) -> None:
+    """The same in features, calibration and mosaic, and in every viewer of the copies."""
+    stored = [smooth(seed) for seed in range(2)]
+    for number, pixels in enumerate(stored):
+        save(tmp_path / "in" / f"{number}{suffix}", pixels, orientation=orientation)
+    first = tmp_path / "in" / f"0{suffix}"
+    seen = cv2.imread(str(first), cv2.IMREAD_COLOR)
+    if suffix != ".tif":  # of which OpenCV cannot read all
+        assert np.abs(seen[..., ::-1].astype(int) - DISPLAYED[orientation](stored[0])).max() < 12
+    assert np.abs(decode(first)[..., ::-1].astype(int) - stored[0]).max() < 12
+    if orientation in (2, 4, 5, 7):
+        fault = inspect(first).fault
+        assert "mirror image" in fault and f"orientation {orientation}" in fault
+        with pytest.raises(ImageError, match="0 usable pictures"):
+            import_images(tmp_path / "w", [tmp_path / "in"])
+        return
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    images = tmp_path / "w" / "images"
+    for record, pixels in zip(read_manifest(images / "manifest.csv"), stored, strict=True):
+        copy = images / record.image
+        for read in (read_colour(copy), cv2.imread(str(copy), cv2.IMREAD_COLOR)):
+            assert read.shape == pixels.shape
+            assert np.abs(read[..., ::-1].astype(int) - pixels).max() < 12
+        if suffix == ".jpg":
+            assert exif_focal_px(copy, 64, 48) == pytest.approx(28 / 36 * 64)
+
+
+def test_taking_an_orientation_off_changes_two_bytes(tmp_path: Path) -> None:
+    for suffix in (".jpg", ".tif"):
+        turned = save(tmp_path / f"a{suffix}", smooth(1), orientation=6).read_bytes()
+        upright = without_orientation(turned)
+        changed = [i for i, (a, b) in enumerate(zip(turned, upright, strict=True)) if a != b]
+        assert len(upright) == len(turned) and len(changed) == 1
+        assert (turned[changed[0]], upright[changed[0]]) == (6, 1)
+    plain = save(tmp_path / "b.jpg", smooth(1)).read_bytes()
+    assert without_orientation(plain) == plain
+    assert without_orientation(turned[:20]) == turned[:20]
+
+
+def test_cameras_of_a_mixed_folder_are_told_apart_by_exif_and_size(tmp_path: Path) -> None:
+    phone = {"make": "Apple", "model": "iPhone 15"}
+    for number in range(6):
+        save(tmp_path / "in" / f"a{number}.jpg", smooth(number), make="GoPro", model="GoPro HERO9",
+             serial="C3", orientation=(1, 3)[number % 2])  # fmt: skip
+    for number in range(3):
+        save(tmp_path / "in" / f"b{number}.jpg", smooth(10 + number), make="GoPro",
+             model="GoPro HERO9", serial="C4")  # fmt: skip
+    for number in range(2):
+        save(tmp_path / "in" / f"c{number}.jpg", smooth(20 + number, (80, 60)), **phone)
+    save(tmp_path / "in" / "d.jpg", smooth(30))
+    found = import_images(tmp_path / "w", [tmp_path / "in"])
+    assert found.cameras == {"camera": 6, "camera-2": 3, "camera-3": 2, "camera-4": 1}
+    assert found.lines == [
+        "camera: 6 of 64 x 48 pixels, GoPro HERO9 #C3",
+        "camera-2: 3 of 64 x 48 pixels, GoPro HERO9 #C4",
+        "camera-3: 2 of 80 x 60 pixels, Apple iPhone 15",
+        "camera-4: 1 of 64 x 48 pixels",
+    ]
+    images = tmp_path / "w" / "images"
+    assert {(r.camera, r.image.split("/")[0]) for r in read_manifest(images / "manifest.csv")} == {
+        (name, name) for name in found.cameras
+    }
+    assert read_json(images / "survey.json")["notes"][-4:] == found.lines
+
+
+def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
+    for number in range(3):
+        path = save(tmp_path / "in" / f"{number}.png", smooth(number))
+    (tmp_path / "in" / "2 (1).png").write_bytes(path.read_bytes())
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "IMG_2.png").write_bytes(path.read_bytes())
+    with heard() as warnings:
+        found = import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "more"])
+    assert found.cameras == {"camera": 3} and found.left_out == {"copies of others": 2}
+    assert len(warnings) == 2 and "2 (1).png" in warnings[0] + warnings[1]
+    assert "left out: 2 copies of others" in found.lines[-1] and "IMG_2.png" in found.lines[-1]
+    (tmp_path / "other").mkdir()
+    for number, name in enumerate("abc"):
+        source = tmp_path / "in" / f"{number}.png"
+        (tmp_path / "other" / f"{name}.png").write_bytes(source.read_bytes())
+    cameras = {"left": tmp_path / "in", "right": tmp_path / "other"}
+    (tmp_path / "in" / "2 (1).png").unlink()
+    with pytest.raises(ImageError, match="left and right have the same picture"):
+        import_images(tmp_path / "v", [], cameras=cameras)
+
+
+def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
+    source = tmp_path / "card"
+    for number, name in enumerate(
+        ["100GOPRO/G2.jpg", "100GOPRO/G10.jpg", "101GOPRO/G2.jpg", "a.jpg"]
+    ):
+        save(source / name, smooth(number))
+    save(source / ".trash" / "x.jpg", smooth(8))
+    save(source / "masks" / "G10.png", np.full((48, 64), 255, np.uint8))
+    for name in ("100GOPRO/G2_mask.png", "101GOPRO/notes.txt"):
+        (source / name).write_bytes((source / "masks" / "G10.png").read_bytes())
+    with heard() as warnings:
+        import_images(tmp_path / "w", [source, source / "101GOPRO"])
+    assert any("--recursive" in line for line in warnings)
+    work = source / "work"
+    for _ in range(2):  # what it wrote itself is not taken
+        found = import_images(work, [source], recursive=True, masks=source / "masks")
+        records = read_manifest(work / "images" / "manifest.csv")
+        assert [r.image for r in records] == [
+            "camera/G2.jpg", "camera/G10.jpg", "camera/G2_2.jpg", "camera/a.jpg",
+        ]  # fmt: skip
+        assert found.left_out == {"other files": 1}
+    assert [bool(r.mask) for r in records] == [False, True, False, False]
+    import_images(tmp_path / "v", [source], recursive=True)
+    records = read_manifest(tmp_path / "v" / "images" / "manifest.csv")
+    assert [r.image for r in records if r.mask] == ["camera/G2.jpg"]
+
+
+class _FakeHeif(ImageFile.ImageFile):
+    """A JPEG behind a mark, which stands for what a decoder of HEIC would open."""
+
+    format, format_description = "HEIF", "as pillow-heif opens it"
+
+    def _open(self) -> None:
+        assert self.fp is not None
+        if self.fp.read(4) != b"HEIC":
+            raise SyntaxError("not a HEIC")
+        with JpegImagePlugin.JpegImageFile(io.BytesIO(self.fp.read())) as inside:
+            inside.load()
+            orientation = inside.getexif().get(0x112, 1)
+            turned = Image.fromarray(DISPLAYED[orientation](np.asarray(inside)))
+        self._mode, self._size = "RGB", turned.size
+        self.info["original_orientation"] = orientation
+        self.im, self.tile = turned.im, []
+
+
+@pytest.fixture
+def heif(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    module = ModuleType("pillow_heif")
+    module.register_heif_opener = (
+        lambda: Image.register_open(  # type: ignore[attr-defined]
+            "HEIF", _FakeHeif, lambda head: head[:4] == b"HEIC"
+        )
+    )
+    monkeypatch.setitem(sys.modules, "pillow_heif", module)
+    can_read_heic.cache_clear()
+    yield
+    can_read_heic.cache_clear()
+    Image.OPEN.pop("HEIF", None)
+    if "HEIF" in Image.ID:
+        Image.ID.remove("HEIF")
+
+
+def heic(folder: Path, name: str, seed: int, orientation: int) -> None:
+    jpeg = save(folder / "scratch.jpg", smooth(seed), orientation=orientation)
+    (folder / name).write_bytes(b"HEIC" + jpeg.read_bytes())
+    jpeg.unlink()
+
+
+def test_heic_is_read_with_the_users_decoder(tmp_path: Path, heif: None) -> None:
+    """Upright and sideways pictures of a phone are those of one sensor."""
+    turns = (1, 6, 8, 3)
+    for seed, orientation in enumerate(turns):
+        heic(tmp_path / "in", f"IMG_{seed}.HEIC", seed, orientation)
+    (tmp_path / "in" / "IMG_9.heic").write_bytes(b"HEIC, cut")
+    with heard() as warnings:
+        found = import_images(tmp_path / "w", [tmp_path / "in"])
+    assert found.kinds == {"HEIC": 4} and found.cameras == {"camera": 4}
+    assert found.left_out == {"cannot be decoded": 1}
+    assert len(warnings) == 1 and "IMG_9.heic" in warnings[0]
+    images = tmp_path / "w" / "images"
+    for seed, record in enumerate(read_manifest(images / "manifest.csv")):
+        assert record.image == f"camera/IMG_{seed}.png"
+        pixels = read_colour(images / record.image)[..., ::-1].astype(int)
+        assert np.abs(pixels - smooth(seed)).max() < 12
+
+
+def test_heic_without_a_decoder_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    can_read_heic.cache_clear()
+    try:
+        for seed in range(2):
+            save(tmp_path / "in" / f"{seed}.jpg", smooth(seed))
+            (tmp_path / "in" / f"IMG_{seed}.heic").write_bytes(b"x")
+        with heard() as warnings:
+            found = import_images(tmp_path / "w", [tmp_path / "in"])
+        assert found.left_out == {"HEIC": 2}
+        (line,) = warnings
+        assert "pip install pillow-heif" in line and "JPEG" in line
+    finally:
+        can_read_heic.cache_clear()
