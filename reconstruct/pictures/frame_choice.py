@@ -67,7 +67,7 @@ class FrameCounts:
 
 
 @dataclass(kw_only=True, eq=False)
-class _Candidate:
+class _SharpFrame:
     """A frame that may be taken."""
 
     frame: Frame
@@ -91,8 +91,8 @@ class OverlapChooser:
         self._small: Grey | None = None
         self._size = (0, 0)
         self._moved = np.eye(3)
-        self._best: _Candidate | None = None
-        self._before: _Candidate | None = None
+        self._best: _SharpFrame | None = None
+        self._before: _SharpFrame | None = None
         self._starting = True
         self._followed = 0
         self._start_s = self._last_s = 0.0
@@ -143,7 +143,7 @@ class OverlapChooser:
         self._starting, self._followed = True, 1
         self._start_s = self._last_s = frame.time_s
         self._before = None
-        self._best = _Candidate(frame=frame, sharpness=_sharpness(frame.pixels))
+        self._best = _SharpFrame(frame=frame, sharpness=_sharpness(frame.pixels))
 
     def _gone(self) -> float:
         """Share of the picture that the last taken frame does not show."""
@@ -157,7 +157,7 @@ class OverlapChooser:
         late = self._starting and frame.time_s - self._start_s > _START_S
         if gone > far or late:
             # With none in the window, the frame before it overlaps more: the picture moves fast.
-            chosen = self._best or self._before or _Candidate(frame=frame)
+            chosen = self._best or self._before or _SharpFrame(frame=frame)
             self._moved, self._best, self._before = chosen.moved, None, None
             self._starting = False
             yield chosen.frame
@@ -165,11 +165,11 @@ class OverlapChooser:
                 yield from self._weigh(frame)
             return
         if gone < near:
-            self._before = _Candidate(frame=frame)
+            self._before = _SharpFrame(frame=frame)
             return
         sharp = _sharpness(frame.pixels)
         if self._best is None or sharp > self._best.sharpness:
-            self._best = _Candidate(frame=frame, sharpness=sharp)
+            self._best = _SharpFrame(frame=frame, sharpness=sharp)
 
 
 def shrunk(pixels: NDArray[np.uint8]) -> Grey:

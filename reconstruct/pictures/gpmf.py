@@ -63,7 +63,7 @@ class Fixes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Item:
+class _KlvItem:
     """One key with its values."""
 
     key: bytes
@@ -102,7 +102,7 @@ def read_fixes(path: Path, track: TelemetryTrack) -> Fixes:
     )
 
 
-def _items(data: bytes) -> Iterator[_Item]:
+def _items(data: bytes) -> Iterator[_KlvItem]:
     """Keys that lie one after the other, each padded to 4 bytes."""
     at = 0
     for _ in range(_MOST_ITEMS):
@@ -112,13 +112,13 @@ def _items(data: bytes) -> Iterator[_Item]:
         end = at + 8 + size * repeat
         if key == b"\0\0\0\0" or end > len(data):
             return
-        yield _Item(
+        yield _KlvItem(
             key=key, kind=kind.decode("latin-1"), size=size, repeat=repeat, data=data[at + 8 : end]
         )
         at = end + -(size * repeat) % 4
 
 
-def _values(item: _Item, kinds: str = "") -> Array:
+def _values(item: _KlvItem, kinds: str = "") -> Array:
     """(repeat, N) numbers of an item; (0, 0) of a kind that holds none."""
     codes = "".join(_CODES.get(kind, "") for kind in kinds)
     if not codes and (code := _CODES.get(item.kind)):
@@ -128,7 +128,7 @@ def _values(item: _Item, kinds: str = "") -> Array:
     return np.array(list(struct.iter_unpack(f">{codes}", item.data)), dtype=np.float64)
 
 
-def _fixes_of(stream: list[_Item]) -> list[tuple[float, ...]]:
+def _fixes_of(stream: list[_KlvItem]) -> list[tuple[float, ...]]:
     """Latitude, longitude, altitude, seconds since 2000, fix and dilution of every sample."""
     said = {item.key: item for item in stream}
     newer = said.get(b"GPS9")
@@ -152,12 +152,12 @@ def _fixes_of(stream: list[_Item]) -> list[tuple[float, ...]]:
     ]
 
 
-def _first(item: _Item | None) -> float:
+def _first(item: _KlvItem | None) -> float:
     values = np.zeros(0) if item is None else _values(item).ravel()
     return float(values[0]) if values.size else math.nan
 
 
-def _utc_s(item: _Item | None) -> float:
+def _utc_s(item: _KlvItem | None) -> float:
     """Seconds since 2000 of a text such as 240701120000.000."""
     if item is None:
         return math.nan
