@@ -1,7 +1,7 @@
 """The place of a model in the world: by navigation, control points, a scale or the sea floor."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.uncertainty import Uncertainty
+from reconstruct.pictures.files import named
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.altitude_scale import scale_by_altitudes
 from reconstruct.placing.control import ControlFit, tie_control
@@ -30,6 +31,7 @@ from reconstruct.placing.control_file import (
     MARKERS_FILE,
     PICKS_FILE,
     Control,
+    Pick,
     read_control,
     read_picks,
 )
@@ -282,20 +284,38 @@ def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
     return f"no latitude and longitude: {measured} by navigation, {own} the model's own; no CRS"
 
 
-def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
-    """Find the known points in the pictures."""
-    if not (control.points or control.lengths):
-        return ControlFit(ties=(), bars=(), lost={})
-    files = [task.workspace / name for name in (PICKS_FILE, MARKERS_FILE)]
+def picks_of_model(workspace: Path, images: Collection[str]) -> list[Pick]:
+    """Picks in the pictures of a model; what else is picked is named.
+
+    Args:
+        workspace: with `picks.csv` and `markers.csv`, or without.
+        images: names of the pictures.
+
+    Raises:
+        WorkspaceError: a file is wrong, or nothing is picked in the model.
+    """
+    files = [workspace / name for name in (PICKS_FILE, MARKERS_FILE)]
     picks = [pick for path in files if path.is_file() for pick in read_picks(path)]
     if not picks:
         warn(
             f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}; "
             "'alice-survey control' finds markers and prepares picking"
         )
-    picked = {p.image for p in picks}
-    if picked and picked.isdisjoint(r.image for r in task.records):
-        raise WorkspaceError(f"no picture of the model is picked; {min(picked)} is not in it")
+    strange = sorted({pick.image for pick in picks} - set(images))
+    found = [pick for pick in picks if pick.image in images]
+    if strange:
+        like = f"not in the model, whose pictures have names such as {min(images)}"
+        if not found:
+            raise WorkspaceError(f"no picture of the model is picked; {strange[0]} is {like}")
+        warn(f"picks in {len(strange)} pictures are left out: {named(strange)}: {like}")
+    return found
+
+
+def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
+    """Find the known points in the pictures."""
+    if not (control.points or control.lengths):
+        return ControlFit(ties=(), bars=(), lost={})
+    picks = picks_of_model(task.workspace, {record.image for record in task.records})
     cameras = {
         record.image: RegisteredPicture(warp=task.warps[record.camera], model_from_pinhole=pose)
         for record, pose in zip(task.records, task.pinholes, strict=True)

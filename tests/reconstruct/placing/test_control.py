@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.errors import WorkspaceError, collected_by
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
@@ -18,6 +18,7 @@ from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.navigation_equations import body_from_pinhole
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.place import picks_of_model
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
 KNOWN = np.array(
@@ -282,6 +283,20 @@ def test_picks_count_from_the_middle_of_the_first_pixel(tmp_path: Path) -> None:
     path.write_text("image,point,x,y\na.png,p,10,\n")
     with pytest.raises(WorkspaceError, match="line 2"):
         read_picks(path)
+
+
+def test_picks_beyond_the_model_are_named(tmp_path: Path) -> None:
+    said: list[str] = []
+    with collected_by(lambda _, text: said.append(text)):
+        assert picks_of_model(tmp_path, {"camera/1.jpg"}) == []
+        assert "no point is picked" in said.pop()
+        (tmp_path / "picks.csv").write_text("image,point,x,y\n1.jpg,A,5,6\n")
+        with pytest.raises(WorkspaceError, match=r"1\.jpg is not in .* such as camera/1\.jpg"):
+            picks_of_model(tmp_path, {"camera/1.jpg"})
+        (tmp_path / "markers.csv").write_text("image,point,x,y\ncamera/1.jpg,7.0,1,2\n")
+        assert [p.point for p in picks_of_model(tmp_path, {"camera/1.jpg"})] == ["7.0"]
+        assert len(said) == 1
+        assert "picks in 1 pictures are left out: 1.jpg" in said[0]
 
 
 def test_control_points_straighten_a_bent_model(tmp_path: Path) -> None:
