@@ -120,6 +120,8 @@ def fuse_planes(
     grids = [layout.grid(cell) for layout in (level, *seen)]
     cells = max(grid.rows * grid.columns for grid in grids)
     edge = voxel_edge(cell, cells, _MOST_POINTS)
+    if (folder / PLANES).exists():  # of a run that was interrupted
+        shutil.rmtree(folder / PLANES)
     made = []
     for layout in (level, *(one for one in seen if not one.plane.is_level)):
         below = folder / PLANES / layout.plane.name
