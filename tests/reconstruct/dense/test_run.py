@@ -9,6 +9,7 @@ from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.executor import SERIAL, local_executor
 from alice_survey.stages import spec
+from reconstruct.dense import plane_rasters
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -157,6 +158,26 @@ def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_pat
     for path in sorted((workspace / "dense").iterdir()):
         if path.name != "stage.json":
             assert (other / "dense" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_an_interruption_while_a_plane_is_written_costs_nothing(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write_workspace(tmp_path, sparse_model(survey_views(), SCENE), SCENE)
+    with monkeypatch.context() as interrupted:
+
+        def stop(dem: Path, picture: Path) -> None:
+            assert dem.exists()
+            raise KeyboardInterrupt
+
+        interrupted.setattr(plane_rasters, "preview_dem", stop)
+        with pytest.raises(KeyboardInterrupt):
+            spec("dense").make(tmp_path, CONFIG, SERIAL)
+    assert (tmp_path / "dense.partial" / "planes").exists()
+    assert spec("dense").make(tmp_path, CONFIG, SERIAL)
+    for name in ("dem.tif", "sigma.tif", "cloud.ply"):
+        assert (tmp_path / "dense" / name).read_bytes() == (workspace / "dense" / name).read_bytes()
+    assert not (tmp_path / "dense" / "planes").exists()
 
 
 def test_pictures_without_texture_are_refused(tmp_path: Path):
