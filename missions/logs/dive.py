@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,10 +105,10 @@ class LoggedDive:
         return times
 
 
-def finite_number(value: object) -> float:
+def finite_number(value: Any) -> float:
     """A number of a log that may hold anything; NaN for what is none."""
     try:
-        number = float(value)  # type: ignore[arg-type]  # what is none raises
+        number = float(value)
     except (TypeError, ValueError, OverflowError):
         return math.nan
     return number if math.isfinite(number) and not isinstance(value, bool) else math.nan

@@ -117,7 +117,7 @@ def _cameras(
 def _messages(
     reader: "AnyReader", cameras: Mapping[str, str], label: str
 ) -> Iterator[tuple[str, int, str, Any]]:
-    """Camera, time (ns; 0 where the header has none), topic and message of every picture."""
+    """Camera, time (ns; of the recording where the header has none), topic and message of each."""
     connections = [c for c in reader.connections if c.topic in cameras]
     total = sum(c.msgcount for c in connections)
     for connection, recorded_ns, raw in progress(reader.messages(connections), label, total):
@@ -202,7 +202,8 @@ def pixels_of(message: Any) -> NDArray[Any]:
     if encoding in _YUV:
         packed = _table(message, rows, columns * 2, step, np.dtype(np.uint8))
         return np.asarray(cv2.cvtColor(packed.reshape(rows, columns, 2), _YUV[encoding]))
-    name, bits = encoding.rstrip("0123456789"), encoding[len(encoding.rstrip("0123456789")) :]
+    name = encoding.rstrip("0123456789")
+    bits = encoding.removeprefix(name)
     if name not in _PLAIN or bits not in ("8", "16"):
         raise ValueError(f"encoding {shown(message.encoding)!r} is not known")
     channels, code = _PLAIN[name]

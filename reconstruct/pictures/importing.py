@@ -192,14 +192,12 @@ def import_images(
             for each in folders_read:
                 for line in each.warnings():
                     warn(line)
-            taken_from_bag = None
-            if bag is not None:
-                taken_from_bag = take_bag(bag, topics, mono, partial / _SCRATCH, every_s)
-            entries, left_out = find_entries(
-                stations if taken_from_bag is None else taken_from_bag.stations, executor
-            )
-            if taken_from_bag is not None:
-                entries = [at_time(e, taken_from_bag.time_s[e.source]) for e in entries]
+            if bag is None:
+                entries, left_out = find_entries(stations, executor)
+            else:
+                found = take_bag(bag, topics, mono, partial / _SCRATCH, every_s)
+                entries, left_out = find_entries(found.stations, executor)
+                entries = [at_time(entry, found.time_s[entry.source]) for entry in entries]
             if folders and known_rig is None:
                 entries = by_camera(entries, mono)
         check_entries(entries, known_rig)

@@ -7,23 +7,21 @@ import numpy as np
 from alice_survey.base.errors import ImageError, warn
 from alice_survey.base.frames import Array
 
-WITHIN_SHARE = 0.25
+_WITHIN_SHARE = 0.25
 """Pictures this share of the shortest usual interval apart are of one moment: a dropped picture
 leaves a gap of a whole interval, and no trigger jitters by so much."""
 _WORST_SHARE = 0.1
 """Pairs that are further apart than this share of the interval are worth a warning."""
 
 
-def moments_of(times_s: Mapping[str, Array], within_s: float | None = None) -> list[dict[str, int]]:
+def moments_of(times_s: Mapping[str, Array]) -> list[dict[str, int]]:
     """Group pictures by their times.
 
     The earliest picture that is left opens a moment; of every other camera its next picture joins
-    it if it is near enough.
+    it if it is within a quarter of the shortest of the cameras' median intervals.
 
     Args:
         times_s: by camera (N,) increasing times on one clock.
-        within_s: how far apart the pictures of a moment are at most; None for a quarter of the
-            shortest of the cameras' median intervals.
 
     Returns:
         For each moment, in order, the index of the picture of each camera that has one.
@@ -35,8 +33,7 @@ def moments_of(times_s: Mapping[str, Array], within_s: float | None = None) -> l
         if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise ImageError(f"times of the pictures of {camera} do not increase")
     intervals = [float(np.median(np.diff(t))) for t in times_s.values() if len(t) > 1]
-    if within_s is None:
-        within_s = WITHIN_SHARE * min(intervals, default=0.0)
+    within_s = _WITHIN_SHARE * min(intervals, default=0.0)
     found = _groups(list(times_s), [np.asarray(t) for t in times_s.values()], within_s)
     if len(times_s) < 2:
         return found
@@ -80,5 +77,5 @@ def _say(
     if worst > _WORST_SHARE * interval_s:
         warn(
             f"pictures of one moment are {1e3 * worst:.3g} ms apart in the median, and pictures of "
-            f"one camera {1e3 * interval_s:.3g} ms: a rig takes them for taken at once"
+            f"one camera {1e3 * interval_s:.3g} ms: a rig counts them as taken at once"
         )

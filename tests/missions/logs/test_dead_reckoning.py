@@ -1,5 +1,7 @@
 """Dead reckoning against dense least squares over all unknowns, and against its own sigmas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -178,8 +180,6 @@ def test_fixes_of_the_log_tie_it() -> None:
 
 @pytest.mark.parametrize("lacks", ["velocity_body", "attitude", "start"])
 def test_what_is_missing_is_named(lacks: str) -> None:
-    from dataclasses import replace
-
     dive = dive_along(0.0)
     if lacks != "start":
         dive = replace(dive, **{lacks: None})
