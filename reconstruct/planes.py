@@ -223,13 +223,16 @@ def turned(model: SparseModel, plane: Plane) -> SparseModel:
         return model
     return replace(
         model,
-        frame=_frame(model.frame, plane),
+        frame=plane_frame(model.frame, plane),
         views=tuple(turned_view(view, plane) for view in model.views),
         points_world=plane.plane_from_world.apply(model.points_world),
     )
 
 
-def _frame(world: WorldFrame, plane: Plane) -> WorldFrame:
+def plane_frame(world: WorldFrame, plane: Plane) -> WorldFrame:
+    """The frame of a plane's rasters; the world's own of the level one."""
+    if plane.is_level:
+        return world
     axes = _axes(plane)
     tags = {"PLANE": plane.name, "PLANE_ABOUT": plane.about} | {
         f"PLANE_{name.upper()}": " ".join(repr(value) for value in axis)

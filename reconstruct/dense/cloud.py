@@ -1,4 +1,4 @@
-"""The coloured point cloud: points of all views, averaged in small cubes, as PLY and LAZ."""
+"""The coloured point cloud: the points of the surface, as PLY and LAZ."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,17 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
 from alice_survey.base.records import CloudRecord
-from reconstruct.dense.dem import bin_points
-from reconstruct.dense.points import Points
-from reconstruct.dense.surfaces import sorted_ranks
 from reconstruct.ply import VERTEX as MESH_VERTEX
 from reconstruct.ply import write_ply
-from reconstruct.raster import DemGrid, crs_of
+from reconstruct.raster import crs_of
 from reconstruct.views.model import WorldFrame
-
-Float32 = NDArray[np.float32]
 
 VERTEX = np.dtype([*MESH_VERTEX.descr, ("sigma", "<f4")])
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
@@ -35,90 +29,34 @@ _NO_DATE = date(2000, 1, 1)
 """Date in the header, the same bytes on every day."""
 
 
-@compiled
-def thin(
-    starts: NDArray[np.int64],
-    order: NDArray[np.int64],
-    enu: Float32,
-    normals: Float32,
-    colours: NDArray[np.uint8],
-    sigmas: Float32,
-    edge: float,
-) -> tuple[Float32, Float32]:
-    """Average the points of each cube, weighted by their certainty.
+def vertices_of(surface: NDArray[Any], cell: float, edge: float) -> NDArray[Any]:
+    """Points of a surface as vertices, averaged in cubes where these are larger than its cells.
+
+    Means of a cube are weighted by certainty. Its sigma is the weighted mean of those of its
+    points, which mostly come from the same few matches and share their errors.
 
     Args:
-        starts: (C + 1,) where the points of each column of cubes start in `order`.
-        order: (M,) point numbers sorted by column.
-        enu: (N, 3) east, north, up, by point number.
-        normals: (N, 3) unit vectors; points with NaN are left out.
-        colours: (N, 3) RGB.
-        sigmas: (N,) standard deviations.
-        edge: of the cubes; a column's cubes start at whole multiples of it.
+        surface: records of `SURFACE_POINT`.
+        cell: of the surface.
+        edge: of the cubes, which start at whole multiples of it.
 
     Returns:
-        (K, 9) means of position, normal (not of unit length) and colour, and (K,) standard
-        deviations, column by column from below. A standard deviation is the weighted mean of those
-        of the points, since points of one cube mostly come from the same few matches and share
-        their errors.
+        (M,) records of `VERTEX`.
     """
-    mean = np.empty((order.size, 9), np.float32)
-    sigma = np.empty(order.size, np.float32)
-    sums = np.zeros(9)
-    cubes = 0
-    for column in range(starts.size - 1):
-        inside = order[starts[column] : starts[column + 1]]
-        levels = np.empty(inside.size, np.int64)
-        for i in range(inside.size):
-            levels[i] = math.floor(enu[inside[i], 2] / edge)
-        ranks = sorted_ranks(levels)
-        first = 0
-        while first < ranks.size:
-            level = levels[ranks[first]]
-            sums[:] = 0.0
-            weights, deviation = 0.0, 0.0
-            while first < ranks.size and levels[ranks[first]] == level:
-                point = inside[ranks[first]]
-                first += 1
-                if math.isnan(normals[point, 0]):
-                    continue
-                w = 1.0 / (sigmas[point] * sigmas[point])
-                weights += w
-                deviation += w * sigmas[point]
-                for k in range(3):
-                    sums[k] += w * enu[point, k]
-                    sums[3 + k] += w * normals[point, k]
-                    sums[6 + k] += w * colours[point, k]
-            if weights > 0.0:
-                for k in range(9):
-                    mean[cubes, k] = sums[k] / weights
-                sigma[cubes] = deviation / weights
-                cubes += 1
-    return mean[:cubes], sigma[:cubes]
-
-
-def thinned_points(grid: DemGrid, points: Points) -> NDArray[Any]:
-    """One vertex for every cube over a grid's cells that holds points.
-
-    Args:
-        grid: columns of cubes; points outside of it are left out, and those without normal.
-        points: in the coordinates of the grid, which are those of the vertices.
-
-    Returns:
-        (M,) records of `VERTEX`, by rows from the north, columns from the west, and from below.
-    """
-    starts, order = bin_points(
-        points.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
-    )
-    mean, sigma = thin(
-        starts, order, points.enu, points.normals, points.colours, points.sigmas, grid.cell
-    )
-    vertices = np.empty(len(mean), VERTEX)
-    vertices["x"], vertices["y"], vertices["z"] = mean[:, :3].T
-    length = np.maximum(np.linalg.norm(mean[:, 3:6], axis=1), 1e-6)
-    vertices["nx"], vertices["ny"], vertices["nz"] = mean[:, 3:6].T / length
-    vertices["red"], vertices["green"], vertices["blue"] = np.rint(mean[:, 6:9]).T
-    vertices["sigma"] = sigma
+    sigma = np.hypot(surface["sigma"], surface["shared"])
+    values = np.column_stack([surface["enu"], surface["normal"], surface["colour"], sigma])
+    if edge > cell:
+        cubes = np.floor(surface["enu"] / np.float32(edge)).astype(np.int64)
+        _, cube = np.unique(cubes, axis=0, return_inverse=True)
+        weight = 1.0 / np.square(sigma.astype(np.float64))
+        sums = [np.bincount(cube.reshape(-1), weight * column) for column in values.T]
+        values = np.column_stack(sums) / np.bincount(cube.reshape(-1), weight)[:, None]
+    vertices = np.empty(len(values), VERTEX)
+    vertices["x"], vertices["y"], vertices["z"] = values[:, :3].T
+    length = np.maximum(np.linalg.norm(values[:, 3:6], axis=1), 1e-6)
+    vertices["nx"], vertices["ny"], vertices["nz"] = values[:, 3:6].T / length
+    vertices["red"], vertices["green"], vertices["blue"] = np.rint(values[:, 6:9]).T
+    vertices["sigma"] = values[:, 9]
     return vertices
 
 

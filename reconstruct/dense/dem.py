@@ -1,34 +1,37 @@
-"""The digital elevation model: one robust height per cell, positive up, with sigma and count."""
+"""The digital elevation model: a surface projected on a grid, heights up, with their sigmas."""
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense.points import Points
-from reconstruct.dense.surfaces import sorted_ranks, surfaces_of
+from alice_survey.base.frames import Array
+from reconstruct.dense.points import EDGE_ON
+from reconstruct.dense.surfaces import sorted_ranks
 from reconstruct.raster import DemGrid
 
 Float32 = NDArray[np.float32]
 
-_GATE = 3.0
-_STEEPEST = np.float32(1e-3)
-"""Third part of a unit normal below which a surface counts as upright."""
 FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
-STRAY_CELLS = 8
-"""Reach of the square around a cell in which others must be known."""
-_LEAST_COMPANY = 0.22
-"""Share of that square that must be known; what is more isolated is mostly wrong."""
+_STEP = 2.0
+"""Slope from which two cells have a step between them."""
+_LEAST_WEIGHT = 1e-3
+_WALL_CELLS = 0.25
+"""A wall empties cells that it is nearer to than this, along both axes."""
+_LEAST_SHARE = 0.25
+"""Sum of the shares of points from which a cell's height is more than a guess at its rim."""
+_APART_SIGMAS = 5.0
+_DIAGONAL = math.sqrt(2.0)
+_LEAST_STATIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FusedCells:
-    """What points show of the cells of a grid, (rows, columns) each."""
+    """What a surface shows in the cells of a grid, (rows, columns) each."""
 
     height: Float32
     """Height of the uppermost surface; NaN in empty cells."""
@@ -42,112 +45,100 @@ class FusedCells:
     lower: Float32
     """Height of the lowest of several surfaces; NaN where there is one."""
 
-    def without(self, cells: NDArray[np.bool_]) -> "FusedCells":
-        """The same with some cells emptied."""
-        nan, none = np.float32(np.nan), np.uint8(0)
-        return FusedCells(
-            height=np.where(cells, nan, self.height),
-            sigma=np.where(cells, nan, self.sigma),
-            count=np.where(cells, np.uint16(0), self.count),
-            stations=np.where(cells, none, self.stations),
-            surfaces=np.where(cells, none, self.surfaces),
-            lower=np.where(cells, nan, self.lower),
-        )
 
+def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
+    """Project a surface onto a grid.
 
-def fuse_points(grid: DemGrid, points: Points, stations: NDArray[np.int64]) -> FusedCells:
-    """Give each cell of a grid one height from the points that fall in it, and what lies below.
-
-    Points whose normal is known to look down do not count.
+    A point's tangent plane gives the height in the middle of a cell; of points around it each
+    counts with the share of a bilinear interpolation. Surfaces that the grid's viewer sees from
+    behind do not count. A cell in which one stands that is seen edge-on has no one height and is
+    left empty.
 
     Args:
-        grid: cells, of which points outside are ignored, in the coordinates of the points.
-        points: of all views that see the grid.
-        stations: (V,) of every view, by its number.
+        grid: cells, in the coordinates of the points.
+        surface: records of `SURFACE_POINT`, in any order.
     """
-    facing = points.part(~(points.normals[:, 2] < 0.0))  # NaN compares as False
-    starts, order = bin_points(
-        facing.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
-    )
-    up = np.maximum(facing.normals[order, 2], _STEEPEST)
-    steepness = np.sqrt(np.maximum(1.0 - up * up, 0.0)) / up
-    height, sigma, count, met, surfaces, lower = fuse_cells(
-        starts, facing.enu[order, 2], facing.sigmas[order], facing.views[order], stations,
-        steepness, grid.cell, _GATE,
+    column = (surface["enu"][:, 0].astype(np.float64) - grid.west) / grid.cell - 0.5
+    row = (grid.north - surface["enu"][:, 1].astype(np.float64)) / grid.cell - 0.5
+    facing = surface["normal"][:, 2] >= EDGE_ON
+    upright = np.abs(surface["normal"][:, 2]) < EDGE_ON
+    walls = np.zeros((grid.rows, grid.columns), np.bool_)
+    for down in (-_WALL_CELLS, _WALL_CELLS):
+        for right in (-_WALL_CELLS, _WALL_CELLS):
+            r, c = np.rint(row[upright] + down), np.rint(column[upright] + right)
+            inside = (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
+            walls[r[inside].astype(np.int64), c[inside].astype(np.int64)] = True
+    surface, row, column = surface[facing], row[facing], column[facing]
+    owner, point, weight = [], [], []
+    for down in (0, 1):
+        for right in (0, 1):
+            r, c = np.floor(row) + down, np.floor(column) + right
+            w = (1.0 - np.abs(row - r)) * (1.0 - np.abs(column - c))
+            taken = (w > _LEAST_WEIGHT) & (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
+            owner.append((r * grid.columns + c)[taken].astype(np.int64))
+            point.append(np.flatnonzero(taken))
+            weight.append(w[taken])
+    cells, points, weights = (np.concatenate(parts) for parts in (owner, point, weight))
+    order = np.argsort(cells, kind="stable")
+    order = order[~walls.reshape(-1)[cells[order]]]
+    starts = np.searchsorted(cells[order], np.arange(grid.rows * grid.columns + 1))
+    height, sigma, count, stations, surfaces, lower = project_cells(
+        starts, points[order], weights[order], surface["enu"], surface["normal"],
+        surface["sigma"], surface["shared"], surface["views"], surface["stations"],
+        grid.west, grid.north, grid.cell, grid.columns,
     )  # fmt: skip
     shape = (grid.rows, grid.columns)
     return FusedCells(
         height=height.reshape(shape),
         sigma=sigma.reshape(shape),
         count=count.reshape(shape),
-        stations=met.reshape(shape),
+        stations=stations.reshape(shape),
         surfaces=surfaces.reshape(shape),
         lower=lower.reshape(shape),
     )
 
 
 @compiled
-def bin_points(
-    points_enu: Float32, north: float, west: float, cell: float, rows: int, columns: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort points by the cell they fall in, keeping their order within each.
+def project_cells(
+    starts: NDArray[np.int64],
+    points: NDArray[np.int64],
+    weights: Array,
+    enu: Float32,
+    normals: Float32,
+    sigmas: Float32,
+    shared: Float32,
+    views: NDArray[np.uint16],
+    stations: NDArray[np.uint8],
+    west: float,
+    north: float,
+    cell: float,
+    columns: int,
+) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8], Float32]:
+    """Height of each cell's uppermost surface, and of its lowest where it has several.
+
+    Heights of one surface differ by no more than noise and slope explain: five standard deviations
+    and what the steeper of two neighbours gains over a cell's diagonal, and a cell's side. What one
+    station sees is no surface beside those that more see: it may be one wrong match.
 
     Args:
-        points_enu: (N, 3), of which those outside of the grid are left out.
-        north: north coordinate of the outer edge of the first row.
-        west: east coordinate of the outer edge of the first column.
+        starts: (C + 1,) where the entries of each cell start.
+        points: (E,) point numbers.
+        weights: (E,) of the points in the cells.
+        enu: (N, 3) points.
+        normals: (N, 3) unit vectors with a positive third part.
+        sigmas: (N,) along the normals.
+        shared: (N,) what all points around share of their errors.
+        views: (N,) views that a point rests on.
+        stations: (N,) stations that a point rests on.
+        west: of the grid.
+        north: of the grid.
         cell: side of a cell.
-        rows: of the grid.
         columns: of the grid.
 
     Returns:
-        (rows * columns + 1,) where the points of each cell start, and point numbers in that order.
-    """
-    starts = np.zeros(rows * columns + 1, np.int64)
-    for i in range(len(points_enu)):
-        row = math.floor((north - points_enu[i, 1]) / cell)
-        column = math.floor((points_enu[i, 0] - west) / cell)
-        if 0 <= row < rows and 0 <= column < columns:
-            starts[row * columns + column + 1] += 1
-    for k in range(rows * columns):
-        starts[k + 1] += starts[k]
-    order = np.empty(starts[-1], np.int64)
-    place = starts[:-1].copy()
-    for i in range(len(points_enu)):
-        row = math.floor((north - points_enu[i, 1]) / cell)
-        column = math.floor((points_enu[i, 0] - west) / cell)
-        if 0 <= row < rows and 0 <= column < columns:
-            order[place[row * columns + column]] = i
-            place[row * columns + column] += 1
-    return starts, order
-
-
-@compiled
-def fuse_cells(
-    starts: NDArray[np.int64],
-    heights: Float32,
-    sigmas: Float32,
-    views: NDArray[np.int32],
-    stations: NDArray[np.int64],
-    steepness: Float32,
-    cell: float,
-    gate: float,
-) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8], Float32]:
-    """Robust height of each cell's uppermost surface, and of its lowest where it has several.
-
-    Args:
-        starts: (C + 1,) where the points of each cell start.
-        heights: (N,) sorted by cell, then by view.
-        sigmas: (N,) of the heights.
-        views: (N,) of the heights.
-        stations: (V,) of every view, by its number.
-        steepness: (N,) tangent of the angle between normal and vertical; NaN where unknown.
-        cell: side of a cell.
-        gate: in standard deviations.
-
-    Returns:
-        (C,) height and sigma, NaN in empty cells; number of views and of stations used (255 stands
-        for more); number of surfaces, and height of the lowest, NaN where there is one surface.
+        (C,) height and standard deviation, NaN in empty cells; views and stations that the point
+        of most weight rests on; number of surfaces, and height of the lowest, NaN where there is
+        one.
     """
     cells = starts.size - 1
     height = np.full(cells, np.nan, np.float32)
@@ -158,111 +149,80 @@ def fuse_cells(
     lowest = np.full(cells, np.nan, np.float32)
     for n in range(cells):
         first, last = starts[n], starts[n + 1]
-        if first == last:
+        size = last - first
+        if size == 0:
             continue
-        values, spreads, seen_by = heights[first:last], sigmas[first:last], views[first:last]
-        found, of_point = surfaces_of(
-            values, spreads, stations[seen_by], steepness[first:last], cell
-        )
+        east = west + (n % columns + 0.5) * cell
+        northing = north - (n // columns + 0.5) * cell
+        heights, spreads, steep = np.empty(size), np.empty(size), np.empty(size)
+        for k in range(size):
+            i = points[first + k]
+            up = normals[i, 2]
+            lift = (enu[i, 0] - east) * normals[i, 0] + (enu[i, 1] - northing) * normals[i, 1]
+            heights[k] = enu[i, 2] + lift / up
+            spreads[k] = sigmas[i] / up
+            steep[k] = math.sqrt(max(1.0 - up * up, 0.0)) / up
+        ranks = sorted_ranks(heights)[::-1]
+        most = 0
+        for k in range(size):
+            most = max(most, stations[points[first + k]])
+        start, found = 0, 0
+        while start < size:
+            end = start + 1
+            while end < size:
+                a, b = ranks[end - 1], ranks[end]
+                gap = _APART_SIGMAS * math.hypot(spreads[a], spreads[b])
+                gap += cell * (1.0 + _DIAGONAL * max(steep[a], steep[b]))
+                if heights[a] - heights[b] > gap:
+                    break
+                end += 1
+            total, mean, square, noise, common = 0.0, 0.0, 0.0, 0.0, 0.0
+            heaviest, seen, share = ranks[start], 0, 0.0
+            for k in range(start, end):
+                member = ranks[k]
+                i = points[first + member]
+                # the nearer a point's normal to the vertical the better its height is known
+                w = weights[first + member] / (spreads[member] * spreads[member])
+                total += w
+                mean += w * heights[member]
+                square += w * heights[member] ** 2
+                noise += w * spreads[member]
+                common += w * shared[i] / normals[i, 2]
+                seen = max(seen, stations[i])
+                share += weights[first + member]
+                if weights[first + member] > weights[first + heaviest]:
+                    heaviest = member
+            start = end
+            if share < _LEAST_SHARE or seen < min(most, _LEAST_STATIONS):
+                continue
+            mean /= total
+            if found == 0:
+                scatter = max(square / total - mean * mean, 0.0)
+                height[n] = mean
+                sigma[n] = math.sqrt((noise / total) ** 2 + scatter + (common / total) ** 2)
+                count[n] = views[points[first + heaviest]]
+                met[n] = stations[points[first + heaviest]]
+            else:
+                lowest[n] = mean
+            found += 1
         surfaces[n] = min(found, 255)
-        if found > 1:
-            floor = of_point == found - 1
-            lowest[n] = robust_height(
-                values[floor], spreads[floor], seen_by[floor], stations, gate
-            )[0]
-            top = of_point == 0
-            values, spreads, seen_by = values[top], spreads[top], seen_by[top]
-        height[n], sigma[n], count[n], met[n] = robust_height(
-            values, spreads, seen_by, stations, gate
-        )
     return height, sigma, count, met, surfaces, lowest
 
 
 @compiled
-def robust_height(
-    heights: Float32,
-    sigmas: Float32,
-    views: NDArray[np.int32],
-    stations: NDArray[np.int64],
-    gate: float,
-) -> tuple[float, float, int, int]:
-    """Robust height of some points: the weighted mean of what lies near the median.
-
-    The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
-    median's own sigma. The standard deviation adds the formal one of independent views to the
-    scatter over the square root of the number of views: pixels of one view share their errors.
-
-    Args:
-        heights: (N,) sorted by view, one or more.
-        sigmas: (N,) of the heights.
-        views: (N,) of the heights.
-        stations: (V,) of every view, by its number.
-        gate: in standard deviations.
-
-    Returns:
-        Height and sigma, and number of views and of stations used (255 stands for more).
-    """
-    order = sorted_ranks(heights)
-    half = 0.0
-    for i in range(heights.size):
-        half += 0.5 / sigmas[i] ** 2
-    median_at, below = order[-1], 0.0
-    for i in order:
-        below += 1.0 / sigmas[i] ** 2
-        if below >= half:
-            median_at = i
-            break
-    median = heights[median_at]
-    misses = np.empty(heights.size, np.float32)
-    for i in range(heights.size):
-        misses[i] = abs(heights[i] - median)
-    ranks = sorted_ranks(misses)
-    middle = heights.size // 2
-    scatter = MAD_TO_SIGMA * misses[ranks[middle]]
-    if heights.size % 2 == 0:
-        scatter = 0.5 * (scatter + MAD_TO_SIGMA * misses[ranks[middle - 1]])
-    reach = gate * max(scatter, sigmas[median_at])
-    total, weights, squares = 0.0, 0.0, 0.0
-    formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
-    places, companions = np.empty(heights.size, np.int64), 0
-    for i in range(heights.size):
-        if abs(heights[i] - median) > reach:
-            continue
-        w = 1.0 / sigmas[i] ** 2
-        total += w * (heights[i] - median)
-        squares += w * (heights[i] - median) ** 2
-        weights += w
-        if views[i] != last_view:
-            if in_view > 0:
-                formal += view_weight / in_view
-            last_view, in_view, view_weight = views[i], 0, 0.0
-            seen += 1
-            place, known = stations[last_view], False
-            for k in range(companions):
-                known = known or places[k] == place
-            if not known:
-                places[companions] = place
-                companions += 1
-        in_view += 1
-        view_weight += w
-    formal += view_weight / in_view
-    mean = total / weights
-    variance = max(squares / weights - mean * mean, 0.0)
-    return median + mean, math.sqrt(1.0 / formal + variance / seen), seen, min(companions, 255)
-
-
-@compiled
-def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Float32]:
+def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple[Float32, Float32]:
     """Bridge small gaps in straight lines between what lies on either side.
 
     A gap's cell is filled where, along at least two of the four lines through it (rows, columns
-    and both diagonals), known cells lie within `reach` on both sides. Its standard deviation is
-    the larger of the ends' plus half their difference.
+    and both diagonals), known cells lie within `reach` on both sides, unless the line between them
+    is so steep that it is a step. Its standard deviation is the larger of the ends' plus half their
+    difference.
 
     Args:
         height: (H, W), NaN where unknown.
         sigma: (H, W) of the heights.
         reach: in cells.
+        cell: side of a cell.
 
     Returns:
         Copies of both with small gaps filled.
@@ -290,7 +250,7 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Flo
                         second, b = height[r, c], n
                         spread = max(spread, sigma[r, c])
                         break
-                if a == 0 or b == 0:
+                if a == 0 or b == 0 or abs(first - second) > _STEP * (a + b) * cell:
                     continue
                 w = 1.0 / (a + b)
                 lines += 1
@@ -318,16 +278,3 @@ def slope_deg(height: Float32, cell: float) -> Float32:
     steep = np.rad2deg(np.arctan(np.hypot(right - left, down - up) / (8 * cell)))
     slope: Float32 = np.where(np.isfinite(rise), steep, np.nan).astype(np.float32)
     return slope
-
-
-def without_strays(height: Float32) -> NDArray[np.bool_]:
-    """Which cells are not isolated: enough cells are known in the square around them.
-
-    Beyond the edge of the array a cell counts as unknown.
-    """
-    known = np.isfinite(height)
-    side = 2 * STRAY_CELLS + 1
-    share = cv2.boxFilter(
-        known.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(known & (share >= _LEAST_COMPANY))

@@ -1,32 +1,48 @@
-"""What the dense stage does for each plane: lay out its grid, fuse its tiles, write its rasters."""
+"""What the dense stage makes of confirmed depth: surface, cloud, and rasters over planes."""
 
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
-from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud, write_cloud_json
-from reconstruct.dense.pose_part import ErrorsOfPoses, PosePart
-from reconstruct.dense.tiles import FuseSetup, Tile, ViewSummary, fuse_tile, tile_tasks
+from reconstruct.dense.cloud import (
+    laz_writer,
+    vertices_of,
+    voxel_edge,
+    write_cloud,
+    write_cloud_json,
+)
+from reconstruct.dense.dem import FILL_CELLS, cells_over, fill_gaps, slope_deg
+from reconstruct.dense.pose_part import ErrorsOfPoses
+from reconstruct.dense.surface_tiles import (
+    FuseSetup,
+    SurfaceTile,
+    ViewSummary,
+    fuse_tasks,
+    fuse_tile,
+    on_plane,
+    tiles_over,
+)
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask, lay_out_view
 from reconstruct.light.solve import LightModel
-from reconstruct.planes import LEVEL_PLANE, PLANES, Plane, turned, write_plane
-from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster
+from reconstruct.planes import PLANES, Plane, plane_frame, write_plane
+from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster, tiles_of
 from reconstruct.views.model import SparseModel, WorldFrame
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
 _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
+_TILE_CELLS = 256
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,43 +59,6 @@ class Confirmed:
     executor: Executor
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Layout:
-    """Where the surface lies over a plane."""
-
-    plane: Plane
-    model: SparseModel
-    """In the frame of the plane."""
-    summaries: Sequence[ViewSummary]
-    pose_part: PosePart | None
-
-    @property
-    def bounds(self) -> list[tuple[float, float, float, float]]:
-        """South, west, north and east of each view that has depth."""
-        return [summary.bounds for summary in self.summaries if summary.bounds is not None]
-
-    def grid(self, cell: float) -> DemGrid:
-        """The grid over all points.
-
-        Raises:
-            ReconstructionError: it would be too large.
-        """
-        grid = grid_over(self.bounds, cell)
-        if grid.rows * grid.columns > _MOST_CELLS:
-            raise ReconstructionError(
-                f"cells of {cell} {self.model.frame.unit} would make a grid of {grid.rows} x "
-                f"{grid.columns} over the plane {self.plane.name!r}; raise reconstruct.dem_cell_m"
-            )
-        return grid
-
-    def offset(self, grid: DemGrid) -> tuple[float, float, float]:
-        """Whole numbers near the middle of the points: east, north, up."""
-        up = float(np.nanmedian([s.up for s in self.summaries]))
-        east = float(grid.east_of(grid.columns / 2))
-        north = float(grid.north_of(grid.rows / 2))
-        return (float(np.round(east)), float(np.round(north)), float(np.round(up)))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Fused:
     """A plane whose rasters are written."""
@@ -93,10 +72,10 @@ class Fused:
 def fuse_planes(
     confirmed: Confirmed, folder: Path, planes: Sequence[Plane], cell_m: float | None
 ) -> list[Fused]:
-    """Write the rasters of planes, and the cloud.
+    """Fuse the surface, and write the cloud and the rasters of planes.
 
-    The cloud is made over the level plane, whether it is among the others or not. The first plane
-    on which something is seen has its rasters in the folder itself, the others below `planes`.
+    The first plane on which something is seen has its rasters in the folder itself, the others
+    below `planes`.
 
     Args:
         confirmed: depth of all views.
@@ -111,42 +90,51 @@ def fuse_planes(
         ReconstructionError: no depth was confirmed, nothing is seen on any plane, or a grid would
             be too large.
     """
-    level = _layout(confirmed, LEVEL_PLANE)
-    if not level.bounds:
-        raise no_depth(len(confirmed.model.views))
-    cell = surface_cell(level.summaries, cell_m, confirmed.model.frame)
-    layouts = [level if p.is_level else _layout(confirmed, p) for p in planes]
-    seen = [layout for layout in layouts if layout.bounds]
-    grids = [layout.grid(cell) for layout in (level, *seen)]
-    cells = max(grid.rows * grid.columns for grid in grids)
-    edge = voxel_edge(cell, cells, _MOST_POINTS)
+    model = confirmed.model
+    summaries = _lay_out(confirmed)
+    bounds = [summary.bounds for summary in summaries if summary.bounds is not None]
+    if not bounds:
+        raise no_depth(len(model.views))
+    cell = surface_cell(summaries, cell_m, model.frame)
+    grid = _grid(bounds, cell, model.frame, "level")
+    setup = FuseSetup(
+        store=confirmed.store,
+        light=confirmed.light,
+        stations=np.array([view.station for view in model.views], dtype=np.int64),
+        planes=tuple(planes),
+        offset_enu=_offset(grid, summaries),
+        sigma_factor=confirmed.sigma_factor,
+    )
+    tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
+    tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))
+    _write_cloud(folder, tiles, setup, model.frame, cell)
     if (folder / PLANES).exists():  # of a run that was interrupted
         shutil.rmtree(folder / PLANES)
-    made = []
-    for layout in (level, *(one for one in seen if not one.plane.is_level)):
-        below = folder / PLANES / layout.plane.name
-        fused = _fuse(confirmed, layout, (folder, below), cell, edge)
-        if fused is not None and layout.plane in planes:
-            made.append(fused)
-        else:
-            shutil.rmtree(below)
-    made.sort(key=lambda fused: planes.index(fused.plane))
+    made: list[Fused] = []
     for plane in planes:
-        if all(fused.plane != plane for fused in made):
+        on_it = [tile.bounds[plane.name] for tile in tiles if plane.name in tile.bounds]
+        if not on_it:
             warn(
                 f"plane {plane.name!r} ({plane.about}): no picture shows a surface that faces its "
                 "viewer: it has no DEM and no mosaic"
             )
+            continue
+        below = folder / PLANES / plane.name if made else folder
+        below.mkdir(parents=True, exist_ok=True)
+        made.append(
+            _project(
+                confirmed,
+                setup,
+                tiles,
+                below,
+                plane,
+                _grid(on_it, cell, plane_frame(model.frame, plane), plane.name),
+            )
+        )
     if not made:
         raise ReconstructionError(
             'nothing is seen on any of the planes: reconstruct.planes = ["auto"] finds the best'
         )
-    first = folder / PLANES / made[0].plane.name
-    for path in first.iterdir():
-        path.rename(folder / path.name)
-    first.rmdir()
-    if len(made) == 1:
-        first.parent.rmdir()
     return made
 
 
@@ -167,104 +155,139 @@ def surface_cell(summaries: Sequence[ViewSummary], cell: float | None, frame: Wo
     return cell or round_cell(max(CELL_PIXELS * footprint, 1.5 * sigma))
 
 
-def _layout(confirmed: Confirmed, plane: Plane) -> Layout:
-    model = turned(confirmed.model, plane)
+def _lay_out(confirmed: Confirmed) -> list[ViewSummary]:
     tasks = [
         ViewTask(store=confirmed.store, index=n, view=view, others=())
-        for n, view in enumerate(model.views)
+        for n, view in enumerate(confirmed.model.views)
     ]
-    lay_out = partial(lay_out_view, confirmed.sigma_factor, plane.name)
-    return Layout(
-        plane=plane,
-        model=model,
-        summaries=list(confirmed.executor.map(lay_out, tasks, label=_label("lay out", plane))),
-        pose_part=None if confirmed.poses is None else confirmed.poses.over(plane),
-    )
+    lay_out = partial(lay_out_view, confirmed.sigma_factor)
+    return list(confirmed.executor.map(lay_out, tasks, label="lay out"))
 
 
-def _fuse(
-    confirmed: Confirmed,
-    layout: Layout,
-    folders: tuple[Path, Path],
-    cell: float,
-    edge: float,
-) -> Fused | None:
-    """Write one plane's rasters, and with the level one the cloud; None where no cell is known.
-
-    Args:
-        confirmed: depth of all views.
-        layout: over the plane.
-        folders: of the stage, and for the rasters.
-        cell: side of a cell.
-        edge: of the cubes to which the cloud is thinned.
+def _grid(
+    bounds: Sequence[tuple[float, float, float, float]], cell: float, frame: WorldFrame, plane: str
+) -> DemGrid:
+    """The grid over all points.
 
     Raises:
-        ReconstructionError: the cloud has no point.
+        ReconstructionError: it would be too large.
     """
-    (stage, folder), plane, grid = folders, layout.plane, layout.grid(cell)
-    folder.mkdir(parents=True)
-    setup = FuseSetup(
-        store=confirmed.store,
-        plane=plane.name,
-        light=confirmed.light,
-        stations=np.array([view.station for view in layout.model.views], dtype=np.int64),
-        offset_enu=layout.offset(grid),
-        edge=edge,
-        sigma_factor=confirmed.sigma_factor,
-    )
-    tasks = tile_tasks(grid, layout.model.views, layout.summaries, layout.pose_part)
-    tiles = confirmed.executor.map(partial(fuse_tile, setup), tasks, label=_label("fuse", plane))
-    known = _Count()
-    parts = _write_rasters(folder, grid, layout.model.frame, known.passed(tiles))
-    if plane.is_level:
-        _write_cloud(stage, parts, setup, layout.model.frame, len(layout.model.views))
-    else:
-        for _ in parts:
-            pass
-    if known.cells == 0:
-        return None
-    write_plane(folder, plane, confirmed.model.frame)
-    preview_dem(folder / "dem.tif", folder / "dem.png")
-    sigma = None if layout.pose_part is None else float(f"{layout.pose_part.median:.3g}")
-    return Fused(plane=plane, grid=grid, pose_sigma=sigma)
+    grid = grid_over(bounds, cell)
+    if grid.rows * grid.columns > _MOST_CELLS:
+        raise ReconstructionError(
+            f"cells of {cell} {frame.unit} would make a grid of {grid.rows} x {grid.columns} over "
+            f"the plane {plane!r}; raise reconstruct.dem_cell_m"
+        )
+    return grid
 
 
-def _label(what: str, plane: Plane) -> str:
-    return what if plane.is_level else f"{what} {plane.name}"
-
-
-class _Count:
-    """Counts the known cells of tiles that pass."""
-
-    def __init__(self) -> None:
-        self.cells = 0
-
-    def passed(self, tiles: Iterable[Tile]) -> Iterator[Tile]:
-        """The same tiles."""
-        for tile in tiles:
-            self.cells += int(np.isfinite(tile.height).sum())
-            yield tile
+def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, float, float]:
+    """Whole numbers near the middle of the points: east, north, up."""
+    up = float(np.nanmedian([s.up for s in summaries]))
+    east = float(grid.east_of(grid.columns / 2))
+    north = float(grid.north_of(grid.rows / 2))
+    return (float(np.round(east)), float(np.round(north)), float(np.round(up)))
 
 
 def _write_cloud(
     folder: Path,
-    parts: Iterator[NDArray[Any]],
+    tiles: Sequence[SurfaceTile],
     setup: FuseSetup,
     frame: WorldFrame,
-    pictures: int,
+    cell: float,
 ) -> None:
     offset = setup.offset_enu
+    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MOST_POINTS)
+    parts = (vertices_of(tile.points(setup.store), cell, edge) for tile in tiles)
     with laz_writer(folder / "cloud.laz", offset, frame) as write_laz:
         count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, frame)
     if count == 0:
-        raise no_depth(pictures)
-    write_cloud_json(folder / "cloud.json", count, offset, setup.edge, frame)
+        raise no_depth(len(setup.stations))
+    write_cloud_json(folder / "cloud.json", count, offset, edge, frame)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RasterTile:
+    """A tile of the rasters of a plane."""
+
+    window: Window
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    """Slope, degrees."""
+    count: NDArray[np.uint16]
+    stations: NDArray[np.uint8]
+    surfaces: NDArray[np.uint8]
+    lower: NDArray[np.float32]
+
+
+def _project(
+    confirmed: Confirmed,
+    setup: FuseSetup,
+    tiles: Sequence[SurfaceTile],
+    folder: Path,
+    plane: Plane,
+    grid: DemGrid,
+) -> Fused:
+    """Write one plane's rasters."""
+    frame = confirmed.model.frame
+    tasks = []
+    for window in tiles_of(grid, _TILE_CELLS):
+        part = grid.window(
+            int(window.row_off) - FILL_CELLS,
+            int(window.col_off) - FILL_CELLS,
+            int(window.height) + 2 * FILL_CELLS,
+            int(window.width) + 2 * FILL_CELLS,
+        )
+        tasks.append((window, part, tiles_over(tiles, plane, part)))
+    label = "project" if plane.is_level else f"project {plane.name}"
+    found = confirmed.executor.map(partial(project_tile, setup, plane), tasks, label=label)
+    _write_rasters(folder, grid, plane_frame(frame, plane), found)
+    write_plane(folder, plane, frame)
+    preview_dem(folder / "dem.tif", folder / "dem.png")
+    poses = confirmed.poses
+    sigma = None if poses is None else float(f"{poses.median_along(plane.normal_world):.3g}")
+    return Fused(plane=plane, grid=grid, pose_sigma=sigma)
+
+
+def project_tile(
+    setup: FuseSetup, plane: Plane, task: tuple[Window, DemGrid, Sequence[SurfaceTile]]
+) -> RasterTile:
+    """Project the surface on a tile of a plane's grid.
+
+    Args:
+        setup: of the surface.
+        plane: to project on.
+        task: the tile, the grid of it with a rim of `FILL_CELLS`, and tiles of the surface over it.
+    """
+    window, grid, tiles = task
+    up = _middle_up(setup, plane)
+    origin = np.array([grid.west, grid.north, up])
+    surface = on_plane(setup, tiles, plane, origin)
+    cells = cells_over(grid.moved(-grid.west, -grid.north), surface)
+    height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
+    inner = (slice(FILL_CELLS, -FILL_CELLS), slice(FILL_CELLS, -FILL_CELLS))
+    return RasterTile(
+        window=window,
+        height=(height[inner] + up).astype(np.float32),
+        sigma=sigma[inner],
+        slope=slope_deg(height, grid.cell)[inner],
+        count=cells.count[inner],
+        stations=cells.stations[inner],
+        surfaces=cells.surfaces[inner],
+        lower=(cells.lower[inner] + up).astype(np.float32),
+    )
+
+
+def _middle_up(setup: FuseSetup, plane: Plane) -> float:
+    """A whole number near the height of the survey's middle over a plane."""
+    east, north, up = setup.offset_enu
+    return float(np.round(-plane.plane_from_world.apply(np.array([north, east, -up]))[2]))
 
 
 def _write_rasters(
-    folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterator[Tile]
-) -> Iterator[NDArray[Any]]:
-    """Write the tiles' rasters and hand their cloud points on."""
+    folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterable[RasterTile]
+) -> None:
     unit, nan = frame.unit, float("nan")
     up = "towards its viewer" if frame.name == "plane" else "up"
     over = f"above {frame.vertical_datum}, {up} ({unit})"
@@ -300,4 +323,3 @@ def _write_rasters(
         for tile in tiles:
             for name, raster in rasters.items():
                 raster.write(getattr(tile, name), 1, window=tile.window)
-            yield tile.vertices

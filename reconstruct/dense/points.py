@@ -18,7 +18,8 @@ _BLOCK = 16
 _ROUNDING = 1e-6
 """Relative rounding of coordinates as float32; kernels and arrays differ by less."""
 EDGE_ON = math.cos(math.radians(80.0))
-"""Least third part of a point's normal for it to be on a surface that a plane's viewer sees."""
+"""Least cosine between a surface's normal and the way to its viewer for it to count as seen: what
+lies more on edge mostly is none, but the step between a foreground and what is behind it."""
 _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 
@@ -30,17 +31,17 @@ class Points:
     enu: Float32
     """(N, 3) east, north, up from an offset that the caller knows."""
     normals: Float32
-    """(N, 3) unit vectors towards the camera; NaN next to unknown depth."""
+    """(N, 3) unit vectors towards the camera; NaN next to unknown depth, and edge-on."""
     colours: NDArray[np.uint8]
     """(N, 3) RGB."""
     sigmas: Float32
-    """(N,) standard deviations of the depth."""
+    """(N,) standard deviations along the normal, of the depth where that is unknown."""
     views: NDArray[np.int32]
     """(N,) number of the view, in ascending order."""
 
-    def part(self, kept: NDArray[np.bool_]) -> "Points":
-        """Those of the points that are kept."""
-        return Points(**{field.name: getattr(self, field.name)[kept] for field in fields(Points)})
+    def part(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Points":
+        """Those of the points that a mask or their numbers choose."""
+        return Points(**{field.name: getattr(self, field.name)[chosen] for field in fields(Points)})
 
 
 def points_in_box(
@@ -160,6 +161,9 @@ def gather(
 ) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:
     """Points, normals, colours (RGB) and standard deviations of pixels whose point is in a box.
 
+    Errors of the depth move a point along its ray; along the normal they count with the cosine
+    between the two.
+
     Args:
         depth: (H, W) along the axis, NaN where unknown.
         sigma: (H, W) of it.
@@ -172,7 +176,8 @@ def gather(
         meeting: (h, w) blocks of pixels of which any may be in the box.
 
     Returns:
-        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN next to unknown depth.
+        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN next to unknown depth, and where
+        the surface is seen edge-on.
     """
     height, width = depth.shape
     t = enu_from_cam
@@ -219,30 +224,14 @@ def gather(
         length = _normal(depth, slopes, row, column, a, b, other)
         if length > 0.0:
             n0, n1, n2 = other[0], other[1], other[2]
+            x, y = slopes[row, column, 0], slopes[row, column, 1]
+            along = abs(x * n0 + y * n1 + n2) / length
+            if along < EDGE_ON * math.sqrt(x * x + y * y + 1.0):
+                continue
+            sigmas[i] *= along
             for k in range(3):
                 normals[i, k] = (t[k, 0] * n0 + t[k, 1] * n1 + t[k, 2] * n2) / length
     return enu[:count].copy(), normals, colours, sigmas
-
-
-def normals_up(depth: Float32, view: View) -> Float32:
-    """Third part, up, of the unit normals (H, W) of a view's depth; NaN next to unknown depth."""
-    transform = enu_from_cam(view, np.zeros(3))
-    found: Float32 = _normals_up(depth, view.kernel_lens, transform)
-    return found
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def _normals_up(depth: Float32, lens: KernelLens, enu_from_cam: Array) -> Float32:
-    t = enu_from_cam
-    slopes = slopes_of(depth, lens)
-    up = np.full(depth.shape, np.nan, np.float32)
-    a, b, n = np.empty(3), np.empty(3), np.empty(3)
-    for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            length = _normal(depth, slopes, row, column, a, b, n)
-            if length > 0.0:
-                up[row, column] = (t[2, 0] * n[0] + t[2, 1] * n[1] + t[2, 2] * n[2]) / length
-    return up
 
 
 @compiled(error_model="numpy", fastmath=FAST)

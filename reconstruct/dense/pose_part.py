@@ -16,52 +16,11 @@ from scipy.spatial import cKDTree
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.planes import Plane
 from reconstruct.views.model import SparseModel
 
 _COMPANY = 16
 """Sparse points around a spot of which the median counts: a single one may be a wrong match."""
-_NODE_CELLS = 16
-"""Cells of the DEM between places where it is computed."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PosePart:
-    """Variances of the surface's height over a plane from poses, at sparse points."""
-
-    places: Array
-    """(P, 2) north and east, or up and right of another plane."""
-    variances: Array
-    """(P,) variances of the height, in the square of the model's unit."""
-
-    @property
-    def median(self) -> float:
-        """Standard deviation at half of the points or less."""
-        return float(np.sqrt(np.median(self.variances)))
-
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.places)
-
-    def at_nodes(self, north: float, west: float, cell: float, rows: int, columns: int) -> Array:
-        """Standard deviations (m, n) on a lattice over a grid of cells, its corners included.
-
-        Args:
-            north: coordinate of the grid's northern edge.
-            west: of its western edge.
-            cell: side of a cell.
-            rows: of cells.
-            columns: of cells.
-        """
-        m, n = (max(2, -(-count // _NODE_CELLS) + 1) for count in (rows, columns))
-        norths = north - np.linspace(0, rows * cell, m)
-        easts = west + np.linspace(0, columns * cell, n)
-        spots = np.stack(np.meshgrid(norths, easts, indexing="ij"), axis=-1).reshape(-1, 2)
-        count = min(_COMPANY, len(self.places))
-        _, near = self._tree.query(spots, k=count)
-        near = np.asarray(near).reshape(len(spots), count)
-        found: Array = np.sqrt(np.median(self.variances[near], axis=1)).reshape(m, n)
-        return found
+_CHUNK = 50_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,25 +32,52 @@ class ErrorsOfPoses:
     covariances: Array
     """(P, 3, 3)."""
 
-    def over(self, plane: Plane) -> PosePart:
-        """The part of it along a plane's normal."""
-        normal = plane.normal_world
-        variances = np.einsum("i,pij,j->p", normal, self.covariances, normal)
-        places = plane.plane_from_world.apply(self.points_world)[:, :2]
-        return PosePart(places=places, variances=np.maximum(variances, 0.0))
+    def median_along(self, normal_world: Array) -> float:
+        """Standard deviation along a direction at half of the points or less."""
+        return float(np.sqrt(np.median(_along(self.covariances, normal_world))))
+
+    def around(self, low: Array, high: Array) -> "ErrorsOfPoses":
+        """Those of the points around a box, of south and west (2,) to north and east (2,)."""
+        margin = float(np.max(high - low))
+        place = self.points_world[:, :2]
+        while True:
+            near = ((place > low - margin) & (place < high + margin)).all(axis=1)
+            if near.sum() >= min(_COMPANY, len(place)):
+                return ErrorsOfPoses(
+                    points_world=self.points_world[near], covariances=self.covariances[near]
+                )
+            margin *= 2.0
+
+    def at(self, points_world: Array, normals_world: Array, block: float) -> Array:
+        """Standard deviations (N,) of a surface's points along its normals.
+
+        Args:
+            points_world: (N, 3).
+            normals_world: (N, 3) unit vectors.
+            block: side of cubes whose points share the sparse points around.
+        """
+        cubes, of_point = np.unique(np.floor(points_world / block), axis=0, return_inverse=True)
+        count = min(_COMPANY, len(self.points_world))
+        near = np.asarray(self._tree.query((cubes + 0.5) * block, k=count)[1])
+        near = near.reshape(len(cubes), count)[of_point.reshape(-1)]
+        found = np.empty(len(points_world))
+        for start in range(0, len(found), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            covariances = self.covariances[near[part]]
+            found[part] = np.median(_along(covariances, normals_world[part, None]), axis=1)
+        sigmas: Array = np.sqrt(found)
+        return sigmas
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points_world)
 
 
-def spread_over(nodes: Array, rows: int, columns: int) -> Array:
-    """A lattice (m, n) whose corners are a grid's at its cells (rows, columns), bilinear."""
-    m, n = nodes.shape
-    y = (np.arange(rows) + 0.5) / rows * (m - 1)
-    x = (np.arange(columns) + 0.5) / columns * (n - 1)
-    i, j = np.minimum(y.astype(int), m - 2), np.minimum(x.astype(int), n - 2)
-    q, p = (y - i)[:, None], (x - j)[None, :]
-    above = nodes[i][:, j] * (1 - p) + nodes[i][:, j + 1] * p
-    below = nodes[i + 1][:, j] * (1 - p) + nodes[i + 1][:, j + 1] * p
-    found: Array = above * (1 - q) + below * q
-    return found
+def _along(covariances: Array, directions: Array) -> Array:
+    """Variances (...,) along directions (..., 3) of covariances (..., 3, 3)."""
+    found = np.einsum("...i,...ij,...j->...", directions, covariances, directions)
+    variances: Array = np.maximum(found, 0.0)
+    return variances
 
 
 @progress.step("find what poses add to errors")

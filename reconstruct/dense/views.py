@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
-from alice_survey.base.plane_settings import LEVEL
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import GATE_SIGMAS, count_witnesses, merge_depths, pair_depth
 from reconstruct.dense.matching_trial import shrunk
-from reconstruct.dense.points import EDGE_ON, block_bounds, normals_up
+from reconstruct.dense.points import block_bounds
 from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import in_frame
-from reconstruct.dense.tiles import ViewSummary
+from reconstruct.dense.surface_tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joined_samples, low_pass
 from reconstruct.pictures.normalise import normalise
@@ -225,23 +224,17 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:
     return ViewLight(light=_shared_light(task, points, rows, columns), nodes=nodes)
 
 
-def lay_out_view(sigma_factor: float, plane: str, task: ViewTask) -> ViewSummary:
-    """Find where the kept points of a view lie over a plane, without the few that lie far off.
+def lay_out_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
+    """Find where the kept points of a view lie, without the few that lie far off.
 
     Args:
         sigma_factor: on the standard deviations of refined depths.
-        plane: name of the plane, by which the view's part in it is kept. The level one takes all
-            points, for the cloud, and flanks of the sea floor are part of it; others take those
-            that are known to face the plane's viewer: the floor at its foot is no part of a wall.
-        task: the view, in the frame of the plane.
+        task: the view.
     """
     store, view = task.store, task.view
     depth, sigma = store.load_depth(task.index, "fine")
     sigma *= np.float32(sigma_factor)
     kept = store.load_mask(task.index, "kept", view.pinhole.width_px)
-    if plane != LEVEL:
-        with np.errstate(invalid="ignore"):
-            kept &= normals_up(depth, view) >= EDGE_ON
     rows, columns = np.nonzero(kept)
     if len(rows) < _LEAST_PIXELS:
         return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, sigma=np.nan)
@@ -249,8 +242,8 @@ def lay_out_view(sigma_factor: float, plane: str, task: ViewTask) -> ViewSummary
     low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
     beyond = (points[:, :2] < low) | (points[:, :2] > high)
     kept[rows, columns] = ~beyond.any(axis=1)
-    store.save_mask(task.index, f"kept.{plane}", kept)
-    store.save(task.index, f"blocks.{plane}", block_bounds(kept.shape, rows, columns, points))
+    store.save_mask(task.index, "inside", kept)
+    store.save(task.index, "blocks", block_bounds(kept.shape, rows, columns, points))
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),

@@ -1,0 +1,255 @@
+"""Points of many views fused into points of one oriented surface in space.
+
+A surface is a function of two coordinates along whichever of the six directions of the axes its
+normal is nearest to: floors over east and north, walls over the other pairs, ceilings from below.
+In each direction points are put into cells of the two other axes, moved along the surface to the
+middle of their cell, told apart where several surfaces lie behind each other, and fused robustly.
+What becomes of a cell depends on points in it alone, so that tiles agree where they meet.
+
+What a single cell cannot show, its neighbours do. A wrong match makes a small patch apart from any
+surface; where a surface turns or ends within a cell, its neighbours contradict it beyond noise.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
+from reconstruct.dense.points import Points
+from reconstruct.dense.robust_fusion import robust_height
+from reconstruct.dense.surfaces import surfaces_of
+
+Float32 = NDArray[np.float32]
+
+SURFACE_POINT = np.dtype(
+    [
+        ("enu", "<f4", 3),
+        ("normal", "<f4", 3),
+        ("colour", "u1", 3),
+        ("sigma", "<f4"),
+        ("shared", "<f4"),
+        ("views", "<u2"),
+        ("stations", "u1"),
+    ]
+)
+"""One point: east, north, up; unit normal into the water; RGB; standard deviations along it, the
+point's own and what all points around share; views and stations that it rests on (255: or more)."""
+_LEAST_ALONG = 0.4
+"""Least part of a point's normal along a direction for it to be fused there."""
+_GATE = 3.0
+PART_REACH_CELLS = 16.0
+"""Around a tile, points must be known so far to tell what is part of a surface."""
+_NEIGHBOUR_CELLS = 2.0
+_LEAST_PART = 300
+"""Points of a part of the surface; smaller ones are mostly wrong."""
+_STEP_CELLS = 1.0
+"""Points farther than this from each other's tangent planes do not hang together."""
+_LEAST_TURN = 0.3
+"""Nor do those whose normals have a smaller cosine between them."""
+_SAME_SIDE = -0.2
+"""Cosine between the normals of neighbours from which they are no two sides of one thing."""
+
+
+def fuse_surface(
+    points: Points, stations: NDArray[np.int64], cell: float, origin: Array
+) -> NDArray[Any]:
+    """Fuse points into one for each cell of a surface.
+
+    Args:
+        points: of all views that see some part of space; those without a normal are left out.
+        stations: (V,) of every view, by its number.
+        cell: side of a cell.
+        origin: (3,) from which cells start at whole multiples of their side.
+
+    Returns:
+        (M,) records of `SURFACE_POINT`.
+    """
+    known = points.part(np.isfinite(points.normals[:, 0]))
+    return np.concatenate(
+        [
+            _fuse_along(known, stations, cell, origin, axis, sign)
+            for axis in (2, 0, 1)
+            for sign in (1.0, -1.0)
+        ]
+    )
+
+
+def _fuse_along(
+    points: Points,
+    stations: NDArray[np.int64],
+    cell: float,
+    origin: Array,
+    axis: int,
+    sign: float,
+) -> NDArray[Any]:
+    facing = points.part(sign * points.normals[:, axis] >= _LEAST_ALONG)
+    if not len(facing.enu):
+        return np.empty(0, SURFACE_POINT)
+    across = [k for k in range(3) if k != axis]
+    at = np.floor((facing.enu[:, across] - origin[across]) / cell).astype(np.int64)
+    order = np.lexsort((at[:, 1], at[:, 0])).astype(np.int64)
+    at, ranked = at[order], facing.part(order)
+    starts = np.flatnonzero(np.any(np.diff(at, axis=0, prepend=at[:1] - 1), axis=1))
+    found = fuse_cells(
+        np.append(starts, len(at)), origin[across] + (at[starts] + 0.5) * cell, ranked.enu,
+        ranked.normals, ranked.colours, ranked.sigmas, ranked.views, stations, cell,
+        (across[0], across[1], axis), sign, _GATE,
+    )  # fmt: skip
+    records = np.zeros(len(found[0]), SURFACE_POINT)
+    names = ("enu", "normal", "colour", "sigma", "views", "stations")
+    for name, values in zip(names, found, strict=True):
+        records[name] = values
+    return records
+
+
+@compiled
+def fuse_cells(
+    starts: NDArray[np.int64],
+    middles: Array,
+    enu: Float32,
+    normals: Float32,
+    colours: NDArray[np.uint8],
+    sigmas: Float32,
+    views: NDArray[np.int32],
+    stations: NDArray[np.int64],
+    cell: float,
+    axes: tuple[int, int, int],
+    sign: float,
+    gate: float,
+) -> tuple[Float32, Float32, NDArray[np.uint8], Float32, NDArray[np.uint16], NDArray[np.uint8]]:
+    """Fuse the points of cells that lie across one direction.
+
+    A surface whose normal is nearer to another direction is left to that.
+
+    Args:
+        starts: (C + 1,) where the points of each cell start.
+        middles: (C, 2) of the cells.
+        enu: (N, 3) sorted by cell, then by view.
+        normals: (N, 3) unit vectors.
+        colours: (N, 3) RGB.
+        sigmas: (N,) standard deviations along the normals.
+        views: (N,) of the points.
+        stations: (V,) of every view, by its number.
+        cell: side of a cell.
+        axes: the two axes of the cells, and that of the direction.
+        sign: 1 or -1, of the direction along its axis.
+        gate: in standard deviations.
+
+    Returns:
+        Columns of `SURFACE_POINT` without what points share.
+    """
+    most, count = enu.shape[0], 0
+    place, normal = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
+    colour = np.empty((most, 3), np.uint8)
+    sigma = np.empty(most, np.float32)
+    seen, met = np.empty(most, np.uint16), np.empty(most, np.uint8)
+    a, b, along = axes
+    middle, mean, tint = np.empty(3), np.empty(3), np.empty(3)
+    for n in range(starts.size - 1):
+        first, last = starts[n], starts[n + 1]
+        size = last - first
+        middle[a], middle[b] = middles[n, 0], middles[n, 1]
+        heights = np.empty(size, np.float32)
+        spreads = np.empty(size, np.float32)
+        steep = np.empty(size, np.float32)
+        for i in range(size):
+            up = sign * normals[first + i, along]
+            lift = (enu[first + i, a] - middle[a]) * normals[first + i, a]
+            lift += (enu[first + i, b] - middle[b]) * normals[first + i, b]
+            heights[i] = sign * enu[first + i, along] + lift / up
+            spreads[i] = sigmas[first + i] / up
+            steep[i] = math.sqrt(max(1.0 - up * up, 0.0)) / up
+        numbers = views[first:last]
+        layers, layer = surfaces_of(heights, spreads, stations[numbers], steep, cell)
+        for one in range(layers):
+            mean[:] = 0.0
+            tint[:] = 0.0
+            weights = 0.0
+            for i in range(size):
+                if layer[i] == one:
+                    w = 1.0 / sigmas[first + i] ** 2
+                    weights += w
+                    for k in range(3):
+                        mean[k] += w * normals[first + i, k]
+                        tint[k] += w * colours[first + i, k]
+            length = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
+            mean /= max(length, 1e-30)
+            up = sign * mean[along]
+            if up < abs(mean[a]) or up < abs(mean[b]):
+                continue
+            for i in range(size):
+                lift = (enu[first + i, a] - middle[a]) * mean[a]
+                lift += (enu[first + i, b] - middle[b]) * mean[b]
+                heights[i] = sign * enu[first + i, along] + lift / up
+            members = layer == one
+            height, deviation, in_views, at_stations = robust_height(
+                heights[members], spreads[members], numbers[members], stations, gate
+            )
+            middle[along] = sign * height
+            for k in range(3):
+                place[count, k] = middle[k]
+                normal[count, k] = mean[k]
+                colour[count, k] = int(tint[k] / weights + 0.5)
+            sigma[count] = deviation * up
+            seen[count], met[count] = in_views, at_stations
+            count += 1
+    return (
+        place[:count], normal[:count], colour[:count], sigma[:count], seen[:count], met[:count]
+    )  # fmt: skip
+
+
+def settled(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDArray[Any]:
+    """Leave out small parts of a surface, and raise sigmas by what neighbours contradict.
+
+    The squared distance of neighbours from a point's tangent plane, beyond the variance of both,
+    is taken for the sum of two equal variances, the point's own and theirs.
+
+    Args:
+        surface: records of `SURFACE_POINT` of one tile and `PART_REACH_CELLS` around it.
+        cell: side of a cell.
+        low: (2,) west and south of all that is known; a part that comes near is taken to go on.
+        high: (2,) east and north of it.
+    """
+    if not len(surface):
+        return surface
+    place = surface["enu"].astype(np.float64) / cell
+    normal = surface["normal"].astype(np.float64)
+    variance = np.square(surface["sigma"].astype(np.float64) / cell)
+    count = len(surface)
+    i, j = cKDTree(place).query_pairs(_NEIGHBOUR_CELLS, output_type="ndarray").T
+    apart = place[j] - place[i]
+    from_i, from_j = (np.einsum("nk,nk->n", apart, normal[k]) for k in (i, j))
+    turn = np.einsum("nk,nk->n", normal[i], normal[j])
+
+    joined = (np.abs(from_i) < _STEP_CELLS) & (np.abs(from_j) < _STEP_CELLS)
+    joined &= turn > _LEAST_TURN
+    links = coo_matrix((np.ones(joined.sum(), np.int8), (i[joined], j[joined])), (count, count))
+    part = connected_components(links, directed=False)[1]
+    near = (place[:, :2] < low / cell + _NEIGHBOUR_CELLS).any(axis=1)
+    near |= (place[:, :2] > high / cell - _NEIGHBOUR_CELLS).any(axis=1)
+    large = np.bincount(part) >= _LEAST_PART
+    large[part[near]] = True
+
+    mean = normal / variance[:, None]
+    for one, other in ((i[joined], j[joined]), (j[joined], i[joined])):
+        for k in range(3):
+            mean[:, k] += np.bincount(one, normal[other, k] / variance[other], count)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    same = turn > _SAME_SIDE
+    i, j = i[same], j[same]
+    both = variance[i] + variance[j]
+    beyond = np.bincount(i, from_i[same] ** 2 - both, count)
+    beyond += np.bincount(j, from_j[same] ** 2 - both, count)
+    neighbours = np.bincount(i, minlength=count) + np.bincount(j, minlength=count)
+    excess = 0.5 * np.maximum(beyond / np.maximum(neighbours, 1), 0.0)
+    found = surface.copy()
+    found["sigma"] = cell * np.sqrt(variance + excess)
+    found["normal"] = mean
+    kept: NDArray[Any] = found[large[part]]
+    return kept

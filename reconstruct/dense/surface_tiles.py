@@ -1,0 +1,204 @@
+"""Fusing the points of all views into the surface, tile by tile of the ground."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.frames import Array
+from reconstruct.dense.points import EDGE_ON, Points, joined, points_in_box
+from reconstruct.dense.pose_part import ErrorsOfPoses
+from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settled
+from reconstruct.dense.view_store import ViewStore
+from reconstruct.light.solve import LightModel
+from reconstruct.planes import Plane
+from reconstruct.raster import DemGrid, tiles_of
+from reconstruct.views.model import View
+
+_TILE_CELLS = 256
+_WORST_CELLS = 4.0
+"""Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
+_RIM_CELLS = int(PART_REACH_CELLS) + 1
+_NAME = "surface"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSummary:
+    """Where the points of a view lie."""
+
+    bounds: tuple[float, float, float, float] | None
+    """South, west, north, east; None where no depth was found."""
+    up: float
+    """Median height of its points."""
+    footprint: float
+    """Side of a pixel on the ground."""
+    sigma: float
+    """Median standard deviation of its depth."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FuseSetup:
+    """What all tiles share."""
+
+    store: ViewStore
+    """With the depth of every view."""
+    light: LightModel
+    stations: NDArray[np.int64]
+    """(V,) station of every view."""
+    planes: tuple[Plane, ...]
+    offset_enu: tuple[float, float, float]
+    """Origin near the points."""
+    sigma_factor: float
+    """On the standard deviations of refined depths."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FuseTask:
+    """One tile of the ground to fuse."""
+
+    number: int
+    grid: DemGrid
+    views: tuple[tuple[int, View], ...]
+    """Those whose points may fall in it and in its rim."""
+    poses: ErrorsOfPoses | None
+    """Around the tile."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceTile:
+    """A tile of the surface that is in the store."""
+
+    number: int
+    count: int
+    corners_enu: Array
+    """(8, 3) of the box around its points."""
+    bounds: Mapping[str, tuple[float, float, float, float]]
+    """South, west, north, east, in planes by name, of what faces their viewers."""
+
+    def points(self, store: ViewStore) -> NDArray[Any]:
+        """(count,) records of `SURFACE_POINT`, from the offset of all tiles."""
+        return np.asarray(store.load(self.number, _NAME))
+
+
+def fuse_tasks(
+    grid: DemGrid,
+    views: Sequence[View],
+    summaries: Sequence[ViewSummary],
+    poses: ErrorsOfPoses | None,
+) -> list[FuseTask]:
+    """Tiles of a grid over all points, in rows."""
+    nowhere = (np.inf, np.inf, -np.inf, -np.inf)
+    bounds = np.array([summary.bounds or nowhere for summary in summaries])
+    tasks = []
+    for number, window in enumerate(tiles_of(grid, _TILE_CELLS)):
+        row, column = int(window.row_off), int(window.col_off)
+        tile = grid.window(row, column, int(window.height), int(window.width))
+        rim = _RIM_CELLS * grid.cell
+        low, high = _corners(tile)
+        away = (bounds[:, 0] >= high[1] + rim) | (bounds[:, 2] <= low[1] - rim)
+        away |= (bounds[:, 1] >= high[0] + rim) | (bounds[:, 3] <= low[0] - rim)
+        seeing = tuple((index, views[index]) for index in np.flatnonzero(~away).tolist())
+        if seeing:
+            near = None if poses is None else poses.around(low[::-1], high[::-1])
+            tasks.append(FuseTask(number=number, grid=tile, views=seeing, poses=near))
+    return tasks
+
+
+def _corners(grid: DemGrid) -> tuple[Array, Array]:
+    """West and south, and east and north, of a grid."""
+    south, east = float(grid.north_of(grid.rows)), float(grid.east_of(grid.columns))
+    return np.array([grid.west, south]), np.array([east, grid.north])
+
+
+def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
+    """Fuse the points of all views in a tile, and keep them in the store."""
+    offset = np.array(setup.offset_enu)
+    grid = task.grid.moved(-offset[0], -offset[1])
+    low, high = _corners(grid)
+    rim = _RIM_CELLS * grid.cell
+    points = _points_over(setup, task, offset, (low - rim, high + rim))
+    surface = fuse_surface(
+        points, setup.stations, grid.cell, np.array([grid.west, grid.north, 0.0])
+    )
+    surface = settled(surface, grid.cell, low - rim, high + rim)
+    place = surface["enu"][:, :2].astype(np.float64)
+    surface = surface[((place >= low) & (place < high)).all(axis=1)]
+    enu = surface["enu"] + offset
+    ned, normals = (_swapped(one) for one in (enu, surface["normal"].astype(np.float64)))
+    if task.poses is not None and len(surface):
+        surface["shared"] = task.poses.at(ned, normals, _RIM_CELLS * grid.cell)
+    setup.store.save(task.number, _NAME, surface)
+    bounds = {}
+    for plane in setup.planes:
+        facing = normals @ plane.normal_world >= EDGE_ON
+        if facing.any():
+            on_plane = plane.plane_from_world.apply(ned[facing])[:, :2]
+            least, most = on_plane.min(axis=0), on_plane.max(axis=0)
+            bounds[plane.name] = (
+                float(least[0]), float(least[1]), float(most[0]), float(most[1])
+            )  # fmt: skip
+    box = np.array([enu.min(axis=0), enu.max(axis=0)]) if len(enu) else np.full((2, 3), np.nan)
+    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    return SurfaceTile(number=task.number, count=len(surface), corners_enu=corners, bounds=bounds)
+
+
+def _swapped(enu: Array) -> Array:
+    """North, east, down of east, north, up, or the other way round."""
+    swapped: Array = enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    return swapped
+
+
+def on_plane(
+    setup: FuseSetup, tiles: Sequence[SurfaceTile], plane: Plane, origin: Array
+) -> NDArray[Any]:
+    """Points of tiles in the coordinates of a plane: right, up, out, from an origin (3,) in it."""
+    surface = np.concatenate(
+        [np.empty(0, SURFACE_POINT), *(tile.points(setup.store) for tile in tiles)]
+    )
+    ned = _swapped(surface["enu"] + np.array(setup.offset_enu))
+    turned = plane.plane_from_world.rotation.apply(_swapped(surface["normal"].astype(np.float64)))
+    surface["enu"] = _swapped(plane.plane_from_world.apply(ned)) - origin
+    surface["normal"] = _swapped(turned)
+    return surface
+
+
+def tiles_over(tiles: Sequence[SurfaceTile], plane: Plane, grid: DemGrid) -> list[SurfaceTile]:
+    """Tiles of which points may lie over a grid in a plane, or next to it."""
+    low, high = _corners(grid)
+    found = []
+    for tile in tiles:
+        place = _swapped(plane.plane_from_world.apply(_swapped(tile.corners_enu)))[:, :2]
+        beyond = (place.max(axis=0) < low - grid.cell) | (place.min(axis=0) > high + grid.cell)
+        if tile.count and not beyond.any():
+            found.append(tile)
+    return found
+
+
+def _points_over(
+    setup: FuseSetup, task: FuseTask, offset: Array, box: tuple[Array, Array]
+) -> Points:
+    """The confirmed points of all views in a box (west and south, east and north)."""
+    store, (low, high) = setup.store, box
+    parts = []
+    for index, view in task.views:
+        depth, sigma = store.load_depth(index, "fine")
+        sigma *= np.float32(setup.sigma_factor)
+        with np.errstate(invalid="ignore"):
+            sure = sigma <= _WORST_CELLS * task.grid.cell
+        parts.append(
+            points_in_box(
+                view,
+                index,
+                depth,
+                sigma,
+                store.load_mask(index, "inside", view.pinhole.width_px) & sure,
+                store.load_colour(index),
+                setup.light.factors(view.camera, view.image),
+                offset,
+                (low[0], high[0], low[1], high[1]),
+                np.asarray(store.load(index, "blocks")),
+            )
+        )
+    return joined(parts)
