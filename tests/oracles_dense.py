@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, best_w
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import design_rig
+from reconstruct.raster import DemGrid
 from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
 from reconstruct.views.range_shift import no_shift, range_shift
 from tests.cameras import changed
@@ -52,7 +54,7 @@ def merged(depths: Array, sigmas: Array, gate: float) -> tuple[float, float, int
 def fused(
     heights: Array, sigmas: Array, views: Array, stations: Array, gate: float
 ) -> tuple[float, float, int, int]:
-    """One cell of `fuse_cells`."""
+    """`robust_height` of some points."""
     weights = 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2
     order = np.argsort(heights, kind="stable")
     reached = np.cumsum(weights[order]) >= weights.sum() / 2
@@ -65,7 +67,7 @@ def fused(
     variance = np.average((h - mean) ** 2, weights=w)
     formal = sum(w[v == view].mean() for view in np.unique(v))
     used = np.unique(v)
-    sigma = math.sqrt(1 / formal + variance / len(used))
+    sigma = math.sqrt(2 / formal + variance / len(used))
     return float(mean), sigma, len(used), len(set(stations[used]))
 
 
@@ -101,6 +103,63 @@ def surfaces(
         if len(part) >= 3 and len({int(places[i]) for i in part}) >= 2
     ]
     return shown[::-1] if len(shown) > 1 else [ranks]
+
+
+def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[str, float]:
+    """One cell of `cells_over`."""
+    nothing = dict.fromkeys(("height", "sigma", "lower"), math.nan)
+    nothing |= dict.fromkeys(("count", "stations", "surfaces"), 0)
+    middle = (grid.west + (column + 0.5) * grid.cell, grid.north - (row + 0.5) * grid.cell)
+    edge_on = math.cos(math.radians(80.0))
+    entries = []
+    for p in points:
+        east, north = ((float(p["enu"][k]) - middle[k]) / grid.cell for k in (0, 1))
+        n = [float(v) for v in p["normal"]]
+        if abs(n[2]) < edge_on and max(abs(east), abs(north)) <= 0.75:
+            return nothing
+        share = max(1 - abs(east), 0.0) * max(1 - abs(north), 0.0)
+        if n[2] >= edge_on and share > 1e-3:
+            lift = grid.cell * (east * n[0] + north * n[1]) / n[2]
+            steep = math.hypot(n[0], n[1]) / n[2]
+            entries.append((float(p["enu"][2]) + lift, float(p["sigma"]) / n[2],
+                            float(p["shared"]) / n[2], steep, share, p))  # fmt: skip
+    if not entries:
+        return nothing
+    entries.sort(key=lambda entry: -entry[0])
+    layers = [[entries[0]]]
+    for above, below in pairwise(entries):
+        gap = 5 * math.hypot(above[1], below[1])
+        gap += grid.cell * (1 + math.sqrt(2) * max(above[3], below[3]))
+        if above[0] - below[0] > gap:
+            layers.append([])
+        layers[-1].append(below)
+    most = max(entry[5]["stations"] for entry in entries)
+    layers = [
+        layer
+        for layer in layers
+        if sum(entry[4] for entry in layer) >= 0.25
+        and max(entry[5]["stations"] for entry in layer) >= min(2, most)
+    ]
+    if not layers:
+        return nothing
+
+    def mean(layer: list[tuple], value: int) -> float:
+        weights = [entry[4] / entry[1] ** 2 for entry in layer]
+        return float(np.average([entry[value] for entry in layer], weights=weights))
+
+    top = layers[0]
+    height = mean(top, 0)
+    scatter = mean([(entry[0], entry[1], entry[2], (entry[0] - height) ** 2, entry[4])
+                    for entry in top], 3)  # fmt: skip
+    nearest = max(top, key=lambda entry: entry[4])[5]
+    return {
+        "height": height,
+        "sigma": math.sqrt(mean(top, 1) ** 2 + scatter + mean(top, 2) ** 2),
+        "count": int(nearest["views"]),
+        "stations": int(nearest["stations"]),
+        "surfaces": len(layers),
+        "lower": mean(layers[-1], 0) if len(layers) > 1 else math.nan,
+    }
 
 
 def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> float:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,10 @@ FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
 _STEP = 2.0
 """Slope from which two cells have a step between them."""
+STRAY_CELLS = 8
+"""Reach of the square around a cell in which others must be known."""
+_LEAST_COMPANY = 0.22
+"""Share of that square that must be known: what is more isolated is a rim of a wall, mostly."""
 _LEAST_WEIGHT = 1e-3
 _WALL_CELLS = 0.25
 """A wall empties cells that it is nearer to than this, along both axes."""
@@ -44,6 +49,18 @@ class FusedCells:
     """How many surfaces lie over each other; 0 in empty cells."""
     lower: Float32
     """Height of the lowest of several surfaces; NaN where there is one."""
+
+    def without(self, cells: NDArray[np.bool_]) -> "FusedCells":
+        """The same with some cells emptied."""
+        nan, none = np.float32(np.nan), np.uint8(0)
+        return FusedCells(
+            height=np.where(cells, nan, self.height),
+            sigma=np.where(cells, nan, self.sigma),
+            count=np.where(cells, np.uint16(0), self.count),
+            stations=np.where(cells, none, self.stations),
+            surfaces=np.where(cells, none, self.surfaces),
+            lower=np.where(cells, nan, self.lower),
+        )
 
 
 def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
@@ -278,3 +295,16 @@ def slope_deg(height: Float32, cell: float) -> Float32:
     steep = np.rad2deg(np.arctan(np.hypot(right - left, down - up) / (8 * cell)))
     slope: Float32 = np.where(np.isfinite(rise), steep, np.nan).astype(np.float32)
     return slope
+
+
+def without_strays(height: Float32) -> NDArray[np.bool_]:
+    """Which cells are not isolated: enough cells are known in the square around them.
+
+    Beyond the edge of the array a cell counts as unknown.
+    """
+    known = np.isfinite(height)
+    side = 2 * STRAY_CELLS + 1
+    share = cv2.boxFilter(
+        known.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_CONSTANT
+    )
+    return np.asarray(known & (share >= _LEAST_COMPANY))

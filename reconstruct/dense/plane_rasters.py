@@ -20,7 +20,14 @@ from reconstruct.dense.cloud import (
     write_cloud,
     write_cloud_json,
 )
-from reconstruct.dense.dem import FILL_CELLS, cells_over, fill_gaps, slope_deg
+from reconstruct.dense.dem import (
+    FILL_CELLS,
+    STRAY_CELLS,
+    cells_over,
+    fill_gaps,
+    slope_deg,
+    without_strays,
+)
 from reconstruct.dense.pose_part import ErrorsOfPoses
 from reconstruct.dense.surface_tiles import (
     FuseSetup,
@@ -43,6 +50,7 @@ CELL_PIXELS = 2.5
 _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 _TILE_CELLS = 256
+_RIM = FILL_CELLS + STRAY_CELLS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -234,10 +242,10 @@ def _project(
     tasks = []
     for window in tiles_of(grid, _TILE_CELLS):
         part = grid.window(
-            int(window.row_off) - FILL_CELLS,
-            int(window.col_off) - FILL_CELLS,
-            int(window.height) + 2 * FILL_CELLS,
-            int(window.width) + 2 * FILL_CELLS,
+            int(window.row_off) - _RIM,
+            int(window.col_off) - _RIM,
+            int(window.height) + 2 * _RIM,
+            int(window.width) + 2 * _RIM,
         )
         tasks.append((window, part, tiles_over(tiles, plane, part)))
     label = "project" if plane.is_level else f"project {plane.name}"
@@ -258,15 +266,16 @@ def project_tile(
     Args:
         setup: of the surface.
         plane: to project on.
-        task: the tile, the grid of it with a rim of `FILL_CELLS`, and tiles of the surface over it.
+        task: the tile, the grid of it with a rim, and tiles of the surface over it.
     """
     window, grid, tiles = task
     up = _middle_up(setup, plane)
     origin = np.array([grid.west, grid.north, up])
     surface = on_plane(setup, tiles, plane, origin)
     cells = cells_over(grid.moved(-grid.west, -grid.north), surface)
+    cells = cells.without(~without_strays(cells.height))
     height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
-    inner = (slice(FILL_CELLS, -FILL_CELLS), slice(FILL_CELLS, -FILL_CELLS))
+    inner = (slice(_RIM, -_RIM), slice(_RIM, -_RIM))
     return RasterTile(
         window=window,
         height=(height[inner] + up).astype(np.float32),

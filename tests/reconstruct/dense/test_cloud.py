@@ -5,52 +5,57 @@ import numpy as np
 from alice_survey.base.artefacts import read_json
 from reconstruct.dense.cloud import (
     VERTEX,
-    thinned_points,
+    vertices_of,
     voxel_edge,
     write_cloud,
     write_cloud_json,
 )
-from reconstruct.dense.points import Points
-from reconstruct.raster import DemGrid
+from reconstruct.dense.surface_points import SURFACE_POINT
 from tests.oracles_dense import FRAME
 
-GRID = DemGrid(west=0.0, north=1.0, cell=0.1, rows=10, columns=10)
 
-
-def random_points(count: int = 4000) -> Points:
+def random_surface(count: int = 4000) -> np.ndarray:
     rng = np.random.default_rng(6)
     normals = rng.normal(np.array([0.0, 0.0, 4.0]), 1.0, (count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals[::50] = np.nan
-    return Points(
-        enu=rng.uniform([-0.05, -0.05, -0.3], [1.05, 1.05, 0.3], (count, 3)).astype(np.float32),
-        normals=normals.astype(np.float32),
-        colours=rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        sigmas=rng.uniform(0.002, 0.02, count).astype(np.float32),
-        views=np.zeros(count, np.int32),
+    found = np.zeros(count, SURFACE_POINT)
+    found["enu"] = rng.uniform([0.0, 0.0, -0.3], [1.0, 1.0, 0.3], (count, 3))
+    found["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    found["colour"] = rng.integers(0, 256, (count, 3))
+    found["sigma"] = rng.uniform(0.002, 0.02, count)
+    found["shared"] = rng.uniform(0.0, 0.01, count)
+    return found
+
+
+def test_each_point_of_the_surface_is_a_vertex_with_all_of_its_sigma():
+    surface = random_surface()
+    vertices = vertices_of(surface, 0.1, 0.1)
+    np.testing.assert_array_equal(np.column_stack([vertices[a] for a in "xyz"]), surface["enu"])
+    colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")])
+    np.testing.assert_array_equal(colours, surface["colour"])
+    np.testing.assert_allclose(
+        vertices["sigma"] ** 2, surface["sigma"] ** 2 + surface["shared"] ** 2, rtol=1e-5
     )
 
 
-def test_one_vertex_per_cube_with_the_weighted_mean_of_its_points():
-    points = random_points()
-    vertices = thinned_points(GRID, points)
+def test_larger_cubes_take_the_weighted_mean_of_their_points():
+    surface = random_surface()
+    sigmas = np.hypot(surface["sigma"].astype(float), surface["shared"])
+    vertices = vertices_of(surface, 0.05, 0.1)
     cubes: dict[tuple[int, int, int], list[int]] = {}
-    for number, (east, north, up) in enumerate(points.enu.astype(np.float64).tolist()):
-        key = (int((1.0 - north) // 0.1), int(east // 0.1), int(up // 0.1))
-        inside = 0 <= key[0] < 10 and 0 <= key[1] < 10
-        if inside and np.isfinite(points.normals[number]).all():
-            cubes.setdefault(key, []).append(number)
+    for number, (east, north, up) in enumerate(surface["enu"].astype(np.float64).tolist()):
+        cubes.setdefault((int(east // 0.1), int(north // 0.1), int(up // 0.1)), []).append(number)
     assert len(vertices) == len(cubes)
     for vertex, key in zip(vertices, sorted(cubes), strict=True):
         members = cubes[key]
-        w = 1 / points.sigmas[members].astype(np.float64) ** 2
-        place = np.average(points.enu[members], axis=0, weights=w)
+        w = 1 / sigmas[members] ** 2
+        place = np.average(surface["enu"][members], axis=0, weights=w)
         np.testing.assert_allclose([vertex["x"], vertex["y"], vertex["z"]], place, atol=1e-5)
-        colour = np.average(points.colours[members], axis=0, weights=w)
+        colour = np.average(surface["colour"][members], axis=0, weights=w)
         found = [vertex["red"], vertex["green"], vertex["blue"]]
         np.testing.assert_allclose(found, colour, atol=0.51)
-        sigma = np.average(points.sigmas[members], weights=w)
-        np.testing.assert_allclose(vertex["sigma"], sigma, rtol=1e-4)
+        np.testing.assert_allclose(
+            vertex["sigma"], np.average(sigmas[members], weights=w), rtol=1e-4
+        )
     length = np.sqrt(vertices["nx"] ** 2 + vertices["ny"] ** 2 + vertices["nz"] ** 2)
     np.testing.assert_allclose(length, 1.0, atol=1e-5)
 
@@ -58,7 +63,7 @@ def test_one_vertex_per_cube_with_the_weighted_mean_of_its_points():
 def test_ply_is_read_back_by_another_library(tmp_path):
     import open3d as o3d
 
-    vertices = thinned_points(GRID, random_points())
+    vertices = vertices_of(random_surface(), 0.1, 0.1)
     parts = [vertices[:100], vertices[100:100], vertices[100:]]
     count = write_cloud(tmp_path / "cloud.ply", parts, (1.0, 2.0, -12.0), FRAME)
     assert count == len(vertices)

@@ -1,29 +1,104 @@
-import math
-
 import numpy as np
 import pytest
 
-from reconstruct.dense.dem import (
-    bin_points,
-    fill_gaps,
-    fuse_cells,
-    fuse_points,
-    slope_deg,
-    without_strays,
-)
-from reconstruct.dense.points import Points
+from reconstruct.dense.dem import cells_over, fill_gaps, slope_deg, without_strays
+from reconstruct.dense.surface_points import SURFACE_POINT
 from reconstruct.raster import DemGrid, grid_over, round_cell
-from tests.oracles_dense import fused, surfaces
+from tests.oracles_dense import projected
+
+GRID = DemGrid(west=0.0, north=1.2, cell=0.1, rows=12, columns=15)
 
 
-def points(enu: np.ndarray, sigmas: np.ndarray, views: np.ndarray) -> Points:
-    return Points(
-        enu=enu.astype(np.float32),
-        normals=np.tile(np.array([0, 0, 1], np.float32), (len(enu), 1)),
-        colours=np.zeros((len(enu), 3), np.uint8),
-        sigmas=sigmas.astype(np.float32),
-        views=views.astype(np.int32),
+def surface(enu: np.ndarray, normals: np.ndarray, sigma: float = 0.01) -> np.ndarray:
+    found = np.zeros(len(enu), SURFACE_POINT)
+    found["enu"], found["normal"], found["sigma"] = enu, normals, sigma
+    found["views"], found["stations"] = 4, 2
+    return found
+
+
+def plane_points(rise: tuple[float, float], shift: float, turn_deg: float) -> np.ndarray:
+    """Points of a lattice of the cells' size that is shifted and turned, on a plane."""
+    i, j = np.mgrid[-30:30, -30:30] * 0.1
+    turn = np.deg2rad(turn_deg)
+    east = np.cos(turn) * i - np.sin(turn) * j + shift
+    north = np.sin(turn) * i + np.cos(turn) * j - 0.3 * shift
+    up = 2.0 + rise[0] * east + rise[1] * north
+    normal = np.array([-rise[0], -rise[1], 1.0]) / np.sqrt(1 + rise[0] ** 2 + rise[1] ** 2)
+    enu = np.stack([east.ravel(), north.ravel(), up.ravel()], axis=1)
+    return surface(enu, np.tile(normal, (len(enu), 1)))
+
+
+@pytest.mark.parametrize("rise", [(0.0, 0.0), (0.4, -1.0), (-2.0, 1.5)])
+@pytest.mark.parametrize(("shift", "turn_deg"), [(0.05, 0.0), (0.031, 0.0), (0.02, 37.0)])
+def test_heights_of_a_plane_are_exact_wherever_its_points_lie(
+    rise: tuple[float, float], shift: float, turn_deg: float
+):
+    """Cells between the points of a turned lattice may have too few of them; most have not."""
+    found = cells_over(GRID, plane_points(rise, shift, turn_deg))
+    east, north = np.meshgrid(GRID.east_of(np.arange(15) + 0.5), GRID.north_of(np.arange(12) + 0.5))
+    known = np.isfinite(found.height)
+    assert known.mean() > 0.99
+    expected = 2.0 + rise[0] * east + rise[1] * north
+    np.testing.assert_allclose(found.height[known], expected[known], atol=2e-5)
+    slope = np.sqrt(1 + rise[0] ** 2 + rise[1] ** 2)  # errors are along the normal
+    np.testing.assert_allclose(found.sigma[known], 0.01 * slope, rtol=1e-3)
+    assert (found.count[known] == 4).all()
+    assert (found.surfaces[known] == 1).all()
+
+
+def test_cells_over_equals_its_slow_twin():
+    rng = np.random.default_rng(2)
+    count = 700
+    enu = rng.uniform([-0.1, -0.1, 0.0], [1.6, 1.3, 0.1], (count, 3))
+    enu[rng.random(count) < 0.3, 2] += 1.0
+    enu[rng.random(count) < 0.2, 2] += 0.5
+    normals = rng.normal([0.0, 0.0, 1.5], 0.5, (count, 3))
+    normals[rng.random(count) < 0.05, 2] = 0.0
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = surface(enu, normals)
+    points["sigma"] = rng.uniform(0.002, 0.02, count)
+    points["shared"] = rng.uniform(0.0, 0.01, count)
+    points["views"] = rng.integers(1, 9, count)
+    points["stations"] = rng.integers(1, 4, count)
+
+    found = cells_over(GRID, points)
+
+    several = 0
+    for row in range(GRID.rows):
+        for column in range(GRID.columns):
+            expected = projected(GRID, points, row, column)
+            for name, value in expected.items():
+                np.testing.assert_allclose(
+                    getattr(found, name)[row, column], value, rtol=2e-4, atol=2e-5, err_msg=name
+                )
+            several += expected["surfaces"] > 1
+    assert 20 < several < 150
+    assert 5 < np.isnan(found.height).sum() < 150
+
+
+def test_a_wall_empties_the_cells_it_stands_in_and_no_others():
+    floor = plane_points((0.0, 0.0), 0.05, 0.0)
+    up = np.arange(0.0, 1.0, 0.1)
+    wall = surface(
+        np.column_stack([np.full(10, 0.75), np.full(10, 0.45), up]),
+        np.tile([0.0, -1.0, 0.05], (10, 1)) / np.hypot(1.0, 0.05),
     )
+    found = cells_over(GRID, np.concatenate([floor, wall]))
+    empty = np.isnan(found.height)
+    assert empty[7, 7]
+    assert empty.sum() == 1
+
+
+def test_no_step_is_bridged():
+    height = np.full((12, 20), 1.0, np.float32)
+    height[:, 10:] = 1.5
+    height[:, 9:11] = np.nan
+    sigma = np.where(np.isnan(height), np.nan, 0.01).astype(np.float32)
+    low, _ = fill_gaps(height, sigma, 3, 0.05)  # 0.5 over 3 cells: a step
+    assert np.isnan(low[:, 9:11]).all()
+    high, spread = fill_gaps(height, sigma, 3, 0.1)
+    assert np.isfinite(high[3:9, 9:11]).all()
+    assert (spread[3:9, 9:11] > 0.2).all()  # half of what lies between
 
 
 def test_grid_covers_its_boxes_on_whole_cells():
@@ -45,83 +120,6 @@ def test_cells_have_two_digits(length: float, cell: float):
     assert round_cell(length) == pytest.approx(cell)
 
 
-def test_bin_points_equals_a_dictionary_of_cells():
-    rng = np.random.default_rng(1)
-    enu = rng.uniform(-1, 4, (500, 3)).astype(np.float32)
-    starts, order = bin_points(enu, 3.0, 0.0, 0.5, 6, 5)
-    cells: dict[int, list[int]] = {n: [] for n in range(30)}
-    for number, (east, north, _) in enumerate(enu.tolist()):
-        row, column = math.floor((3.0 - north) / 0.5), math.floor(east / 0.5)
-        if 0 <= row < 6 and 0 <= column < 5:
-            cells[row * 5 + column].append(number)
-    for cell, members in cells.items():
-        assert order[starts[cell] : starts[cell + 1]].tolist() == members
-    assert 0 < len(order) < 500
-
-
-def test_fuse_cells_equals_its_slow_twin():
-    rng = np.random.default_rng(2)
-    sizes = rng.integers(0, 24, 200)
-    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    heights = rng.normal(0, 0.01, starts[-1]).astype(np.float32)
-    heights[rng.random(len(heights)) < 0.3] += np.float32(0.4)
-    heights[rng.random(len(heights)) < 0.1] += np.float32(0.3)
-    sigmas = rng.uniform(0.002, 0.02, len(heights)).astype(np.float32)
-    views = np.concatenate([np.sort(rng.integers(0, 4, n)) for n in sizes]).astype(np.int32)
-    steepness = rng.exponential(3.0, len(heights)).astype(np.float32)
-    steepness[rng.random(len(heights)) < 0.3] = np.nan
-
-    stations = np.array([5, 5, 9, 2])
-
-    height, sigma, count, met, number, lower = fuse_cells(
-        starts, heights, sigmas, views, stations, steepness, 0.05, 3.0
-    )
-
-    for cell, size in enumerate(sizes):
-        part = slice(starts[cell], starts[cell + 1])
-        if size == 0:
-            assert np.isnan(height[cell])
-            assert count[cell] == number[cell] == 0
-            continue
-        parts = surfaces(heights[part], sigmas[part], stations[views[part]], steepness[part], 0.05)
-        assert number[cell] == len(parts)
-        results = [
-            fused(heights[p], sigmas[p], views[p], stations, 3.0)
-            for p in (starts[cell] + np.sort(members) for members in parts)
-        ]
-        h, s, n, places = results[0]
-        np.testing.assert_allclose(height[cell], h, atol=2e-6)
-        np.testing.assert_allclose(sigma[cell], s, rtol=1e-3)
-        assert count[cell] == n
-        assert met[cell] == places
-        below = results[-1][0] if len(parts) > 1 else np.nan
-        np.testing.assert_allclose(lower[cell], below, atol=2e-6)
-    assert 20 < (number > 1).sum() < 150
-
-
-def test_heights_are_up_and_rows_go_south():
-    grid = DemGrid(west=0.0, north=2.0, cell=1.0, rows=2, columns=2)
-    enu = np.array([[0.5, 1.5, -10.0], [1.5, 1.5, -11.0], [0.5, 0.5, -12.0]])
-    found = fuse_points(grid, points(enu, np.full(3, 0.01), np.arange(3)), np.arange(3))
-    np.testing.assert_allclose(found.height[[0, 0, 1], [0, 1, 0]], [-10, -11, -12])
-    assert np.isnan(found.height[1, 1])
-    assert found.count.tolist() == [[1, 1], [1, 0]]
-    assert found.surfaces.tolist() == [[1, 1], [1, 0]]
-
-
-def test_a_few_outliers_do_not_move_a_cell():
-    rng = np.random.default_rng(3)
-    grid = DemGrid(west=0.0, north=1.0, cell=1.0, rows=1, columns=1)
-    enu = np.column_stack([rng.uniform(0.1, 0.9, (60, 2)), rng.normal(5.0, 0.003, 60)])
-    stations = np.arange(6)
-    clean = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
-    enu[::6, 2] += 0.3
-    dirty = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
-    assert abs(dirty.height[0, 0] - clean.height[0, 0]) < 0.001
-    assert abs(clean.height[0, 0] - 5.0) < 3 * clean.sigma[0, 0]
-    assert 0.0005 < clean.sigma[0, 0] < 0.003  # six views, each 3 mm
-
-
 def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():
     rows, columns = np.mgrid[:30, :40]
     plane = (0.1 * rows - 0.05 * columns + 3.0).astype(np.float32)
@@ -130,7 +128,7 @@ def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():
     holed[12:26, 15:30] = np.nan
     sigma = np.where(np.isnan(holed), np.nan, 0.01).astype(np.float32)
 
-    height, spread = fill_gaps(holed, sigma, 3)
+    height, spread = fill_gaps(holed, sigma, 3, 1.0)
 
     np.testing.assert_allclose(height[5:8, 5:8], plane[5:8, 5:8], atol=1e-5)
     assert (spread[5:8, 5:8] > 0.01).all()
@@ -138,7 +136,7 @@ def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():
     known = ~np.isnan(holed)
     np.testing.assert_array_equal(height[known], holed[known])
     edge = np.where(columns < 20, plane, np.nan).astype(np.float32)
-    assert np.isnan(fill_gaps(edge, np.full_like(edge, 0.01), 3)[0][:, 20:]).all()
+    assert np.isnan(fill_gaps(edge, np.full_like(edge, 0.01), 3, 1.0)[0][:, 20:]).all()
 
 
 def test_strays_go_and_a_sheet_with_its_edge_stays():

@@ -109,15 +109,14 @@ def test_a_turned_plane_has_the_heights_of_the_level_one(level: Path):
     column, row = (-west - east[0, 0]) / 0.01, (north[0, 0] - up_north) / 0.01
     there = map_coordinates(height, [row, column], order=1, cval=np.nan)
     known = np.isfinite(there) & np.isfinite(turned)
-    assert known.mean() > 0.8
+    assert known.mean() > 0.75
     difference = np.abs(there - turned)[known]
     assert np.median(difference) < 2e-6  # the same cells, of the same points
     assert np.mean(difference > 1e-3) < 0.005  # ends of views and bridged gaps
     for name in ("surfaces", "count"):
         one = read(level / "dense" / f"{name}.tif")[0]
         other = read(level / "dense" / "planes" / "turned" / f"{name}.tif")[0]
-        # without the rims of pictures, whose normals nobody knows
-        assert 0.95 < other.sum() / one.sum() < 1.0
+        assert other.sum() == pytest.approx(one.sum(), rel=1e-3)
 
 
 def test_the_wall_has_its_relief(wall: tuple[Path, list[str]]):

@@ -3,13 +3,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import heard
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
-from reconstruct.dense.pose_part import PosePart, find_errors_of_poses, spread_over
-from reconstruct.planes import LEVEL_PLANE, Plane, facing
+from reconstruct.dense.pose_part import ErrorsOfPoses, find_errors_of_poses
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 from tests.oracles_dense import write_workspace as write
@@ -50,26 +48,20 @@ def test_what_pixels_do_is_taken_out(workspace: Path):
     model = read_model(workspace / "sparse")
     errors = find_errors_of_poses(workspace, model)
     assert errors is not None
-    part = errors.over(LEVEL_PLANE)
-    assert part.median == pytest.approx(0.003, rel=1e-3)
-    nodes = part.at_nodes(0.8, -0.4, 0.01, 100, 70)
-    assert nodes.shape == (8, 6)
-    np.testing.assert_allclose(nodes, 0.003, rtol=0.01)
+    assert errors.median_along(np.array([0.0, 0.0, -1.0])) == pytest.approx(0.003, rel=1e-3)
 
 
-def test_a_wall_takes_what_is_unsure_along_its_normal(workspace: Path):
+@pytest.mark.parametrize(("azimuth_deg", "expected"), [(0.0, 1.0), (180.0, 1.0), (60.0, 0.5)])
+def test_a_wall_takes_what_is_unsure_along_its_normal(
+    workspace: Path, azimuth_deg: float, expected: float
+):
     model = read_model(workspace / "sparse")
     errors = find_errors_of_poses(workspace, model)
     assert errors is not None
-    for direction, lean, expected in ((0.0, 0.0, 1.0), (180.0, 0.0, 1.0), (60.0, 0.0, 0.5)):
-        wall = Plane(
-            name="wall",
-            about="",
-            plane_from_world=RigidTransform.from_rotation(facing(direction, lean)),
-        )
-        assert errors.over(wall).median == pytest.approx(expected, rel=1e-6)
-    up = model.points_world[:, 2].max() + 1.0
-    assert (errors.over(wall).places[:, 0] > -up).all()  # up the wall: minus the depth
+    azimuth = np.deg2rad(azimuth_deg)
+    normal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    found = errors.at(model.points_world, np.tile(normal, (len(model.points_world), 1)), 0.1)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_a_covariance_of_another_model_is_not_taken(workspace: Path):
@@ -80,14 +72,21 @@ def test_a_covariance_of_another_model_is_not_taken(workspace: Path):
     assert len(warnings) == 1
 
 
-def test_nodes_take_the_median_of_the_points_around_and_cells_lie_between():
+def test_a_point_takes_the_median_of_sparse_points_around_also_of_a_part_of_them():
     rng = np.random.default_rng(2)
-    places = rng.uniform(0, 1, (4000, 2))
+    places = np.column_stack([rng.uniform(0, 1, (4000, 2)), np.zeros(4000)])
     sigmas = 0.001 + 0.002 * places[:, 1]  # growing eastwards
     sigmas[::9] = 1.0  # wrong matches
-    part = PosePart(places=places, variances=sigmas**2)
-    nodes = part.at_nodes(1.0, 0.0, 0.01, 100, 100)
-    cells = spread_over(nodes, 100, 100)
-    assert cells.shape == (100, 100)
-    expected = 0.001 + 0.002 * (np.arange(100) + 0.5) * 0.01
-    np.testing.assert_allclose(cells[50, 5:95], expected[5:95], rtol=0.08)
+    covariances = np.zeros((4000, 3, 3))
+    covariances[:, 2, 2] = sigmas**2
+    errors = ErrorsOfPoses(points_world=places, covariances=covariances)
+    east = np.linspace(0.1, 0.9, 50)
+    spots = np.column_stack([np.full(50, 0.5), east, np.zeros(50)])
+    up = np.tile([0.0, 0.0, -1.0], (50, 1))
+    found = errors.at(spots, up, 0.02)
+    np.testing.assert_allclose(found, 0.001 + 0.002 * east, rtol=0.12)
+    part = errors.around(np.array([0.45, 0.05]), np.array([0.55, 0.95]))
+    assert len(part.points_world) <= len(places)
+    np.testing.assert_array_equal(part.at(spots, up, 0.02), found)
+    few = errors.around(np.array([9.0, 9.0]), np.array([9.1, 9.1]))  # far from all
+    assert len(few.points_world) >= 16

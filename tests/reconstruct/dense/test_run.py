@@ -173,7 +173,7 @@ def test_an_interruption_while_a_plane_is_written_costs_nothing(
         interrupted.setattr(plane_rasters, "preview_dem", stop)
         with pytest.raises(KeyboardInterrupt):
             spec("dense").make(tmp_path, CONFIG, SERIAL)
-    assert (tmp_path / "dense.partial" / "planes").exists()
+    assert (tmp_path / "dense.partial" / "dem.tif").exists()
     assert spec("dense").make(tmp_path, CONFIG, SERIAL)
     for name in ("dem.tif", "sigma.tif", "cloud.ply"):
         assert (tmp_path / "dense" / name).read_bytes() == (workspace / "dense" / name).read_bytes()
