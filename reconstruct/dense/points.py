@@ -18,8 +18,10 @@ _BLOCK = 16
 _ROUNDING = 1e-6
 """Relative rounding of coordinates as float32; kernels and arrays differ by less."""
 EDGE_ON = math.cos(math.radians(80.0))
-"""Least cosine between a surface's normal and the way to its viewer for it to count as seen: what
-lies more on edge mostly is none, but the step between a foreground and what is behind it."""
+"""Least cosine between a surface's normal and the way to a plane's viewer for it to be seen."""
+_GRAZING = math.cos(math.radians(72.0))
+"""The same of a ray: depths that lie more on edge are mostly of no surface, but of the step
+between a foreground and what is behind it."""
 _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 
@@ -226,7 +228,7 @@ def gather(
             n0, n1, n2 = other[0], other[1], other[2]
             x, y = slopes[row, column, 0], slopes[row, column, 1]
             along = abs(x * n0 + y * n1 + n2) / length
-            if along < EDGE_ON * math.sqrt(x * x + y * y + 1.0):
+            if along < _GRAZING * math.sqrt(x * x + y * y + 1.0):
                 continue
             sigmas[i] *= along
             for k in range(3):
