@@ -218,6 +218,8 @@ class PortRecord(JsonRecord):
     prior_sigmas: tuple[float | None, ...]
     sigmas: tuple[float | None, ...]
     correlation: tuple[tuple[float, ...], ...]
+    contradiction: str | None = None
+    """What the pictures say against the calibration, in words."""
 
 
 class MountRecord(JsonRecord):

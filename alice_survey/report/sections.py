@@ -355,6 +355,8 @@ def _camera(figures: Figures) -> Section:
             f"The survey's own pictures refined the rig from {refined.observations:,} "
             f"observations at {refined.stations} stations, within what calibration knew."
         )
+        if refined.contradiction is not None:
+            text.append(f"But {refined.contradiction}.")
         tables.append(
             Table(
                 title="Rig refined by the survey",

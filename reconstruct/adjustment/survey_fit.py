@@ -41,6 +41,7 @@ from reconstruct.adjustment.normal_equations import (
     PointEquations,
     reduce_parts,
 )
+from reconstruct.adjustment.rig_evidence import Contradiction, contradiction
 from reconstruct.adjustment.soft_modes import Motions, SoftModes
 from reconstruct.mapping.arrays import (
     LEAST_POINTS,
@@ -80,7 +81,8 @@ class SurveyFit:
     """What was adjusted of the rig."""
     before: Array
     """(G,) values, in the parameters' units."""
-    prior_sigmas: Array
+    prior_covariance: Array
+    """(G, G) covariance of the values before."""
     covariance: Array
     """(G, G) covariance of the values."""
     calibration: Motions | None
@@ -93,6 +95,17 @@ class SurveyFit:
     def after(self) -> Array:
         """(G,) adjusted values."""
         return np.array([value(self.state.rig, name) for name in self.parameters])
+
+    @property
+    def prior_sigmas(self) -> Array:
+        """(G,) sigmas of the values before."""
+        return np.sqrt(np.diag(self.prior_covariance))
+
+    @property
+    def contradiction(self) -> Contradiction | None:
+        """What the pictures say against the calibration; None where they agree with it."""
+        change = self.after - self.before
+        return contradiction(self.parameters, change, self.prior_covariance, self.covariance)
 
     @cached_property
     def rig(self) -> Rig:
@@ -139,7 +152,9 @@ class SurveyFit:
     def to_json(self) -> dict[str, Any]:
         """What `port.json` says."""
         known = Covariance(parameters=self.parameters, matrix=self.covariance)
+        found = self.contradiction
         return {
+            "contradiction": None if found is None else found.words,
             "parameters": list(self.parameters),
             "before": self.before.tolist(),
             "after": self.after.tolist(),
@@ -192,7 +207,7 @@ def fit_survey(
         point_ids=ids,
         parameters=problem.fields,
         before=np.array([value(problem.start.state.rig, name) for name in problem.fields]),
-        prior_sigmas=np.sqrt(np.diag(inverse_of(problem.information))),
+        prior_covariance=inverse_of(problem.information),
         covariance=covariance,
         calibration=motions_of(equations, guess.state.points, known) if fields else None,
         sigma_px=float(np.sqrt(variance / weights.mean())),

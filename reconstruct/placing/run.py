@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.records import (
@@ -122,6 +123,8 @@ def run_sparse(
     CamerasRecord.save(folder / "cameras.json", cameras)
     if adjusted.exact is not None and adjusted.exact.fit.parameters:
         PortRecord.save(folder / "port.json", adjusted.exact.fit.to_json())
+        if adjusted.exact.fit.contradiction is not None:
+            warn(adjusted.exact.fit.contradiction.words)
         write_rig(folder / "rig.json", adjusted.exact.fit.rig)
     write_frame(folder / "frame.json", placed.frame)
     rig = adjusted.rig
