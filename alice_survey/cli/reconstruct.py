@@ -26,6 +26,7 @@ reconstruct_app = typer.Typer(
         "reconstruct -w reef",
         "reconstruct -w reef --threads 2 --json",
         "reconstruct -w quay --plane level --plane 'wall=facing 180'",
+        "reconstruct -w reef --export undistorted",
         "reconstruct pair left.png right.png --rig rig.json -o stingray",
     ),
 )
@@ -43,6 +44,13 @@ def reconstruct(
             "'NAME=facing DEGREES tilt DEGREES': where the surface faces, and its lean back."
         ),
     ] = None,
+    export: Annotated[
+        Literal["undistorted"] | None,
+        typer.Option(
+            help="Then write for other programs: pictures without refraction and distortion, with "
+            "the COLMAP model and nerfstudio's transforms.json."
+        ),
+    ] = None,
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
@@ -55,8 +63,14 @@ def reconstruct(
         from alice_survey.survey import run
 
         stages = names("calibrate", "reconstruct")
-        result = run(stages, workspace, survey, None, executor_of(threads), planes=plane)
-        print_result(*result, as_json)
+        executor = executor_of(threads)
+        text, values = run(stages, workspace, survey, None, executor, planes=plane)
+        if export is not None:
+            from reconstruct.export.undistorted import export_undistorted
+
+            more, values[export] = export_undistorted(workspace, executor)
+            text = f"{text}\n{more}"
+        print_result(text, values, as_json)
 
 
 @reconstruct_app.command(

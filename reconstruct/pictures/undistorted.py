@@ -183,6 +183,10 @@ class Pictures:
             return None
         return read_mask(self._images / self._masks[image], self.warp(image).size_px)
 
+    def maps(self, image: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where each pixel of a picture's pinhole lies in it as taken; see `undistortion_maps`."""
+        return self._maps(self._cameras[image])
+
     def colour(self, image: str) -> Colour:
         """A picture as its pinhole sees it, (H, W, 3) BGR; black where there is nothing.
 

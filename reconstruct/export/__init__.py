@@ -1,0 +1,1 @@
+"""Roads out: the model and its pictures as other programs take them."""

@@ -1,0 +1,133 @@
+"""Exported pictures against exact rays, and their files as other programs read them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import SERIAL
+from reconstruct.evaluate.mesh import read_mesh
+from reconstruct.export.undistorted import bilinear, export_undistorted, exported_name
+from reconstruct.views.model import View, read_model, read_warps
+
+
+@pytest.fixture(scope="module")
+def workspace(small_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished survey whose pictures are exported; one picture has a mask of its own."""
+    folder = tmp_path_factory.mktemp("export") / "survey"
+    shutil.copytree(small_survey, folder)
+    export_undistorted(folder, SERIAL)
+    return folder
+
+
+def seen_points(view: View, workspace: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the mesh that a view's pinhole sees first, world and camera, by a z-buffer."""
+    vertices, triangles = read_mesh(workspace / "mesh")
+    points = vertices[triangles].mean(axis=1)
+    local = view.world_from_cam.inv().apply(points)
+    pixels = view.pinhole.project(local)
+    inside = (local[:, 2] > 0) & (pixels > 12).all(axis=1)
+    inside &= (pixels < np.array(view.pinhole.size_px) - 12).all(axis=1)
+    points, local, pixels = points[inside], local[inside], pixels[inside]
+    block = (pixels // 12).astype(int)
+    key = block[:, 1] * 10_000 + block[:, 0]
+    nearest: dict[int, float] = {}
+    for k, z in zip(key.tolist(), local[:, 2].tolist(), strict=True):
+        nearest[k] = min(nearest.get(k, np.inf), z)
+    first = local[:, 2] < np.array([nearest[k] for k in key.tolist()]) + 0.01
+    return points[first], local[first]
+
+
+def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path):
+    """The path of a pixel is found again by tracing positions through the exported resampling."""
+    model = read_model(workspace / "sparse")
+    warps = read_warps(workspace / "sparse" / "cameras.json")
+    exported = pycolmap.Reconstruction(workspace / "undistorted" / "sparse" / "0")
+    images = {image.name: image for image in exported.images.values()}
+    from reconstruct.export import undistorted
+    from reconstruct.pictures.undistorted import Pictures
+
+    for view in (model.views[0], model.views[-1]):
+        points, local = seen_points(view, workspace)
+        at = np.array([images[view.image].project_point(p) for p in points])
+        warp = warps[view.camera]
+        exact = warp.camera.project(warp.pinhole_from_cam.inv().apply(local))
+        scene = undistorted.scene_of(workspace / "mesh")
+        depth = undistorted.surface_depth(view, *scene)
+        maps = undistorted.taken_at(Pictures.open(workspace), view, depth)
+        found = 0.5 + np.stack(
+            [bilinear(one, at[:, 0] - 0.5, at[:, 1] - 0.5) for one in maps], axis=1
+        )
+        known = np.isfinite(found).all(axis=1) & np.isfinite(exact).all(axis=1)
+        assert known.sum() > 300
+        miss = np.linalg.norm(found - exact, axis=1)[known]
+        assert np.percentile(miss, 99) < 1e-3
+        one_distance = np.linalg.norm(warp.from_pinhole(at) - exact, axis=1)[known]
+        assert np.percentile(one_distance, 99) > 3 * np.percentile(miss, 99)
+
+
+def test_other_programs_read_what_was_written(workspace: Path):
+    folder = workspace / "undistorted"
+    text, binary = (pycolmap.Reconstruction(folder / name) for name in ("sparse", "sparse/0"))
+    assert (
+        text.num_reg_images()
+        == binary.num_reg_images()
+        == len(read_model(workspace / "sparse").views)
+    )
+    points = np.array([p.xyz for p in binary.points3D.values()])[::10]
+    enu = points[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    about = json.loads((folder / "transforms.json").read_text())
+    images = {image.name: image for image in text.images.values()}
+    assert about["camera_model"] == "PINHOLE"
+    assert len(about["frames"]) == len(images)
+    for frame in about["frames"]:
+        picture = cv2.imread(str(folder / frame["file_path"]))
+        mask = cv2.imread(str(folder / frame["mask_path"]), cv2.IMREAD_GRAYSCALE)
+        assert picture.shape[:2] == mask.shape == (frame["h"], frame["w"])
+        assert (picture[mask == 0] == 0).all()
+        assert 0.5 < (mask == 255).mean() <= 1.0
+        assert picture[mask > 0].std() > 5
+        # OpenGL: x right, y up, looking along -z
+        pose = np.array(frame["transform_matrix"])
+        local = (enu - pose[:3, 3]) @ pose[:3, :3]
+        u = frame["cx"] + frame["fl_x"] * local[:, 0] / -local[:, 2]
+        v = frame["cy"] - frame["fl_y"] * local[:, 1] / -local[:, 2]
+        image = images[frame["file_path"].removeprefix("images/")]
+        expected = [image.project_point(p) for p in points]
+        ahead = np.array([one is not None for one in expected])
+        np.testing.assert_allclose(
+            np.column_stack([u, v])[ahead],
+            np.array([e for e in expected if e is not None]),
+            atol=1e-3,
+            rtol=1e-6,
+        )
+    shown = json.loads((folder / "export.json").read_text())["on_surface"]
+    assert min(shown.values()) > 0.5
+
+
+def test_a_second_run_writes_nothing(workspace: Path):
+    picture = next((workspace / "undistorted" / "images").rglob("*.png"))
+    before = picture.stat().st_mtime_ns
+    text, values = export_undistorted(workspace, SERIAL)
+    assert picture.stat().st_mtime_ns == before
+    assert values["pictures"] == len(read_model(workspace / "sparse").views)
+    assert str(workspace / "undistorted") in text
+
+
+def test_without_a_mesh_the_command_that_makes_it_is_named(workspace: Path, tmp_path: Path):
+    (tmp_path / "sparse").symlink_to(workspace / "sparse")
+    with pytest.raises(WorkspaceError, match="reconstruct"):
+        export_undistorted(tmp_path, SERIAL)
+
+
+@pytest.mark.parametrize(
+    ("image", "name"),
+    [("left/7.png", "left/7.png"), ("DCIM/A.JPG", "DCIM/A.JPG"), ("a/b.webp", "a/b.png")],
+)
+def test_names_stay_where_the_format_can_be_written(image: str, name: str):
+    assert exported_name(image) == name
