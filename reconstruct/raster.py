@@ -123,7 +123,13 @@ def frame_tags(frame: WorldFrame) -> dict[str, str]:
 
 @contextmanager
 def tiled_raster(
-    path: Path, grid: DemGrid, frame: WorldFrame, dtype: str, nodata: float | None, text: str
+    path: Path,
+    grid: DemGrid,
+    frame: WorldFrame,
+    dtype: str,
+    nodata: float | None,
+    text: str,
+    unit: str = "",
 ) -> Iterator[Any]:
     """A one-band tiled GeoTIFF to write to, window by window.
 
@@ -134,6 +140,7 @@ def tiled_raster(
         dtype: of the band.
         nodata: value of unknown cells.
         text: what the band holds.
+        unit: of its values; none of numbers.
     """
     profile = {
         "driver": "GTiff",
@@ -155,6 +162,7 @@ def tiled_raster(
     with rasterio.open(path, "w", **profile) as raster:
         raster.update_tags(**frame_tags(frame))
         raster.set_band_description(1, text)
+        raster.set_band_unit(1, unit)
         yield raster
 
 
@@ -188,10 +196,15 @@ def opened_raster(path: Path) -> Iterator[Any]:
 
 def tiles_of(grid: DemGrid, size: int) -> list[Window]:
     """Windows of a grid, row by row; a multiple of `BLOCK` as size fits the blocks of files."""
+    return tiles_of_shape(grid.rows, grid.columns, size)
+
+
+def tiles_of_shape(rows: int, columns: int, size: int) -> list[Window]:
+    """The same of a raster of so many rows and columns."""
     return [
-        Window(column, row, min(size, grid.columns - column), min(size, grid.rows - row))
-        for row in range(0, grid.rows, size)
-        for column in range(0, grid.columns, size)
+        Window(column, row, min(size, columns - column), min(size, rows - row))
+        for row in range(0, rows, size)
+        for column in range(0, columns, size)
     ]
 
 

@@ -27,6 +27,7 @@ reconstruct_app = typer.Typer(
         "reconstruct -w reef --threads 2 --json",
         "reconstruct -w quay --plane level --plane 'wall=facing 180'",
         "reconstruct -w reef --export undistorted",
+        "reconstruct -w reef --crs EPSG:32636",
         "reconstruct pair left.png right.png --rig rig.json -o stingray",
     ),
 )
@@ -51,6 +52,13 @@ def reconstruct(
             "the COLMAP model and nerfstudio's transforms.json."
         ),
     ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="EPSG:N",
+            help="Then write rasters, cloud, mesh and track in this projected system too.",
+        ),
+    ] = None,
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
@@ -69,6 +77,11 @@ def reconstruct(
             from reconstruct.export.undistorted import export_undistorted
 
             more, values[export] = export_undistorted(workspace, executor)
+            text = f"{text}\n{more}"
+        if crs is not None:
+            from reconstruct.export.projected import export_projected
+
+            more, values["crs"] = export_projected(workspace, crs)
             text = f"{text}\n{more}"
         print_result(text, values, as_json)
 

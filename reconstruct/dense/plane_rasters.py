@@ -42,6 +42,7 @@ from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask, lay_out_view
 from reconstruct.light.solve import LightModel
 from reconstruct.planes import PLANES, Plane, plane_frame, write_plane
+from reconstruct.qgis import write_style
 from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster, tiles_of
 from reconstruct.views.model import SparseModel, WorldFrame
 
@@ -253,6 +254,8 @@ def _project(
     _write_rasters(folder, grid, plane_frame(frame, plane), found)
     write_plane(folder, plane, frame)
     preview_dem(folder / "dem.tif", folder / "dem.png")
+    for name, ramp in (("dem", "viridis"), ("sigma", "cividis")):
+        write_style(folder / f"{name}.tif", ramp, frame.unit)
     poses = confirmed.poses
     sigma = None if poses is None else float(f"{poses.median_along(plane.normal_world):.3g}")
     return Fused(plane=plane, grid=grid, pose_sigma=sigma)
@@ -301,33 +304,34 @@ def _write_rasters(
     up = "towards its viewer" if frame.name == "plane" else "up"
     over = f"above {frame.vertical_datum}, {up} ({unit})"
     bands = {
-        "height": ("dem", "float32", nan, f"height {over}"),
-        "sigma": ("sigma", "float32", nan, f"standard deviation of the height ({unit})"),
-        "slope": ("slope", "float32", nan, "steepest slope (degrees)"),
+        "height": ("dem", "float32", nan, f"height {over}", unit),
+        "sigma": ("sigma", "float32", nan, f"standard deviation of the height ({unit})", unit),
+        "slope": ("slope", "float32", nan, "steepest slope (degrees)", "degrees"),
         "count": (
             "count", "uint16", None,
-            "views that the height rests on; 0 where a small gap was bridged",
+            "views that the height rests on; 0 where a small gap was bridged", "",
         ),
         "stations": (
             "stations", "uint8", None,
             "stations that the height rests on (255: or more); 0 where a small gap was bridged",
+            "",
         ),
         "surfaces": (
             "surfaces", "uint8", None,
             "surfaces over each other, of which the height is the uppermost's; 0 where a small "
-            "gap was bridged",
+            "gap was bridged", "",
         ),
         "lower": (
             "lower", "float32", nan,
-            f"height of the lowest of several surfaces {over}; unknown where there is one",
+            f"height of the lowest of several surfaces {over}; unknown where there is one", unit,
         ),
     }  # fmt: skip
     with ExitStack() as files:
         rasters = {
             name: files.enter_context(
-                tiled_raster(folder / f"{file}.tif", grid, frame, dtype, nodata, text)
+                tiled_raster(folder / f"{file}.tif", grid, frame, dtype, nodata, text, unit)
             )
-            for name, (file, dtype, nodata, text) in bands.items()
+            for name, (file, dtype, nodata, text, unit) in bands.items()
         }
         for tile in tiles:
             for name, raster in rasters.items():

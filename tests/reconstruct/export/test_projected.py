@@ -1,0 +1,142 @@
+"""Products in UTM, against Krueger's series and against each other."""
+
+import csv
+import json
+import math
+import shutil
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+
+from alice_survey.base.errors import ConfigError, ReconstructionError
+from reconstruct.evaluate.elevation import elevation_in
+from reconstruct.export.projected import export_projected
+from reconstruct.views.model import read_frame
+
+CRS = "EPSG:32636"
+CENTRAL_DEG, EAST_M, SCALE = 33.0, 500_000.0, 0.9996
+
+
+def utm(latitude_deg: np.ndarray, longitude_deg: np.ndarray) -> np.ndarray:
+    """Easting and northing of WGS 84 by Krueger's series (1912), to fractions of a millimetre."""
+    a, f = 6378137.0, 1 / 298.257223563
+    n = f / (2 - f)
+    radius = a / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    alpha = [n / 2 - 2 / 3 * n**2 + 5 / 16 * n**3, 13 / 48 * n**2 - 3 / 5 * n**3, 61 / 240 * n**3]
+    phi, lam = np.radians(latitude_deg), np.radians(longitude_deg - CENTRAL_DEG)
+    e = 2 * math.sqrt(n) / (1 + n)
+    t = np.sinh(np.arctanh(np.sin(phi)) - e * np.arctanh(e * np.sin(phi)))
+    xi, eta = np.arctan2(t, np.cos(lam)), np.arctanh(np.sin(lam) / np.sqrt(1 + t * t))
+    x, y = eta.copy(), xi.copy()
+    for j, c in enumerate(alpha, 1):
+        x += c * np.cos(2 * j * xi) * np.sinh(2 * j * eta)
+        y += c * np.sin(2 * j * xi) * np.cosh(2 * j * eta)
+    return np.column_stack([EAST_M + SCALE * radius * x, SCALE * radius * y])
+
+
+@pytest.fixture(scope="module")
+def workspace(small_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("utm") / "survey"
+    shutil.copytree(small_survey, folder)
+    text, values = export_projected(folder, CRS)
+    assert "UTM zone 36N" in text
+    assert values["vertical_datum"] == read_frame(folder / "sparse" / "frame.json").vertical_datum
+    return folder
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_track_is_where_the_series_says(workspace: Path):
+    old = rows_of(workspace / "sparse" / "track.csv")
+    new = rows_of(workspace / "EPSG-32636" / "track.csv")
+    degrees = [np.array([float(r[f"{k}_deg"]) for r in old]) for k in ("latitude", "longitude")]
+    found = np.array([[float(r["easting_m"]), float(r["northing_m"])] for r in new])
+    # ten decimals of a degree are 0.01 mm
+    np.testing.assert_allclose(found, utm(*degrees), atol=2e-4)
+    assert [r["image"] for r in new] == [r["image"] for r in old]
+    assert [-float(r["height_m"]) for r in new] == pytest.approx(
+        [float(r["depth_m"]) for r in old], abs=1e-6
+    )
+
+
+def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(workspace: Path):
+    folder = workspace / "EPSG-32636"
+    with (
+        rasterio.open(workspace / "dense" / "dem.tif") as old,
+        rasterio.open(folder / "dem.tif") as new,
+    ):
+        assert new.crs.to_epsg() == 32636
+        assert new.tags()["VERTICAL_DATUM"] == old.tags()["VERTICAL_DATUM"]
+        assert new.descriptions == old.descriptions
+        assert new.transform.a == pytest.approx(old.transform.a)
+        heights, cell = new.read(1), new.transform.a
+        rows, columns = np.nonzero(np.isfinite(heights))
+        assert len(rows) > 0.97 * np.isfinite(old.read(1)).sum()
+        pick = np.random.default_rng(1).choice(len(rows), 2000, replace=False)
+        rows, columns = rows[pick], columns[pick]
+        x, y = new.transform * (columns + 0.5, rows + 0.5)
+        back = pyproj.Transformer.from_crs(
+            pyproj.CRS.from_epsg(32636), pyproj.CRS.from_wkt(old.crs.to_wkt()), always_xy=True
+        )
+        east, north = back.transform(x, y)
+    true = elevation_in(workspace / "dense")
+    column, row = (east - true.west) / cell - 0.5, (true.north - north) / cell - 0.5
+    r, c = np.floor(row).astype(int), np.floor(column).astype(int)
+    inside = (r >= 0) & (c >= 0) & (r < true.height.shape[0] - 1) & (c < true.height.shape[1] - 1)
+    r, c, p, q = r[inside], c[inside], (column % 1)[inside], (row % 1)[inside]
+    h = true.height
+    expected = (h[r, c] * (1 - p) + h[r, c + 1] * p) * (1 - q)
+    expected += (h[r + 1, c] * (1 - p) + h[r + 1, c + 1] * p) * q
+    error = heights[rows, columns][inside] - expected
+    error = error[np.isfinite(error)]
+    assert len(error) > 1000
+    assert np.percentile(np.abs(error), 95) < 2e-4
+
+
+def test_cloud_and_mesh_lie_on_the_raster(workspace: Path):
+    folder = workspace / "EPSG-32636"
+    with rasterio.open(folder / "dem.tif") as raster:
+        dem, at = raster.read(1), ~raster.transform
+    cloud = laspy.read(folder / "cloud.laz")
+    assert cloud.header.parse_crs().to_epsg() == 32636
+    assert "sigma" in cloud.point_format.extra_dimension_names
+    offset = json.loads((folder / "projected.json").read_text())["mesh_offset"]
+    lines = (folder / "mesh.obj").read_text().splitlines()
+    mesh = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float) + offset
+    assert sum(line.startswith("f ") for line in lines) > 1000
+    assert (folder / "mesh.mtl").exists()
+    for points in (np.column_stack([cloud.x, cloud.y, cloud.z])[::50], mesh[::20]):
+        columns, rows = at * (points[:, 0], points[:, 1])
+        r, c = rows.astype(int), columns.astype(int)
+        inside = (r >= 0) & (c >= 0) & (r < dem.shape[0]) & (c < dem.shape[1])
+        gap = points[inside, 2] - dem[r[inside], c[inside]]
+        assert np.nanmedian(np.abs(gap)) < 0.005
+    length = np.sqrt(np.square([cloud[name] for name in ("nx", "ny", "nz")]).sum(axis=0))
+    np.testing.assert_allclose(length, 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("crs", "why"),
+    [("EPSG:4326", "UTM"), ("EPSG:32636+5773", "horizontal"), ("EPSG:1", "unknown"),
+     ("EPSG:2263", "metres")],
+)  # fmt: skip
+def test_systems_that_do_not_fit_are_refused_in_one_line(workspace: Path, crs: str, why: str):
+    with pytest.raises(ConfigError, match=why) as refused:
+        export_projected(workspace, crs)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_model_without_a_place_is_refused(workspace: Path, tmp_path: Path):
+    shutil.copytree(workspace, tmp_path / "w")
+    path = tmp_path / "w" / "sparse" / "frame.json"
+    frame = json.loads(path.read_text()) | {"name": "model", "datum": None}
+    path.write_text(json.dumps(frame))
+    with pytest.raises(ReconstructionError, match="no place"):
+        export_projected(tmp_path / "w", CRS)
