@@ -186,7 +186,7 @@ def _one_instance(
             f"{path}: BARO has {', '.join(map(str, numbers))}: choose the depth sensor with "
             f"--topic {role}=BARO[{numbers[-1]}]"
         )
-    if table.name in ("RFND", "DISTANCE_SENSOR"):
+    if table.name.upper() in ("RFND", "DISTANCE_SENSOR"):
         return table, ""
     note = f"; {table.name} {numbers[0]} of {', '.join(map(str, numbers))} is used"
     return table.rows(table.columns[field] == numbers[0]), note
