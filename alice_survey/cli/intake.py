@@ -23,6 +23,7 @@ app = typer.Typer()
     epilog=examples(
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
+        "import-images --left cam1 --right cam2 --triggers triggers.csv -w reef",
         "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
         "import-images --bag dive.mcap --every 0.5 --rig rig.json --navigation dive.csv -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
@@ -62,6 +63,9 @@ def import_images(
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
+    triggers: Annotated[
+        Path | None, typer.Option(help="CSV: image or number, time_s or time_utc; camera.")
+    ] = None,
     workspace: Workspace = WORK,
     threads: Threads = None,
 ) -> None:
@@ -86,7 +90,8 @@ def import_images(
         topics={} if bag is None else named, videos=video or (), overlap=overlap,
         every_s=every, recursive=recursive,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
-        vertical_datum=vertical_datum, rig=rig, masks=masks, executor=executor_of(threads),
+        vertical_datum=vertical_datum, rig=rig, masks=masks, triggers=triggers,
+        executor=executor_of(threads),
     )  # fmt: skip
     typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
 
