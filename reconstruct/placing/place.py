@@ -25,6 +25,7 @@ from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.pictures.files import named
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.altitude_scale import scale_by_altitudes
+from reconstruct.placing.coarse_control import real_sigma_factor, widened, without_wrong_points
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import (
     CONTROL_FILE,
@@ -37,7 +38,12 @@ from reconstruct.placing.control_file import (
 )
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.mount import fit_with_mount
-from reconstruct.placing.navigation_equations import Installation, body_from_pinhole
+from reconstruct.placing.navigation_equations import (
+    PLACE,
+    SCALE,
+    Installation,
+    body_from_pinhole,
+)
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import picture_modes
@@ -117,8 +123,14 @@ def find_place(task: Placing) -> Placed:
     path = task.workspace / CONTROL_FILE
     control = read_control(path) if path.is_file() else Control()
     datum = task.datum or control.datum()
-    ties = _tie(task, control, datum)
+    ties = without_wrong_points(_tie(task, control, datum), scale)
     fit, local = _fit(task, levelled, scale, known, ties, datum)
+    if fit is not None and local is None:
+        freely = PLACE if fit.sigma_scale > 0 else SCALE
+        factor = real_sigma_factor(ties.deformed(fit.modes), fit.ned_from_model, freely)
+        if factor > 1.0:
+            ties = widened(ties, factor)
+            fit, local = _fit(task, levelled, scale, known, ties, datum)
     notes = [*task.survey.notes, *task.mapping.notes]
     if fit is not None:
         place = fit.ned_from_model
