@@ -135,6 +135,8 @@ def find_place(task: Placing) -> Placed:
     if fit is not None:
         place = fit.ned_from_model
         source = _scale_source(known, ties)
+        if known is None and not ties.informs_scale:
+            source += f", sigma {fit.sigma_scale:.2g}"
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
             datum = None
