@@ -9,6 +9,7 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import brentq
 
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
@@ -93,7 +94,9 @@ def _misfits(control: ControlFit, place: Similarity) -> Array:
 
 
 def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -> float:
-    """Factor by which points miss by more than their sigmas allow, 1 or more.
+    """Factor that sigmas of points need for what they miss by, 1 or more.
+
+    What picks are worth shows in the pictures; the rest is the coordinates'.
 
     Args:
         control: on the model as placed.
@@ -103,27 +106,35 @@ def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -
     freedom = 3 * len(control.used_points) - parameters
     if freedom < 1:
         return 1.0
-    ratio = 3.0 * float(np.square(_misfits(control, place)).sum()) / freedom
-    significant = ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom)
-    return float(np.sqrt(ratio)) if significant else 1.0
+
+    def excess(log_factor: float) -> float:
+        coarser = widened(control, float(np.exp(log_factor)))
+        return 3.0 * float(np.square(_misfits(coarser, place)).sum()) / freedom - 1.0
+
+    ratio = 1.0 + excess(0.0)
+    if ratio <= 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom):
+        return 1.0
+    most = np.log(ratio)
+    while excess(most) > 0:
+        most *= 2.0
+    return float(np.exp(brentq(excess, 0.0, most)))
 
 
 def widened(control: ControlFit, factor: float) -> ControlFit:
-    """The same with sigmas of its points that are larger by a factor, after a warning."""
-    used = control.used_points
-    stated = float(np.median([tie.sigma for tie in used]))
-    warn(
-        f"{len(used)} control points miss by {factor:.2g} times what their sigmas and picks allow: "
-        f"they count with a sigma of {factor * stated:.2g} m, not {stated:.2g} m"
-    )
+    """The same with sigmas of its points that are larger by a factor."""
     ties = tuple(
-        replace(
-            tie,
-            sigma=factor * tie.sigma,
-            spot=replace(tie.spot, covariance=factor**2 * tie.spot.covariance),
-        )
-        if tie.use == "control"
-        else tie
+        replace(tie, sigma=factor * tie.sigma) if tie.use == "control" else tie
         for tie in control.ties
     )
     return replace(control, ties=ties, sigma_factor=factor * control.sigma_factor)
+
+
+def warn_of_coarse(control: ControlFit) -> None:
+    """Say what sigma points count with, where that is not the stated one."""
+    if control.sigma_factor > 1.0:
+        used = control.used_points
+        real = float(np.median([tie.sigma for tie in used]))
+        warn(
+            f"{len(used)} control points miss by more than their sigmas and picks allow: they "
+            f"count with a sigma of {real:.2g} m, not {real / control.sigma_factor:.2g} m"
+        )

@@ -17,7 +17,7 @@ from PIL import Image
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import PicturesRecord
+from alice_survey.base.records import PicturesRecord, RegistrationRecord
 from alice_survey.cli.main import main
 from camera_calib.rig import design_rig, write_rig
 
@@ -338,3 +338,40 @@ def test_a_folder_ends_well_or_in_one_line(
         assert len({record.station for record in records}) == end.stations
     assert any(words in err + out for words in end.said.split("|")), err + out
     assert PicturesRecord.read(work / "images" / "survey.json").source == "imported"
+
+
+def test_a_troubled_folder_becomes_a_model(
+    shared_data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Turned, doubled, cut and black pictures among those of a beach, and one of elsewhere."""
+    folder, work = tmp_path / "in", tmp_path / "work"
+    folder.mkdir()
+    work.mkdir()
+    (work / "survey.toml").write_text("[reconstruct]\nmax_features = 1500\n")
+    sources = sorted((shared_data / "brighton_beach" / "images").glob("*.jpg"))[9:14]
+    for k, source in enumerate(sources):
+        with Image.open(source) as image:
+            small = image.resize((image.width // 3, image.height // 3), Image.Resampling.BOX)
+            exif = image.getexif()
+            exif[0x112] = (1, 6, 3, 8, 1)[k]
+            small.save(folder / source.name, exif=exif, quality=92)
+    size = small.size
+    (folder / f"{sources[0].stem} (1).jpg").write_bytes((folder / sources[0].name).read_bytes())
+    (folder / "cut.jpg").write_bytes((folder / sources[1].name).read_bytes()[:4000])
+    Image.new("RGB", size).save(folder / "black.jpg", exif=exif)
+    rng = np.random.default_rng(1)
+    elsewhere = cv2.resize(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8), size)
+    Image.fromarray(elsewhere).save(folder / "elsewhere.jpg", exif=exif)
+    code, _, err = command(
+        ["import-images", str(folder), "-w", str(work), "--threads", "1"], capsys, monkeypatch
+    )
+    assert code == 0, err
+    assert "(1).jpg is left out" in err and "cut.jpg is left out" in err
+    code, _, err = command(["reconstruct", "-w", str(work), "--threads", "1"], capsys, monkeypatch)
+    assert code == 0, err
+    found = RegistrationRecord.read(work / "sparse" / "registration.json")
+    assert (found.registered, found.total) == (5, 7)
+    assert (work / "mosaic" / "mosaic.tif").is_file()
