@@ -156,7 +156,7 @@ def import_images(
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
         name="images",
-        version=3,
+        version=4,
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),
