@@ -432,6 +432,11 @@ def read_csv(
             numbered = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise fault(f"{path}: cannot be read: {why(error)}") from None
+    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
+        raise fault(
+            f"{path}: its cells are not apart by commas: save it as CSV with commas between cells "
+            "and points in numbers"
+        )
     missing = [name for name in required if name not in names]
     if missing:
         raise fault(f"{path}: column {missing[0]} is missing; it has {shown(', '.join(names))}")

@@ -336,6 +336,8 @@ class ControlRecord(JsonRecord):
     bars: tuple[BarRow, ...]
     not_found: dict[str, str]
     """Reasons, by name."""
+    sigma_factor: float = 1.0
+    """How many times larger sigmas of points are than stated."""
     rms: dict[str, ControlRms]
     """Statistics by use."""
 

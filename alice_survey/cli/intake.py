@@ -23,6 +23,7 @@ app = typer.Typer()
     epilog=examples(
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
+        "import-images --left cam1 --right cam2 --triggers triggers.csv -w reef",
         "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
         "import-images --bag dive.mcap --every 0.5 --rig rig.json --navigation dive.csv -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
@@ -62,6 +63,9 @@ def import_images(
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
+    triggers: Annotated[
+        Path | None, typer.Option(help="CSV: image or number, time_s or time_utc; camera.")
+    ] = None,
     workspace: Workspace = WORK,
     threads: Threads = None,
 ) -> None:
@@ -86,7 +90,8 @@ def import_images(
         topics={} if bag is None else named, videos=video or (), overlap=overlap,
         every_s=every, recursive=recursive,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
-        vertical_datum=vertical_datum, rig=rig, masks=masks, executor=executor_of(threads),
+        vertical_datum=vertical_datum, rig=rig, masks=masks, triggers=triggers,
+        executor=executor_of(threads),
     )  # fmt: skip
     typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
 
@@ -149,10 +154,13 @@ def import_control(
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
         "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
         "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
+        "import-log dvl.pd0 --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     ),
 )
 def import_log(
-    log: Annotated[Path, typer.Argument(help="ROS bag; ArduSub .BIN, .log, .tlog; QGC .csv.")],
+    log: Annotated[
+        Path, typer.Argument(help="ROS bag; ArduSub, PX4 or QGC log; PD0 or JSON of a DVL.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
     declination: Annotated[float, typer.Option(help="Added to headings, deg; east +.")] = 0.0,
     tide: Annotated[str, typer.Option(help="Water above the depths' level: m, or a CSV.")] = "0",
@@ -188,11 +196,15 @@ def import_log(
     velocity_noise: Annotated[
         float, typer.Option(help="Of dead reckoning: over one second, m/s.")
     ] = 0.02,
+    flip_velocity: Annotated[
+        bool, typer.Option("--flip-velocity", help="Velocities of a DVL the other way round.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Turn a vehicle's own log into the navigation CSV of import-images.
 
-    ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs.
+    ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs, PX4's
+    .ulg, PD0 of Teledyne's DVLs and JSON of Water Linked's.
     """
     from missions.logs.dead_reckoning import TrackErrors
     from missions.logs.import_log import ImportOptions
@@ -203,6 +215,7 @@ def import_log(
         end_s=end, topics=topic or (), datum_deg=datum, lever_body_m=lever_arm,
         altitude_offset_m=altitude_offset, start_utc=start_utc, time_zone=time_zone,
         vehicle_log=vehicle_log, start_at=start_at,
+        flip_velocity=flip_velocity,
         dead_reckon=(
             TrackErrors(scale=speed_sigma, heading_deg=heading_sigma, noise_mps=velocity_noise)
             if dead_reckon else None

@@ -7,8 +7,7 @@ depth; its barometer is zeroed at the surface.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +15,8 @@ import numpy as np
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array, Datum
 from missions.logs.dataflash import LogTable, Mask, read_dataflash
-from missions.logs.dive import (
-    DATED_AFTER_S,
-    ROLES,
-    LoggedDive,
-    Signal,
-    cleaned,
-    usable_positions,
-)
+from missions.logs.dive import DATED_AFTER_S, LoggedDive
+from missions.logs.message_sources import Keep, Source, Tables, dive_from, take, with_time
 from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, read_tlog
 
 _GPS_EPOCH_S = 315964800.0
@@ -37,55 +30,11 @@ _DOWN = 25
 """ROTATION_PITCH_270: a range finder that looks down."""
 _GOOD = 4
 """RangeFinder status: in range."""
-_INSTANCE = ("C", "I", "Instance", "id")
-"""Fields that identify one of several cores or sensors."""
 _REBOOT_S = 1.0
 """A clock since boot that goes back by more has been started again."""
 
-_Tables = Mapping[str, LogTable]
-_Reader = Callable[[LogTable, _Tables], tuple[Array, Array] | None]
-"""Takes the table of a message, and all tables, to times and values; None where a field or another
-table is missing."""
 
-
-@dataclass(frozen=True)
-class _Source:
-    """One way to get a quantity."""
-
-    message: str
-    read: _Reader
-    note: str = ""
-    """What to know of it when it is used."""
-
-
-@dataclass(frozen=True)
-class _Keep:
-    """Which rows of a message to use."""
-
-    fields: tuple[str, ...]
-    """What `rows` needs."""
-    rows: Callable[[LogTable], Mask]
-
-
-def _take(
-    *fields: str, scale: float = 1.0, keep: _Keep | None = None, absent: float | None = None
-) -> _Reader:
-    """Read fields of a message, times a scale; `keep` marks rows to use, `absent` what is NaN."""
-
-    def read(table: LogTable, _: _Tables) -> tuple[Array, Array] | None:
-        if not table.has(*fields, *(keep.fields if keep is not None else ())):
-            return None
-        if keep is not None:
-            table = table.rows(keep.rows(table))
-        values = table.stacked(*fields)
-        if absent is not None:
-            values = np.where(values == absent, np.nan, values)
-        return table.columns["time_s"], values * scale
-
-    return read
-
-
-def _from_origin(table: LogTable, tables: _Tables) -> tuple[Array, Array] | None:
+def _from_origin(table: LogTable, tables: Tables) -> tuple[Array, Array] | None:
     """Latitude and longitude of north and east from the filter's origin (message ORGN, type 0)."""
     origin = tables.get("ORGN")
     if origin is None or not table.has("PN", "PE", "PD") or not origin.has("Type", "Lat", "Lng"):
@@ -99,8 +48,8 @@ def _from_origin(table: LogTable, tables: _Tables) -> tuple[Array, Array] | None
     return table.columns["time_s"], datum.geodetic_from_ned(ned)[:, :2]
 
 
-def _has_fix(field: str) -> _Keep:
-    return _Keep((field,), lambda table: table.columns[field] >= _FIX_3D)
+def _has_fix(field: str) -> Keep:
+    return Keep((field,), lambda table: table.columns[field] >= _FIX_3D)
 
 
 def _sees_down(table: LogTable) -> Mask:
@@ -124,57 +73,54 @@ def _hears_bottom(table: LogTable) -> Mask:
 _SURFACE = "positions are GPS: they hold at the surface only"
 _BACKUP = "positions are those of the backup attitude filter"
 _DEGREES = float(np.rad2deg(1.0))
-_BIN: Mapping[str, tuple[_Source, ...]] = {
+_BIN: Mapping[str, tuple[Source, ...]] = {
     "navigation": (
-        _Source("POS", _take("Lat", "Lng")),
-        _Source("XKF1", _from_origin),
-        _Source("NKF1", _from_origin),
-        _Source("AHR2", _take("Lat", "Lng"), _BACKUP),
-        _Source("GPS", _take("Lat", "Lng", keep=_has_fix("Status")), _SURFACE),
+        Source("POS", take("Lat", "Lng")),
+        Source("XKF1", _from_origin),
+        Source("NKF1", _from_origin),
+        Source("AHR2", take("Lat", "Lng"), _BACKUP),
+        Source("GPS", take("Lat", "Lng", keep=_has_fix("Status")), _SURFACE),
     ),
     "depth": (
-        _Source("POS", _take("RelHomeAlt", scale=-1.0)),
-        _Source("CTUN", _take("BAlt", scale=-1.0)),
-        _Source("XKF1", _take("PD")),
-        _Source("NKF1", _take("PD")),
-        _Source("BARO", _take("Alt", scale=-1.0)),
+        Source("POS", take("RelHomeAlt", scale=-1.0)),
+        Source("CTUN", take("BAlt", scale=-1.0)),
+        Source("XKF1", take("PD")),
+        Source("NKF1", take("PD")),
+        Source("BARO", take("Alt", scale=-1.0)),
     ),
     "attitude": tuple(
-        _Source(message, _take("Roll", "Pitch", "Yaw"))
-        for message in ("ATT", "XKF1", "NKF1", "AHR2")
+        Source(message, take("Roll", "Pitch", "Yaw")) for message in ("ATT", "XKF1", "NKF1", "AHR2")
     ),
-    "altitude": (_Source("RFND", _take("Dist", keep=_Keep(("Stat",), _sees_down))),),
-    "velocity": tuple(_Source(message, _take("VN", "VE", "VD")) for message in ("XKF1", "NKF1")),
-    "rates": (_Source("RATE", _take("R", "P", "Y", scale=float(np.deg2rad(1.0)))),),
-    "pwm": (_Source("RCOU", _take(*(f"C{i}" for i in range(1, 9)))),),
+    "altitude": (Source("RFND", take("Dist", keep=Keep(("Stat",), _sees_down))),),
+    "velocity": tuple(Source(message, take("VN", "VE", "VD")) for message in ("XKF1", "NKF1")),
+    "rates": (Source("RATE", take("R", "P", "Y", scale=float(np.deg2rad(1.0)))),),
+    "pwm": (Source("RCOU", take(*(f"C{i}" for i in range(1, 9)))),),
 }
 """Sources of each role, the best first; degrees, metres, m/s, rad/s."""
-_TLOG: Mapping[str, tuple[_Source, ...]] = {
+_TLOG: Mapping[str, tuple[Source, ...]] = {
     "navigation": (
-        _Source("GLOBAL_POSITION_INT", _take("lat", "lon", scale=1e-7)),
-        _Source(
-            "GPS_RAW_INT", _take("lat", "lon", scale=1e-7, keep=_has_fix("fix_type")), _SURFACE
-        ),
+        Source("GLOBAL_POSITION_INT", take("lat", "lon", scale=1e-7)),
+        Source("GPS_RAW_INT", take("lat", "lon", scale=1e-7, keep=_has_fix("fix_type")), _SURFACE),
     ),
     "depth": (
-        _Source("GLOBAL_POSITION_INT", _take("relative_alt", scale=-1e-3)),
-        _Source("VFR_HUD", _take("alt", scale=-1.0)),
+        Source("GLOBAL_POSITION_INT", take("relative_alt", scale=-1e-3)),
+        Source("VFR_HUD", take("alt", scale=-1.0)),
     ),
-    "attitude": (_Source("ATTITUDE", _take("roll", "pitch", "yaw", scale=_DEGREES)),),
+    "attitude": (Source("ATTITUDE", take("roll", "pitch", "yaw", scale=_DEGREES)),),
     "altitude": (
-        _Source(
+        Source(
             "DISTANCE_SENSOR",
-            _take(
+            take(
                 "current_distance",
                 scale=1e-2,
-                keep=_Keep(("orientation", "min_distance", "max_distance"), _hears_bottom),
+                keep=Keep(("orientation", "min_distance", "max_distance"), _hears_bottom),
             ),
         ),
-        _Source("RANGEFINDER", _take("distance", absent=0.0)),
+        Source("RANGEFINDER", take("distance", absent=0.0)),
     ),
-    "velocity": (_Source("GLOBAL_POSITION_INT", _take("vx", "vy", "vz", scale=1e-2)),),
-    "rates": (_Source("ATTITUDE", _take("rollspeed", "pitchspeed", "yawspeed")),),
-    "pwm": (_Source("SERVO_OUTPUT_RAW", _take(*(f"servo{i}_raw" for i in range(1, 9)))),),
+    "velocity": (Source("GLOBAL_POSITION_INT", take("vx", "vy", "vz", scale=1e-2)),),
+    "rates": (Source("ATTITUDE", take("rollspeed", "pitchspeed", "yawspeed")),),
+    "pwm": (Source("SERVO_OUTPUT_RAW", take(*(f"servo{i}_raw" for i in range(1, 9)))),),
 }
 
 
@@ -196,10 +142,10 @@ def read_ardusub_bin(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     for name, table in tables.items():
         if "TimeUS" in table.columns:
             time_s = table.columns["TimeUS"] * 1e-6 + offset_s
-            timed[name] = _with_time(table, time_s)
+            timed[name] = with_time(table, time_s)
         elif "TimeMS" in table.columns and name != "GPS":
-            timed[name] = _with_time(table, table.columns["TimeMS"] * 1e-3 + offset_s)
-    return _dive(
+            timed[name] = with_time(table, table.columns["TimeMS"] * 1e-3 + offset_s)
+    return dive_from(
         path, _BIN, requested, timed, present, lost,
         kind="an on-board log of ArduSub",
         clock="the vehicle's clock, set by GPS" if dated else "the vehicle's clock since boot",
@@ -220,9 +166,9 @@ def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
         if len(own) < len(table):
             lost[f"{name}: messages of another system than {vehicle:.0f}"] += len(table) - len(own)
         if len(own):
-            offset[name] = _with_time(own, _tlog_times(own))
+            offset[name] = with_time(own, _tlog_times(own))
     recorded = np.concatenate([table.columns[RECORDED] for table in tables.values()])
-    return _dive(
+    return dive_from(
         path, _TLOG, requested, offset, present, lost,
         kind="a ground station's log of ArduSub",
         clock="the ground station's clock",
@@ -231,128 +177,7 @@ def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     )  # fmt: skip
 
 
-def _dive(
-    path: Path,
-    sources: Mapping[str, tuple[_Source, ...]],
-    requested: Mapping[str, str],
-    tables: _Tables,
-    present: Sequence[str],
-    lost: Counter[str],
-    *,
-    kind: str,
-    clock: str,
-    dated: bool,
-    declination_in_log_deg: float | None,
-) -> LoggedDive:
-    notes: list[str] = []
-    counted: set[str] = set()
-
-    def signal(role: str) -> Signal | None:
-        own: Counter[str] = Counter()
-        found, note = _signal(path, role, sources[role], requested.get(role), tables, present, own)
-        # What the times of a message cost is counted once, though it serves several roles.
-        if found is not None and found.source not in counted:
-            counted.add(found.source)
-            lost.update(own)
-        if note and note not in notes:
-            notes.append(note)
-        return found
-
-    found = {role: signal(role) for role in sources}
-    if not any(found[role] for role in ROLES):
-        names = ", ".join(dict.fromkeys(s.message for role in ROLES for s in sources[role]))
-        raise NavigationError(f"{path}: none of {names}; it has {', '.join(present)}")
-    return LoggedDive(
-        kind=kind,
-        clock=clock,
-        dated=dated,
-        position=usable_positions(found["navigation"], lost),
-        depth=found["depth"],
-        attitude=found["attitude"],
-        altitude=found["altitude"],
-        altitude_slant=True,
-        velocity_ned=found["velocity"],
-        rates=found["rates"],
-        pwm=found["pwm"],
-        declination_in_log_deg=declination_in_log_deg,
-        lost=dict(lost),
-        notes=tuple(notes),
-    )
-
-
-def _signal(
-    path: Path,
-    role: str,
-    sources: Sequence[_Source],
-    requested: str | None,
-    tables: _Tables,
-    present: Sequence[str],
-    lost: Counter[str],
-) -> tuple[Signal | None, str]:
-    """The best source that the log holds, or the requested one, and its note."""
-    name, _, instance = (requested or "").removesuffix("]").partition("[")
-    known = [source.message for source in sources]
-    if name and name not in known:
-        raise NavigationError(f"{path}: {role} can come from {', '.join(known)}, not {name}")
-    for source in sources:
-        if name and source.message != name:
-            continue
-        table = tables.get(source.message)
-        if table is None:
-            continue
-        one, others = _one_instance(path, role, table, instance, bool(name))
-        if one is None:
-            continue
-        read = source.read(one, tables)
-        if read is None or not len(read[0]):
-            continue
-        found = cleaned(source.message, *read, lost)
-        if found is not None:
-            return found, f"{source.note}{others}".strip("; ")
-    if name:
-        raise NavigationError(f"{path}: {requested} gives no {role}; it has {', '.join(present)}")
-    return None, ""
-
-
-def _one_instance(
-    path: Path, role: str, table: LogTable, requested: str, named: bool
-) -> tuple[LogTable | None, str]:
-    """The rows of one core or sensor, and a note on the others.
-
-    Cores and GPS receivers count from the one that is used. Which barometer is the depth sensor
-    is not identified by its number, so that one of several must be requested.
-    """
-    field = next((name for name in _INSTANCE if name in table.columns), None)
-    if field is None:
-        return table, ""
-    known = table.columns[field][np.isfinite(table.columns[field])]
-    numbers = np.unique(known).astype(int).tolist()
-    if requested:
-        if not requested.isdigit() or int(requested) not in numbers:
-            raise NavigationError(
-                f"{path}: {table.name} has {', '.join(map(str, numbers))}, not {requested}"
-            )
-        return table.rows(table.columns[field] == int(requested)), ""
-    if len(numbers) < 2:
-        return table, ""
-    if table.name == "BARO":
-        if not named:
-            return None, ""
-        raise NavigationError(
-            f"{path}: BARO has {', '.join(map(str, numbers))}: choose the depth sensor with "
-            f"--topic {role}=BARO[{numbers[-1]}]"
-        )
-    if table.name in ("RFND", "DISTANCE_SENSOR"):
-        return table, ""
-    note = f"; {table.name} {numbers[0]} of {', '.join(map(str, numbers))} is used"
-    return table.rows(table.columns[field] == numbers[0]), note
-
-
-def _with_time(table: LogTable, time_s: Array) -> LogTable:
-    return replace(table, columns={**table.columns, "time_s": time_s})
-
-
-def _since_1970(tables: _Tables) -> tuple[float, bool]:
+def _since_1970(tables: Tables) -> tuple[float, bool]:
     """What makes UTC of seconds since boot: the median over all GPS fixes; 0 without one."""
     gps = tables.get("GPS")
     if gps is None or not gps.has("TimeUS", "GMS", "GWk", "Status"):
@@ -378,7 +203,7 @@ def _declination(parameters: LogTable | None) -> float | None:
     return None if declination is None else float(np.rad2deg(declination))
 
 
-def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
+def _vehicle(path: Path, tables: Tables, present: Sequence[str]) -> float:
     """The system that reports its place most."""
     names = ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "ATTITUDE", *sorted(tables))
     name = next((name for name in names if name in tables), None)

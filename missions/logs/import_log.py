@@ -55,6 +55,8 @@ class ImportOptions:
     """Vehicle log to write, too."""
     dead_reckon: TrackErrors | None = None
     """How velocities err: positions are those of velocities and attitudes between fixes."""
+    flip_velocity: bool = False
+    """Turn velocities over ground round: those of a DVL whose file states the other sign."""
     start_at: tuple[float, float, float] | None = None
     """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
@@ -90,7 +92,8 @@ def import_log(
     is counted, by reason, in warnings and in the result.
 
     Args:
-        path: a bag of ROS 1 or 2, ArduSub's .BIN, .log or .tlog, or a QGroundControl CSV.
+        path: a bag of ROS 1 or 2, ArduSub's .BIN, .log or .tlog, PX4's .ulg, a QGroundControl CSV,
+            or the reports of a DVL.
         out: CSV to write.
         options: what to change, and what to choose.
 
@@ -107,6 +110,8 @@ def import_log(
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
     dive = read_dive(path, options)
+    if options.flip_velocity:
+        dive = _flipped(path, dive)
     if options.dead_reckon is not None:
         dive = with_dead_reckoning(
             dive, options.dead_reckon, options.start_at, options.declination_deg
@@ -137,6 +142,21 @@ def import_log(
     return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
 
 
+def _flipped(path: Path, dive: LoggedDive) -> LoggedDive:
+    """The dive with its velocities the other way."""
+    if dive.velocity_ned is None and dive.velocity_body is None:
+        raise NavigationError(f"{path}: holds no velocity that --flip-velocity could turn round")
+
+    def other_way(signal: Signal | None) -> Signal | None:
+        return None if signal is None else replace(signal, values=-signal.values)
+
+    return replace(
+        dive,
+        velocity_ned=other_way(dive.velocity_ned),
+        velocity_body=other_way(dive.velocity_body),
+    )
+
+
 def _nothing_of_use(path: Path, dive: LoggedDive, lost: Mapping[str, int]) -> str:
     why = "; ".join(f"{count} times {reason}" for reason, count in sorted(lost.items()))
     text = f"{path}: no row holds a position, depth, attitude or altitude"
@@ -155,6 +175,8 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     """
     from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
     from missions.logs.bag_reader import is_bag
+    from missions.logs.pd0 import is_pd0, read_pd0
+    from missions.logs.px4_ulog import is_ulog, read_px4_ulog
     from missions.logs.qgc_csv import read_qgc_csv
     from missions.logs.ros_bag import read_ros_bag
     from missions.logs.waterlinked import is_waterlinked, read_waterlinked
@@ -170,6 +192,10 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_ros_bag(path, chosen, datum)
     if suffix in _JSON and is_waterlinked(path):
         return read_waterlinked(path, chosen)
+    if suffix in (".ulg", ".ulog") or is_ulog(path):
+        return read_px4_ulog(path, chosen)
+    if suffix == ".pd0" or is_pd0(path):
+        return read_pd0(path, chosen)
     if suffix in (".bin", ".log"):
         return read_ardusub_bin(path, chosen)
     if suffix == ".tlog":
@@ -178,7 +204,8 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_qgc_csv(path, chosen, options.time_zone)
     raise NavigationError(
         f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
-        ".log or .tlog, QGroundControl's .csv, or JSON reports of a Water Linked DVL"
+        ".log or .tlog, PX4's .ulg, QGroundControl's .csv, JSON reports of a Water Linked DVL, or "
+        "PD0 of a Teledyne DVL"
     )
 
 

@@ -55,7 +55,7 @@ _WORLDS = ("map", "odom", "world", "earth")
 """Frames that do not turn with the body."""
 _NOT_ALTITUDE = ("beam", "front", "forward", "fls", "obstacle")
 
-_DENSITY_KG_M3, _SURFACE_PA, _GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
+DENSITY_KG_M3, _SURFACE_PA, GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
 """What makes a depth of a pressure; the standard atmosphere (ISO 2533)."""
 _UNIT = 0.05
 """How far from 1 the length of a quaternion may be."""
@@ -335,9 +335,9 @@ class _BagReading:
         if series is None or series.topic.kind != PRESSURE:
             return self._signal(series, ("number",)) or self._signal(series, ("depth",))
         self.notes.append(
-            f"depth is pressure minus {_SURFACE_PA:g} Pa, in water of {_DENSITY_KG_M3:g} kg/m^3"
+            f"depth is pressure minus {_SURFACE_PA:g} Pa, in water of {DENSITY_KG_M3:g} kg/m^3"
         )
-        per_metre = _DENSITY_KG_M3 * _GRAVITY_MPS2
+        per_metre = DENSITY_KG_M3 * GRAVITY_MPS2
         values = (series.columns["pressure"] - _SURFACE_PA) / per_metre
         return self._cleaned(series, values)
 

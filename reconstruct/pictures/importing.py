@@ -11,7 +11,6 @@ import numpy as np
 
 from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.base.errors import (
-    CalibrationError,
     ImageError,
     WorkspaceError,
     warn,
@@ -19,11 +18,10 @@ from alice_survey.base.errors import (
 from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.manifest import read_manifest, write_manifest
 from alice_survey.base.records import PicturesRecord
-from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import read_rig, write_rig
 from missions.logs.navigation_csv import find_zone, read_navigation
-from reconstruct.pictures.bag_pictures import take_bag
+from reconstruct.pictures.bag_pictures import BagPictures, take_bag
 from reconstruct.pictures.files import VIDEO, PictureFolder, look_into
 from reconstruct.pictures.incoming import (
     at_time,
@@ -35,6 +33,7 @@ from reconstruct.pictures.incoming import (
     named_apart,
     record_of,
 )
+from reconstruct.pictures.pairing import PairedPictures, pair_by_time
 from reconstruct.pictures.recordings import Recording, find_videos, read_recordings
 from reconstruct.pictures.summary import (
     ImportedPictures,
@@ -74,6 +73,7 @@ def import_images(
     vertical_datum: str | None = None,
     rig: Path | None = None,
     masks: Path | None = None,
+    triggers: Path | None = None,
     executor: Executor = SERIAL,
 ) -> ImportedPictures:
     """Write `images/` from pictures, of cameras on a rig or not, or from videos.
@@ -90,9 +90,8 @@ def import_images(
     Args:
         workspace: folder of the survey.
         folders: folders of pictures that are taken one by one, in order; or videos.
-        cameras: folder of each camera of a rig by its name, such as left and right; the pictures of
-            one moment are those of one place in the order of names or, where a camera lacks some,
-            of one number in them.
+        cameras: folder of each camera of a rig by its name, such as left and right; which pictures
+            are of one moment, `pairing` says.
         videos: to take frames from, or folders of them; chapters of a GoPro are one recording.
         bag: a bag of ROS 1 or ROS 2 with pictures, which are paired by their times.
         topics: of the bag's pictures, by camera; empty for those of one or of a left and a right.
@@ -109,6 +108,7 @@ def import_images(
         rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
         masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
             camera; without it `NAME_mask.png` next to a picture is its mask.
+        triggers: CSV with the time of every picture, see `pair_by_time`.
         executor: where tasks run.
 
     Returns:
@@ -123,6 +123,8 @@ def import_images(
     videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in VIDEO)]
     folders = [folder for folder in folders if folder not in videos]
     _check_sources(folders, cameras, videos, bag)
+    if triggers is not None and not (folders or cameras):
+        raise ImageError("--triggers is for folders of pictures: videos and bags have times")
     frames = _frame_settings(overlap, every_s, videos, bag)
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
@@ -132,7 +134,7 @@ def import_images(
         *folders,
         *cameras.values(),
         *videos,
-        *(p for p in (bag, navigation, rig, masks) if p is not None),
+        *(p for p in (bag, navigation, rig, masks, triggers) if p is not None),
     ]
     for path in given:
         if not path.exists():
@@ -150,12 +152,11 @@ def import_images(
     mono = _MONO if known_rig is None else known_rig.reference
     found_videos = find_videos(videos)
     sides = _look_into(folders, cameras, mono, [*given, workspace], recursive)
-    stations = _stations(sides)
     folders_read = [each for side in sides.values() for each in side]
     files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
     stage = Stage(
         name="images",
-        version=3,
+        version=4,
         settings={
             "folders": len(folders),
             "stereo": bool(cameras),
@@ -171,11 +172,12 @@ def import_images(
             "vertical_datum": vertical_datum,
             "rig": rig is not None,
             "masks": masks is not None,
+            **({} if triggers is None else {"triggers": True}),
         },
         inputs=[
             *files,
             *found_videos,
-            *(path for path in (bag, navigation, rig, masks) if path is not None),
+            *(path for path in (bag, navigation, rig, masks, triggers) if path is not None),
         ],
     )
 
@@ -192,12 +194,17 @@ def import_images(
             for each in folders_read:
                 for line in each.warnings():
                     warn(line)
+            found: BagPictures | PairedPictures
             if bag is None:
-                entries, left_out = find_entries(stations, executor)
+                paths = {name: [p for f in own for p in f.pictures] for name, own in sides.items()}
+                found = pair_by_time(paths, triggers, zone)
             else:
                 found = take_bag(bag, topics, mono, partial / _SCRATCH, every_s)
-                entries, left_out = find_entries(found.stations, executor)
-                entries = [at_time(entry, found.time_s[entry.source]) for entry in entries]
+            entries, left_out = find_entries(found.stations, executor)
+            entries = [
+                at_time(entry, found.time_s[entry.source]) if found.time_s else entry
+                for entry in entries
+            ]
             if folders and known_rig is None:
                 entries = by_camera(entries, mono)
         check_entries(entries, known_rig)
@@ -255,17 +262,6 @@ def _cameras_of(recordings: Sequence[Recording], mono: str) -> list[str]:
     names = [mono, *(f"{mono}-{number}" for number in range(2, len(seconds) + 1))]
     by_size = {size: name for (size, _), name in zip(seconds.most_common(), names, strict=True)}
     return [by_size[recording.size] for recording in recordings]
-
-
-def _stations(sides: Mapping[str, Sequence[PictureFolder]]) -> list[Mapping[str, Path]]:
-    """Pictures of every moment, by camera."""
-    found = {side: [p for one in folders for p in one.pictures] for side, folders in sides.items()}
-    if len({len(paths) for paths in found.values()}) <= 1:
-        return [dict(zip(found, paths, strict=True)) for paths in zip(*found.values(), strict=True)]
-    try:
-        return [moment.paths for moment in pair_pictures(found)]
-    except CalibrationError as error:
-        raise ImageError(str(error)) from None
 
 
 def _check_sources(

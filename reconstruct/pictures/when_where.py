@@ -112,7 +112,10 @@ def _without_times(entries: Sequence[Incoming]) -> str:
             f"{named(recordings)} do not say when they began, so navigation cannot be tied: import "
             "each into a workspace of its own with --clock-offset, then 'join' them"
         )
-    return "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied"
+    return (
+        "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied: give "
+        "their times with --triggers"
+    )
 
 
 def _times(

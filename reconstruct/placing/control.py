@@ -71,6 +71,8 @@ class ControlFit:
     """Why other control is not used, by name."""
     motion_at: MotionAt | None = None
     """How the model moves with its soft modes; None where it is stiff."""
+    sigma_factor: float = 1.0
+    """How many times larger sigmas of points are than stated."""
 
     @property
     def used_points(self) -> tuple[_Tie, ...]:
@@ -152,13 +154,18 @@ class ControlFit:
         if len(ties) < 3:
             return None
         model, ned = np.stack([t.spot.model for t in ties]), np.stack([t.ned for t in ties])
-        spread = np.linalg.svd(ned - ned.mean(axis=0), compute_uv=False)
-        if spread[1] < _LEAST_SPREAD * spread[0]:
-            return None
-        if known_scale is None:
-            return align_similarity(model, ned)
-        rigid = align_rigid(known_scale * model, ned)
-        return Similarity(scale=known_scale, rotation=rigid.rotation, translation=rigid.translation)
+        return aligned(model, ned, known_scale)
+
+    def misfits(self, place: Similarity) -> list[tuple[Array, Array]]:
+        """Misfit (3,) and its covariance (3, 3) of each used point, metres."""
+        turn = place.rotation.as_matrix()
+        return [
+            (
+                place.apply(tie.spot.model[None])[0] - tie.ned,
+                place.scale**2 * turn @ tie.spot.covariance @ turn.T + np.diag(tie.sigma**2),
+            )
+            for tie in self.used_points
+        ]
 
     def bar_scale(
         self, known_scale: float | None, scale_sigma: float
@@ -194,6 +201,7 @@ class ControlFit:
             "points": points,
             "bars": bars,
             "not_found": dict(self.lost),
+            "sigma_factor": self.sigma_factor,
             "rms": {
                 use: {
                     **_rms_points([p for p in points if p["use"] == use]),
@@ -202,6 +210,17 @@ class ControlFit:
                 for use in ("control", "check")
             },
         }
+
+
+def aligned(model: Array, ned: Array, known_scale: float | None) -> Similarity | None:
+    """The placement of points (N, 3) of the model on known ones; None where they are on a line."""
+    spread = np.linalg.svd(ned - ned.mean(axis=0), compute_uv=False)
+    if spread[1] < _LEAST_SPREAD * spread[0]:
+        return None
+    if known_scale is None:
+        return align_similarity(model, ned)
+    rigid = align_rigid(known_scale * model, ned)
+    return Similarity(scale=known_scale, rotation=rigid.rotation, translation=rigid.translation)
 
 
 def tie_control(
@@ -254,6 +273,10 @@ def describe(score: Mapping[str, Any]) -> str:
                 f"{rms['bars']} lengths {words}: rms {1e3 * rms['length_m']:.2f} mm, "
                 f"{100 * rms['length_relative']:.3f} %"
             )
+    if score.get("sigma_factor", 1.0) > 1.0:
+        lines.append(f"sigmas of the points are {score['sigma_factor']:.2g} times those stated")
+    left_out = [row["name"] for row in score["points"] if row["use"] == "left out"]
+    lines += [f"{name}: left out, for the others contradict it" for name in left_out]
     lines += [f"{name}: {why}" for name, why in score["not_found"].items()]
     return "\n".join(lines) if lines else "no control was found in the pictures"
 

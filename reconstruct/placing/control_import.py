@@ -6,7 +6,7 @@ A format is one module with a reader that returns `ForeignControl`; `_READERS` l
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -16,7 +16,7 @@ from alice_survey.base.errors import WorkspaceError, warn, why
 from alice_survey.base.manifest import read_manifest
 from reconstruct.pictures.files import safe_name
 from reconstruct.placing.control_file import CONTROL_FILE, PICKS_FILE
-from reconstruct.placing.foreign_control import ForeignControl, ForeignPoint
+from reconstruct.placing.foreign_control import ForeignBar, ForeignControl, ForeignPoint
 from reconstruct.placing.metashape_control import is_markers, read_markers
 from reconstruct.placing.odm_control import is_gcp_list, read_gcp_list
 
@@ -29,7 +29,7 @@ _READERS: tuple[tuple[Callable[[str], bool], Callable[[str], ForeignControl]], .
 _LARGEST_BYTES = 200_000_000
 _CONTROL_HEADER = (
     "kind", "name", "use", "latitude_deg", "longitude_deg", "north_m", "east_m", "depth_m",
-    "height_m", "sigma_m", "sigma_vertical_m",
+    "height_m", "sigma_m", "sigma_vertical_m", "from", "to", "length_m",
 )  # fmt: skip
 _SHOWN_NAMES = 4
 
@@ -39,8 +39,9 @@ class ImportedControl:
     """What a workspace got."""
 
     points: int
+    bars: int
     checks: int
-    """Points that only score the model."""
+    """Points and bars that only score the model."""
     picks: int
     pictures: int
     """Pictures in which points are picked."""
@@ -48,7 +49,8 @@ class ImportedControl:
     def __str__(self) -> str:
         """One line."""
         held = f" ({self.checks} of them to check by)" if self.checks else ""
-        return f"{self.points} points{held}, {self.picks} picks in {self.pictures} pictures"
+        bars = f", {self.bars} scale bar{'s' * (self.bars > 1)}" if self.bars else ""
+        return f"{self.points} points{bars}{held}, {self.picks} picks in {self.pictures} pictures"
 
 
 def import_control(
@@ -83,9 +85,11 @@ def import_control(
     found = read_foreign(path)
     if heights == "ellipsoid" and not all(point.geodetic for point in found.points):
         raise WorkspaceError(f"{path}: is of a local grid, which has no ellipsoid: --heights level")
-    points = _usable(path, found.points, sigma_m, sigma_vertical_m)
+    points = _usable(path, found, sigma_m, sigma_vertical_m)
+    bars = _bars(path, found, sigma_m)
     names = [record.image for record in read_manifest(images / "manifest.csv")]
-    rows, lost = _picks(found, {point.name for point in points}, names)
+    wanted = {point.name for point in points} | {end for bar in bars for end in bar.ends}
+    rows, lost = _picks(found, wanted, names)
     if not rows:
         raise WorkspaceError(
             f"{path}: none of its {len(found.picks)} picks is in a picture of {images}: "
@@ -99,7 +103,11 @@ def import_control(
             "left out"
         )
     for target, header, lines in (
-        (targets[0], _CONTROL_HEADER, [_control_row(point, heights) for point in points]),
+        (
+            targets[0],
+            _CONTROL_HEADER,
+            [*(_control_row(point, heights) for point in points), *map(_bar_row, bars)],
+        ),
         (targets[1], ("image", "point", "x", "y", "sigma_px"), rows),
     ):
         write_csv(target, header, lines)
@@ -107,7 +115,8 @@ def import_control(
         warn(f"{path}: {note}")
     return ImportedControl(
         points=len(points),
-        checks=sum(point.use == "check" for point in points),
+        bars=len(bars),
+        checks=[*(p.use for p in points), *(bar.use for bar in bars)].count("check"),
         picks=len(rows),
         pictures=len({row[0] for row in rows}),
     )
@@ -143,16 +152,17 @@ def read_foreign(path: Path) -> ForeignControl:
 
 def _usable(
     path: Path,
-    points: Sequence[ForeignPoint],
+    foreign: ForeignControl,
     sigma_m: float | None,
     sigma_vertical_m: float | None,
 ) -> list[ForeignPoint]:
-    """Points of known place, with sigmas; the others are named."""
-    placed = [point for point in points if all(map(math.isfinite, point.place))]
-    left = [point.name for point in points if point not in placed]
+    """Points of known place, with sigmas; the others are named, unless bars end there."""
+    placed = [point for point in foreign.points if all(map(math.isfinite, point.place))]
+    ends = {end for bar in foreign.bars for end in bar.ends}
+    left = [p.name for p in foreign.points if p not in placed and p.name not in ends]
     if left:
         warn(f"{path}: points without a whole place are left out: {_some(left)}")
-    if not placed:
+    if not placed and not foreign.bars:
         raise WorkspaceError(f"{path}: no point has a place")
     found = []
     for point in placed:
@@ -163,6 +173,17 @@ def _usable(
             )
         found.append(known)
     return found
+
+
+def _bars(path: Path, foreign: ForeignControl, sigma_m: float | None) -> list[ForeignBar]:
+    """Bars with sigmas."""
+    bars = [bar if bar.sigma_m else replace(bar, sigma_m=sigma_m) for bar in foreign.bars]
+    unknown = [bar.name for bar in bars if bar.sigma_m is None]
+    if unknown:
+        raise WorkspaceError(
+            f"{path}: states no accuracy of scale bar {shown(unknown[0])}: give --sigma, in metres"
+        )
+    return bars
 
 
 def _picks(
@@ -202,7 +223,12 @@ def _control_row(point: ForeignPoint, heights: Heights) -> tuple[object, ...]:
     vertical = (-height, None) if heights == "level" else (None, height)
     return (
         "point", point.name, point.use, *geodetic, *vertical, point.sigma_m, point.sigma_vertical_m,
+        *[None] * 3,
     )  # fmt: skip
+
+
+def _bar_row(bar: ForeignBar) -> tuple[object, ...]:
+    return ("bar", bar.name, bar.use, *[None] * 6, bar.sigma_m, None, *bar.ends, bar.length_m)
 
 
 def _some(names: Sequence[str]) -> str:

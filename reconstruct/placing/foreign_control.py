@@ -48,11 +48,23 @@ class ForeignPick:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ForeignBar:
+    """A known distance of two points."""
+
+    name: str
+    ends: tuple[str, str]
+    length_m: float
+    use: Use = "control"
+    sigma_m: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class ForeignControl:
     """All that a file holds."""
 
     points: tuple[ForeignPoint, ...]
     picks: tuple[ForeignPick, ...]
+    bars: tuple[ForeignBar, ...] = ()
     notes: tuple[str, ...] = ()
     """What else it holds that is not used."""
 

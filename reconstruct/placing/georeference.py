@@ -1,11 +1,13 @@
 """Where a model lies in the world: fitted to navigation, or levelled where there is none."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import warn
+from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
@@ -20,6 +22,9 @@ from reconstruct.placing.navigation_equations import (
 from reconstruct.placing.navigation_task import SHRUNK, ExtraOf, NavigationTask
 from reconstruct.placing.placement_fit import PlacementFit
 
+_ROUGH_SCALE, _VAGUE_SCALE = 0.03, 0.15
+"""Relative sigmas of a scale by positions: from the first it is worth a warning; beyond the second
+it is none: of vaguer ones those that are too large would pass."""
 _TRIMS = 5
 """Rounds of leaving out what is off the mean plane."""
 
@@ -110,14 +115,42 @@ def fit_navigation(
         control=control,
         joints=joints,
     )
-    near = task.robust(start, free)
-    if near.scale < SHRUNK * start.scale:
+    near, fit = task.robust(start, free), None
+    if near.scale >= SHRUNK * start.scale:
+        with suppress(ReconstructionError):
+            fit = task.fit(near, free)
+    if fit is None:
         warn(
             "positions of navigation and model have no scale in common: it stays without CRS; are "
             "they of these pictures?"
         )
         return None
-    return task.fit(near, free)
+    return fit if known_scale is not None or control is not None else _with_rough_scale(fit)
+
+
+def _with_rough_scale(fit: PlacementFit) -> PlacementFit | None:
+    """The fit with a sigma of its scale that holds where positions hardly show the scale.
+
+    Errors of the scale itself are normal, those of its logarithm not: three sigmas s below a scale
+    are -ln(1 - 3 s) away. None, after a warning, where the scale might as well be zero.
+    """
+    sigma = fit.sigma_scale
+    if sigma < _ROUGH_SCALE:
+        return fit
+    if sigma > _VAGUE_SCALE:
+        warn(
+            f"positions of navigation show the scale to {sigma:.0%} only: the model stays without "
+            "CRS; measure a known length with 'alice-survey scale'"
+        )
+        return None
+    honest = -float(np.log1p(-3.0 * sigma)) / 3.0
+    warn(
+        f"positions spread little for their errors: the scale is rough, sigma {honest:.0%}; "
+        "measure a known length with 'alice-survey scale'"
+    )
+    grown = np.ones(len(fit.joint))
+    grown[SCALE] = honest / sigma
+    return replace(fit, joint=fit.joint * np.outer(grown, grown))
 
 
 def fit_control(

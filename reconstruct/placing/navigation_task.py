@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import warn
+from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
@@ -90,7 +90,12 @@ class NavigationTask:
     joints: int
 
     def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
-        """Iterate from a robust placement to the final one."""
+        """Iterate from a robust placement to the final one.
+
+        Raises:
+            ReconstructionError: the model shrinks to a point on the way, or grows without bound.
+        """
+        start = place
         epochs, sizes, factor = self.epochs, np.zeros(self.epochs.modes.shape[2]), 1.0
         nuisances = np.zeros(PARAMETERS)
         found = equations(epochs, place, self._middle(place))
@@ -121,7 +126,9 @@ class NavigationTask:
                 frame_bounds=bounds,
                 widened=widened,
             )
-            place = _moved(place, got.change, middle)
+            place = _moved(place, _without_overshoot(got.change), middle)
+            if not SHRUNK < place.scale / start.scale < 1.0 / SHRUNK:
+                raise ReconstructionError("positions of navigation show no scale of the model")
             sizes = sizes + got.change[PARAMETERS:]
             nuisances = got.change[:PARAMETERS]
             sigma = np.sqrt(np.diag(got.covariance))
@@ -420,12 +427,18 @@ class NavigationTask:
             step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
             change = np.zeros(rows_of.shape[1])
             change[free] = step
-            if change[SCALE] > 0:  # a scale alone is solved by 1 + step; exp overshoots
-                change[SCALE] = np.log1p(change[SCALE])
-            place = _moved(place, change, middle)
+            place = _moved(place, _without_overshoot(change), middle)
             if np.all(np.abs(step) * size < 1e-6) or place.scale < SHRUNK * start.scale:
                 break
         return place
+
+
+def _without_overshoot(change: Array) -> Array:
+    """A change (P,) whose scale grows by 1 + step, as a scale alone is solved, and not by exp."""
+    grown = change.copy()
+    if grown[SCALE] > 0:
+        grown[SCALE] = np.log1p(grown[SCALE])
+    return grown
 
 
 def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:

@@ -1,12 +1,13 @@
 """Points picked in pictures, found in space through the exact lenses of their cameras."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.triangulate import nearest_to_rays
@@ -17,6 +18,10 @@ _WRONG_SIGMAS = 5.0
 _WRONG_PX = 2.0
 """A pick further off than both is left out where three or more remain."""
 _TRIED = 6
+_COARSE = 3.0
+"""How many of their sigmas picks of most points must be off to count as coarser than stated."""
+_LEAST_POINTS = 3
+"""Points that say how coarse picks are."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,10 +73,12 @@ def find_spots(
     """
     by_name: dict[str, list[Pick]] = {}
     for pick in picks:
-        by_name.setdefault(pick.point, []).append(pick)
+        if pick.image in cameras:
+            by_name.setdefault(pick.point, []).append(pick)
+    by_name = _with_real_sigmas(by_name, cameras)
     found, lost = {}, {}
-    for name, some in sorted(by_name.items()):
-        seen = [p for p in some if p.image in cameras]
+    for name in sorted({pick.point for pick in picks}):
+        seen = by_name.get(name, [])
         if len({p.image for p in seen}) < 2:
             lost[name] = f"picked in {len(seen)} pictures of the model; two or more are needed"
             continue
@@ -93,6 +100,32 @@ def find_spots(
                 rms_px=float(np.sqrt(np.mean([c.rms_px**2 for c in whole]))),
             )
     return found, lost
+
+
+def _with_real_sigmas(
+    by_name: Mapping[str, list[Pick]], cameras: Mapping[str, RegisteredPicture]
+) -> dict[str, list[Pick]]:
+    """Picks whose sigmas are what those of most points miss by, where that is far more."""
+    sizes = []
+    for some in by_name.values():
+        start = _nearest(some, cameras) if len({p.image for p in some}) > 1 else ""
+        if isinstance(start, str):
+            continue
+        off = _fit(start, some, cameras)[0] / np.array([[p.sigma_px] for p in some])
+        if np.isfinite(off).all():
+            sizes.append(float(np.sqrt(np.sum(off**2) / (2 * len(some) - 3))))
+    factor = float(np.median(sizes)) if len(sizes) >= _LEAST_POINTS else 1.0
+    if factor <= _COARSE:
+        return dict(by_name)
+    usual = float(np.median([p.sigma_px for some in by_name.values() for p in some]))
+    warn(
+        f"picks of most of {len(sizes)} points are {factor:.2g} times as far off as their sigma of "
+        f"{usual:.2g} px: they count with a sigma of {factor * usual:.2g} px"
+    )
+    return {
+        name: [replace(p, sigma_px=factor * p.sigma_px) for p in some]
+        for name, some in by_name.items()
+    }
 
 
 def _triangulate(
@@ -164,6 +197,7 @@ def _fit(
 ) -> tuple[Array, Array, Array]:
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
     picked = np.array([[p.x_px, p.y_px] for p in picks])
+    near_px = max(_ROBUST_PX, 2.0 * float(np.median([p.sigma_px for p in picks])))
     unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))
 
     def misses(x: Array) -> Array:
@@ -172,7 +206,7 @@ def _fit(
         return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
 
     found = least_squares(
-        misses, np.zeros(3), loss="soft_l1", f_scale=_ROBUST_PX, xtol=1e-12, ftol=1e-12, gtol=1e-12,
+        misses, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12, ftol=1e-12, gtol=1e-12,
         jac="3-point",
     )  # fmt: skip
     jacobian = np.empty((2 * len(picks), 3))

@@ -25,6 +25,12 @@ from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.pictures.files import named
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.altitude_scale import scale_by_altitudes
+from reconstruct.placing.coarse_control import (
+    real_sigma_factor,
+    warn_of_coarse,
+    widened,
+    without_wrong_points,
+)
 from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_file import (
     CONTROL_FILE,
@@ -37,7 +43,12 @@ from reconstruct.placing.control_file import (
 )
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.mount import fit_with_mount
-from reconstruct.placing.navigation_equations import Installation, body_from_pinhole
+from reconstruct.placing.navigation_equations import (
+    PLACE,
+    SCALE,
+    Installation,
+    body_from_pinhole,
+)
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.placing.track import picture_modes
@@ -48,6 +59,7 @@ RIG_SCALE_SIGMA = 1e-3
 (600 ppm in the built-in demo; the baseline's own sigma leaves out the angle between cameras)."""
 LENGTH_SCALE_SIGMA = 1e-2
 """Relative sigma of a scale from one length that a person measured."""
+_WIDENED_TIMES = 5
 _VERTICAL_OF_CONTROL = "WGS 84 ellipsoid, or the level of the control points' depths"
 _LOCAL = "placed by control points in their own north, east and depth; no CRS"
 
@@ -117,12 +129,25 @@ def find_place(task: Placing) -> Placed:
     path = task.workspace / CONTROL_FILE
     control = read_control(path) if path.is_file() else Control()
     datum = task.datum or control.datum()
-    ties = _tie(task, control, datum)
+    ties = without_wrong_points(_tie(task, control, datum), scale)
     fit, local = _fit(task, levelled, scale, known, ties, datum)
+    # Points that count for more than they are worth bend the model, and so hide what they miss by.
+    for _ in range(_WIDENED_TIMES):
+        if fit is None or local is not None:
+            break
+        freely = PLACE if fit.sigma_scale > 0 else SCALE
+        factor = real_sigma_factor(ties.deformed(fit.modes), fit.ned_from_model, freely)
+        if factor == 1.0:
+            break
+        ties = widened(ties, factor)
+        fit, local = _fit(task, levelled, scale, known, ties, datum)
+    warn_of_coarse(ties)
     notes = [*task.survey.notes, *task.mapping.notes]
     if fit is not None:
         place = fit.ned_from_model
         source = _scale_source(known, ties)
+        if known is None and not ties.informs_scale:
+            source += f", sigma {fit.sigma_scale:.2g}"
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
             datum = None

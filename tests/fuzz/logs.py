@@ -77,6 +77,31 @@ def _dive() -> list[tuple[object, ...]]:
     return rows
 
 
+def _ulog(folder: Path) -> None:
+    from tests.missions.logs.test_import_ulog import dive, ulog
+
+    (folder / "a.ulg").write_bytes(ulog(dive(6)))
+
+
+def _pd0(folder: Path, transform: int) -> None:
+    from tests.missions.logs.test_import_pd0 import log_of
+
+    log_of(transform, folder / "a.pd0", 6)
+
+
+def read_pairing(path: Path) -> object:
+    """As `import-images --triggers`."""
+    from reconstruct.pictures.pairing import pair_by_time
+
+    sides = {side: [Path(f"{side}/{k}.jpg") for k in range(5)] for side in ("left", "right")}
+    return pair_by_time(sides, path, UTC)
+
+
+def _pairing(folder: Path) -> None:
+    rows = [f"{side},{k},{10.5 + k}" for k in range(5) for side in ("left", "right")]
+    (folder / "p.csv").write_text("camera,number,time_s\n" + "\n".join(rows) + "\n")
+
+
 def _dataflash(folder: Path, name: str) -> None:
     from tests.missions.logs.log_files import dataflash_log, dataflash_text
 
@@ -320,6 +345,19 @@ TARGETS = (
     ),
     Target(
         name="reports of a DVL", syntax="json", file="a.json", build=_dvl, read=read_dead_reckoned
+    ),
+    Target(name="ULog", syntax="binary", file="a.ulg", build=_ulog, read=read_any_log),
+    Target(
+        name="PD0, beams", syntax="binary", file="a.pd0",
+        build=partial(_pd0, transform=0x00), read=read_any_log,
+    ),
+    Target(
+        name="PD0, ship", syntax="binary", file="a.pd0",
+        build=partial(_pd0, transform=0x14), read=read_any_log,
+    ),
+    Target(
+        name="trigger log of pictures", syntax="csv", file="p.csv", build=_pairing,
+        read=read_pairing,
     ),
     Target(
         name="DataFlash .BIN", syntax="binary", file="a.bin",

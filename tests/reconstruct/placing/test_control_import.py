@@ -1,6 +1,7 @@
 """Ground control as ODM and Metashape write it arrives as points and picks of the workspace."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import WorkspaceError, collected_by
+from alice_survey.base.errors import WorkspaceError, collected_by, heard
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord, write_manifest
 from reconstruct.placing.control_file import read_control, read_picks
@@ -248,3 +249,50 @@ def test_pictures_that_are_not_there_are_named(workspace: Path, tmp_path: Path) 
     path.write_text("EPSG:4326\n-91 46 1 10 20 other.jpg A\n")
     with pytest.raises(WorkspaceError, match=r"none of its 1 picks .*other\.jpg"):
         import_control(workspace, path, sigma_m=0.02)
+
+
+SCALEBARS = (
+    '<scalebars next_id="4"><scalebar id="0" label="short" {ends}>'
+    '<reference distance="0.5" accuracy="0.0002" enabled="true"/></scalebar>'
+    '<scalebar id="1" label="A_C"><reference distance="81.5" enabled="false"/></scalebar>'
+    '<scalebar id="2" label="B_D"><reference distance="1.5"/></scalebar>'
+    '<scalebar id="3" label="B_C"/></scalebars>'
+)
+
+
+@pytest.mark.parametrize("placed", [True, False])
+@pytest.mark.parametrize("ends", ['marker_id1="0" marker_id2="1"', 'marker1="0" marker2="1"'])
+def test_scale_bars_of_metashape_become_bars(workspace: Path, ends: str, placed: bool) -> None:
+    path = workspace / "markers.xml"
+    settings = (
+        '<settings><property name="accuracy_markers" value="0.01"/>'
+        '<property name="accuracy_scalebars" value="0.004"/></settings>'
+    )
+    markers_xml(path, settings=settings + SCALEBARS.format(ends=ends))
+    if not placed:  # a diver's reef: bars, and no place of any marker
+        text = re.sub(r'<reference x="[^>]*/>', "", path.read_text())
+        path.write_text(re.sub(r"<reference>.*?</reference>", "", text))
+    with heard() as said:
+        found = import_control(workspace, path)
+    assert (found.points, found.bars, found.checks) == ((3, 2, 2) if placed else (0, 2, 1))
+    assert any("B_D, B_C" in text for text in said)
+    lengths = {bar.name: bar for bar in read_control(workspace / "control.csv").lengths}
+    assert set(lengths) == {"short", "A_C"}
+    short, long = lengths["short"], lengths["A_C"]
+    assert (short.ends, short.length_m, short.sigma_m, short.use) == (
+        ("A", "B"), 0.5, 0.0002, "control",
+    )  # fmt: skip
+    assert (long.ends, long.length_m, long.sigma_m, long.use) == (
+        ("A", "C"), 81.5, 0.004, "check",
+    )  # fmt: skip
+    assert {pick.point for pick in read_picks(workspace / "picks.csv")} == {"A", "B", "C"}
+
+
+def test_scale_bars_without_an_accuracy_ask_for_it(workspace: Path) -> None:
+    path = markers_xml(workspace / "markers.xml", system=SCALEBARS.format(ends='marker="0"'))
+    text = re.sub(r'<reference x="[^>]*/>', "", path.read_text())
+    path.write_text(text)
+    with pytest.raises(WorkspaceError, match="accuracy of scale bar A_C"):
+        import_control(workspace, path)
+    found = import_control(workspace, path, sigma_m=0.002)
+    assert str(found) == "0 points, 1 scale bar (1 of them to check by), 4 picks in 2 pictures"

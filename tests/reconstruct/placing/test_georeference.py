@@ -134,11 +134,51 @@ def test_a_straight_line_is_kept_from_turning_about_itself() -> None:
     assert np.rad2deg(np.arccos(down[2])) < 6.0
 
 
-def test_positions_closer_than_their_sigma_do_not_place_a_model(
+def exif(scene: Scene, seed: int, drift_m: float, correlated_s: float) -> list[ImageRecord]:
+    """GPS of 3 m as EXIF has it over a block of 4 by 2 m: one error, a little of which drifts."""
+    rng = np.random.default_rng(seed)
+    count = 1 + max(record.station for record in scene.records)
+    errors = np.zeros((count, 3))
+    errors[0] = rng.normal(0, drift_m, 3)
+    kept = np.exp(-2.0 / correlated_s)
+    for k in range(1, count):
+        errors[k] = kept * errors[k - 1] + np.sqrt(1 - kept**2) * rng.normal(0, drift_m, 3)
+    errors += rng.normal(0, 3.0, 3) + rng.normal(0, 0.1, errors.shape)
+    at = np.array([record.station for record in scene.records])
+    places = np.stack([pose.translation for pose in scene.ned_from_cam]) + errors[at]
+    nan = float("nan")
+    return [
+        replace(r, latitude_deg=a, longitude_deg=b, depth_m=d, roll_deg=nan, pitch_deg=nan,
+                heading_deg=nan, altitude_m=nan, sigma_horizontal_m=3.0, sigma_depth_m=6.0)
+        for r, (a, b, d) in zip(scene.records, DATUM.geodetic_from_ned(places), strict=True)
+    ]  # fmt: skip
+
+
+def test_positions_closer_than_their_sigma_give_a_rough_scale_with_an_honest_sigma(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    records = [replace(r, roll_deg=np.nan, sigma_horizontal_m=50.0) for r in site().records]
-    assert fit(site(), records, gauge(6, 1.0), known=True) is None
+    misses, sigmas = [], []
+    for seed in range(16):
+        found = fit(site(), exif(site(), seed, 0.3, 20.0), gauge(seed, 2.0), known=False,
+                    levers=False)  # fmt: skip
+        assert found is not None
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "rough" in line and "alice-survey scale" in line
+        misses.append(np.log(found.ned_from_model.scale / 2.0) / found.sigma_scale)
+        sigmas.append(found.sigma_scale)
+    assert min(sigmas) > 0.02 and max(sigmas) < 0.2
+    assert 0.7 < np.sqrt(np.mean(np.square(misses))) < 1.4
+
+
+def test_positions_that_scatter_more_than_they_spread_give_no_scale(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for seed in range(6):
+        records = exif(site(), seed, 3.0, 1.0)
+        assert fit(site(), records, gauge(seed, 2.0), known=False, levers=False) is None
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    far = [replace(r, roll_deg=np.nan, sigma_horizontal_m=50.0) for r in site().records]
+    assert fit(site(), far, gauge(6, 1.0), known=True) is None
     assert len(capsys.readouterr().err.splitlines()) == 1
     nowhere = [replace(r, latitude_deg=np.nan) for r in site().records]
     assert fit(site(), nowhere, gauge(6, 1.0), known=True) is None

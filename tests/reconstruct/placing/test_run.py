@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
+from pyproj import Transformer
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
@@ -18,9 +20,11 @@ from alice_survey.base.records import RegistrationRecord
 from alice_survey.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.placing.control_import import import_control
+from reconstruct.placing.picked_points import RegisteredPicture
 from reconstruct.placing.scale import scale_model
 from reconstruct.placing.track import read_track_poses
-from reconstruct.views.model import read_model
+from reconstruct.views.model import read_model, read_warps
 
 
 def reconstruct(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
@@ -50,7 +54,7 @@ def test_a_drone_block_is_registered_scaled_and_placed_by_its_gps(drone: Path) -
     found = read_json(drone / "sparse" / "registration.json")
     assert found["registered"] == found["total"] == 6
     assert 0.1 < found["mean_reprojection_px"] < 1.0
-    assert found["scale_source"] == "scale from navigation"
+    assert found["scale_source"].startswith("scale from navigation, sigma 0.")
     assert max(found["georeference"][f"rms_{axis}_m"] for axis in ("north", "east", "depth")) < 3
     model = read_model(drone / "sparse")
     assert (model.frame.name, model.frame.scaled) == ("ned", True)
@@ -254,3 +258,50 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
     write_manifest(manifest, records)
     with pytest.raises(AliceError, match=r"800 x 450.*3384 x 2710"):
         reconstruct(folder, QUICK, SERIAL)
+
+
+def test_ground_control_of_handheld_gps_is_fitted_robustly(
+    drone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A gcp_list of nine points, 1.5 m off where 0.02 m is stated, one of them 80 m off."""
+    work = tmp_path / "work"
+    shutil.copytree(drone, work)
+    model = pycolmap.Reconstruction(drone / "sparse" / "model")
+    datum = read_model(drone / "sparse").frame.datum
+    assert datum is not None
+    rng = np.random.default_rng(3)
+    points = [p for _, p in sorted(model.points3D.items()) if p.track.length() >= 4]
+    to_utm = Transformer.from_crs(4326, datum.utm_epsg, always_xy=True)
+    chosen = [points[0]]
+    while len(chosen) < 9:  # the one that is farthest from all chosen ones
+        away = [min(np.linalg.norm(p.xyz - q.xyz) for q in chosen) for p in points]
+        chosen.append(points[int(np.argmax(away))])
+    cameras = read_warps(work / "sparse" / "cameras.json")
+    lines = [f"EPSG:{datum.utm_epsg}"]
+    for number, point in enumerate(chosen):
+        wrong = np.array([60.0, -50.0, 20.0]) if number == 4 else np.zeros(3)
+        place = point.xyz + rng.normal(0, 1.5, 3) + wrong
+        latitude, longitude, depth = datum.geodetic_from_ned(place[None])[0]
+        east, north = to_utm.transform(longitude, latitude)
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen = image.cam_from_world() * point.xyz
+            record = image.name.split("/", maxsplit=1)[0]
+            pose = RigidTransform.identity()
+            x, y = RegisteredPicture(warp=cameras[record], model_from_pinhole=pose).project(
+                seen
+            ) + rng.normal(0, 2.0, 2)
+            name = Path(image.name).name
+            lines.append(f"{east:.4f} {north:.4f} {-depth:.4f} {x:.2f} {y:.2f} {name} g{number}")
+    (work / "gcp_list.txt").write_text("\n".join(lines))
+    import_control(work, work / "gcp_list.txt", sigma_m=0.02)
+    capsys.readouterr()
+    assert spec("placing").make(work, QUICK, SERIAL)
+    said = capsys.readouterr().err
+    assert "control point g4 is " in said and "count with a sigma of" in said
+    score = read_json(work / "sparse" / "control.json")
+    assert [row["name"] for row in score["points"] if row["use"] == "left out"] == ["g4"]
+    assert 0.6 * 1.5 < 0.02 * score["sigma_factor"] < 2.0 * 1.5
+    assert score["rms"]["control"]["points"] == 8
+    found = read_json(work / "sparse" / "georeference.json")
+    assert 0.3 < found["sigma_north_m"] < 1.5  # 1.5 m over the root of 8 points

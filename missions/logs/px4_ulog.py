@@ -1,0 +1,323 @@
+"""PX4's on-board log (.ulg) as a logged dive.
+
+The format describes itself: definitions of message types (F), which number stands for which of them
+(A), and their packed values (D), each behind its length (docs.px4.io, "ULog File Format"). What the
+messages hold: docs.px4.io, "uORB Message Reference". Quaternions of `vehicle_attitude` are of the
+FRD body in NED, with w first; `eph` is the root of the summed variances of north and east.
+"""
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.frames import Array, Datum, attitude_from_rotation
+from missions.logs.dataflash import LogTable, Mask
+from missions.logs.dive import LoggedDive, Signal, cleaned
+from missions.logs.message_sources import Keep, Source, Tables, dive_from, take, with_time
+
+MAGIC = b"ULog\x01\x12\x35"
+_HEADER = 16
+_TYPES = {
+    "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
+    "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
+    "bool": "u1", "char": "S1",
+}  # fmt: skip
+_FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? +(\w+)")
+_APPENDED = 1
+"""Flag of a log that was written on later, after a crash."""
+_DEEPEST, _MOST_FIELDS = 8, 4096
+_FIX_3D = 3
+_DOWN = 25
+"""ROTATION_PITCH_270: a range finder that looks down."""
+_GPS = ("sensor_gps", "vehicle_gps_position")
+"""Receivers by the names of new and of old versions."""
+_LOCAL, _GLOBAL = "vehicle_local_position", "vehicle_global_position"
+
+
+def _valid(*fields: str) -> Keep:
+    return Keep(
+        fields, lambda table: np.all([table.columns[field] > 0 for field in fields], axis=0)
+    )
+
+
+def _from_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | None:
+    """Latitude and longitude of north and east from the filter's origin, which may be set again."""
+    if not table.has("x", "y", "xy_valid", "xy_global", "ref_lat", "ref_lon"):
+        return None
+    table = table.rows(
+        (table.columns["xy_valid"] > 0)
+        & (table.columns["xy_global"] > 0)
+        & np.isfinite(table.stacked("x", "y", "ref_lat", "ref_lon")).all(axis=1)
+    )
+    places = np.full((len(table), 2), np.nan)
+    ne0 = np.column_stack([table.stacked("x", "y"), np.zeros(len(table))])
+    origins, of = np.unique(table.stacked("ref_lat", "ref_lon"), axis=0, return_inverse=True)
+    for number, (latitude, longitude) in enumerate(origins.tolist()):
+        if abs(latitude) < 90 and abs(longitude) <= 360:
+            rows = of.ravel() == number
+            places[rows] = Datum(latitude, longitude).geodetic_from_ned(ne0[rows])[:, :2]
+    return table.columns["time_s"], places
+
+
+def _attitude(table: LogTable, _: Tables) -> tuple[Array, Array] | None:
+    if not table.has(*(f"q[{i}]" for i in range(4))):
+        return None
+    quaternion = table.stacked(*(f"q[{i}]" for i in (1, 2, 3, 0)))
+    known = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < 0.05
+    angles = np.full((len(table), 3), np.nan)
+    if known.any():
+        turns = Rotation.from_quat(quaternion[known])
+        angles[known] = np.rad2deg(attitude_from_rotation(turns))
+    return table.columns["time_s"], angles
+
+
+def _hears_bottom(table: LogTable) -> Mask:
+    distance = table.columns["current_distance"]
+    good: Mask = (
+        (table.columns["orientation"] == _DOWN)
+        & (distance >= table.columns["min_distance"])
+        & (distance < table.columns["max_distance"])
+    )
+    if "signal_quality" in table.columns:  # 0 is invalid, -1 not known
+        good &= table.columns["signal_quality"] != 0
+    return good
+
+
+_SURFACE = "positions are GPS: they hold at the surface only"
+_FIX = Keep(("fix_type",), lambda table: table.columns["fix_type"] >= _FIX_3D)
+_SOURCES: Mapping[str, tuple[Source, ...]] = {
+    "navigation": (
+        Source(_GLOBAL, take("lat", "lon")),
+        Source(_LOCAL, _from_origin),
+        Source(_GPS[0], take("latitude_deg", "longitude_deg", keep=_FIX), _SURFACE),
+        Source(_GPS[0], take("lat", "lon", scale=1e-7, keep=_FIX), _SURFACE),
+        Source(_GPS[1], take("latitude_deg", "longitude_deg", keep=_FIX), _SURFACE),
+        Source(_GPS[1], take("lat", "lon", scale=1e-7, keep=_FIX), _SURFACE),
+    ),
+    "depth": (
+        Source(
+            _LOCAL,
+            take("z", keep=_valid("z_valid")),
+            "depths count from where the vehicle's filter was started: --tide takes off its height "
+            "above the water, if that was not the surface",
+        ),
+    ),
+    "attitude": (Source("vehicle_attitude", _attitude),),
+    "altitude": (
+        Source(
+            "distance_sensor",
+            take(
+                "current_distance",
+                keep=Keep(("orientation", "min_distance", "max_distance"), _hears_bottom),
+            ),
+        ),
+    ),
+    "velocity": (Source(_LOCAL, take("vx", "vy", "vz", keep=_valid("v_xy_valid", "v_z_valid"))),),
+    "rates": (Source("vehicle_angular_velocity", take(*(f"xyz[{i}]" for i in range(3)))),),
+    "pwm": (Source("actuator_outputs", take(*(f"output[{i}]" for i in range(8)))),),
+}
+"""Sources of each role, the best first; degrees, metres, m/s, rad/s."""
+
+
+def is_ulog(path: Path) -> bool:
+    """Whether a file begins as such a log."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def read_px4_ulog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
+    """Read a log.
+
+    Args:
+        path: a .ulg.
+        requested: the message to use for each role (`dive.ROLES`), `NAME` or `NAME[instance]`.
+
+    Raises:
+        NavigationError: it is not such a log, or lacks what navigation needs.
+    """
+    lost: Counter[str] = Counter()
+    wanted = {source.message for sources in _SOURCES.values() for source in sources}
+    tables, present = read_ulog(path, wanted, lost)
+    offset_s = _since_1970(tables)
+    timed = {
+        name: with_time(table, table.columns["timestamp"] * 1e-6 + (offset_s or 0.0))
+        for name, table in tables.items()
+        if "timestamp" in table.columns
+    }
+    dive = dive_from(
+        path, _SOURCES, requested, timed, present, lost,
+        kind="an on-board log of PX4",
+        clock="the vehicle's clock since boot" if offset_s is None else "its clock, set by GPS",
+        dated=offset_s is not None,
+        declination_in_log_deg=None,
+    )  # fmt: skip
+    return replace(dive, sigmas=_sigmas(dive, timed))
+
+
+def _since_1970(tables: Tables) -> float | None:
+    """What makes UTC of seconds since boot: the median over all fixes; None without one."""
+    for name in _GPS:
+        table = tables.get(name)
+        if table is None or not table.has("timestamp", "time_utc_usec", "fix_type"):
+            continue
+        good = (table.columns["fix_type"] >= _FIX_3D) & (table.columns["time_utc_usec"] > 0)
+        if good.any():
+            apart = table.columns["time_utc_usec"][good] - table.columns["timestamp"][good]
+            return float(np.median(apart)) * 1e-6
+    return None
+
+
+def _sigmas(dive: LoggedDive, tables: Tables) -> dict[str, Signal]:
+    """Sigmas that the filter states of its own positions and depths."""
+    found = {}
+    for column, signal, field, share in (
+        ("sigma_horizontal_m", dive.position, "eph", np.sqrt(0.5)),
+        ("sigma_depth_m", dive.depth, "epv", 1.0),
+    ):
+        if signal is None or signal.source not in (_LOCAL, _GLOBAL):
+            continue
+        table = tables[signal.source]
+        if field not in table.columns:
+            continue
+        stated = table.columns[field]
+        values = share * np.where(stated > 0, stated, np.nan)
+        sigma = cleaned(signal.source, table.columns["time_s"], values, Counter())
+        if sigma is not None:
+            found[column] = sigma
+    return found
+
+
+def read_ulog(
+    path: Path, wanted: Collection[str], lost: Counter[str]
+) -> tuple[dict[str, LogTable], list[str]]:
+    """Read the messages of some names; those of several sensors have a column `Instance`.
+
+    Args:
+        path: a .ulg.
+        wanted: names of messages.
+        lost: counts what cannot be read; is added to.
+
+    Returns:
+        Tables by name, and the names of all messages in the log.
+
+    Raises:
+        NavigationError: it is not such a log, or cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None
+    if not data.startswith(MAGIC) or len(data) < _HEADER:
+        raise NavigationError(f"{path}: no log of PX4: it does not begin with ULog")
+    forms: dict[str, str] = {}
+    topics: dict[int, tuple[str, int]] = {}
+    starts: dict[int, list[int]] = {}
+    ends: dict[int, int] = {}
+    for kind, start, end in _messages(path, data, lost):
+        if kind == b"F":
+            name, _, fields = data[start:end].decode("ascii", "replace").partition(":")
+            forms[name] = fields
+        elif kind == b"A" and end - start > 3:
+            instance, number = struct.unpack_from("<BH", data, start)
+            topics[number] = (data[start + 3 : end].decode("ascii", "replace"), instance)
+        elif kind == b"D" and end - start > 2:
+            number = int.from_bytes(data[start : start + 2], "little")
+            shortest = ends.setdefault(number, end - start - 2)
+            ends[number] = min(shortest, end - start - 2)
+            starts.setdefault(number, []).append(start + 2)
+        elif kind == b"O":
+            lost["pauses of the recording"] += 1
+    parts: dict[str, list[LogTable]] = {}
+    view = np.frombuffer(data, np.uint8)
+    for number, (name, instance) in sorted(topics.items(), key=lambda item: item[1]):
+        if name not in wanted or number not in starts:
+            continue
+        kept = _dtype(name, forms)
+        if kept is None or kept.itemsize > ends[number]:
+            lost[f"{name}: messages that do not fit their definition"] += len(starts[number])
+            continue
+        raw = view[np.array(starts[number])[:, None] + np.arange(kept.itemsize)]
+        parts.setdefault(name, []).append(_table(name, instance, raw.view(kept)[:, 0]))
+    present = sorted({name for number, (name, _) in topics.items() if number in starts})
+    return {name: _joined(own) for name, own in parts.items()}, present
+
+
+def _messages(path: Path, data: bytes, lost: Counter[str]) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of every message's content."""
+    place, stops = _HEADER, [len(data)]
+    while place + 3 <= len(data):
+        size = int.from_bytes(data[place : place + 2], "little")
+        kind, start, end = data[place + 2 : place + 3], place + 3, place + 3 + size
+        if kind == b"B" and size >= 40:
+            incompatible = data[start + 8 : start + 16]
+            if incompatible[0] & ~_APPENDED or any(incompatible[1:]):
+                raise NavigationError(f"{path}: a later kind of ULog, which is not known")
+            offsets = struct.unpack_from("<3Q", data, start + 16)
+            stops = sorted({*(o for o in offsets if _HEADER < o < len(data)), len(data)})
+        stop = next(s for s in stops if s > place)
+        if end > stop:  # cut off, at the end or where the log was written on
+            lost["bytes of a message cut off"] += stop - place
+            place = stop
+            continue
+        yield kind, start, end
+        place = end
+
+
+def _dtype(name: str, forms: Mapping[str, str]) -> np.dtype[Any] | None:
+    """Record type of a message without the padding at its end; None where it is not known."""
+    fields = _fields(name, forms, 0)
+    while fields and fields[-1][0].startswith("_padding"):
+        fields.pop()
+    if not fields or any(not kind for _, kind in fields) or len(fields) > _MOST_FIELDS:
+        return None
+    if len({field for field, _ in fields}) < len(fields):
+        return None
+    return np.dtype(fields)
+
+
+def _fields(name: str, forms: Mapping[str, str], depth: int) -> list[tuple[str, str]]:
+    """Name and type of every number; an empty type where it is not known."""
+    found: list[tuple[str, str]] = []
+    for text in filter(None, forms.get(name, "").split(";")):
+        match = _FIELD.fullmatch(text.strip())
+        if match is None or depth > _DEEPEST or len(found) > _MOST_FIELDS:
+            return [(text, "")]
+        kind, count, field = match[1], match[2], match[3]
+        if field.startswith("_padding"):
+            found.append((f"{field}{len(found)}", f"S{count or 1}"))
+            continue
+        each = [field] if count is None else [f"{field}[{i}]" for i in range(min(int(count), 999))]
+        if kind in _TYPES:
+            found += [(one, _TYPES[kind]) for one in each]
+            continue
+        inner = _fields(kind, forms, depth + 1) or [("", "")]
+        found += [(f"{one}.{sub}", own) for one in each for sub, own in inner]
+    return found
+
+
+def _table(name: str, instance: int, records: Any) -> LogTable:
+    numbers = [f for f in records.dtype.names if records.dtype[f].kind != "S"]
+    columns = {field: records[field].astype(np.float64) for field in numbers}
+    columns["Instance"] = np.full(len(records), float(instance))
+    return LogTable(name=name, columns=columns, texts={})
+
+
+def _joined(parts: list[LogTable]) -> LogTable:
+    if len(parts) == 1:
+        return parts[0]
+    shared = [field for field in parts[0].columns if all(part.has(field) for part in parts)]
+    columns = {field: np.concatenate([p.columns[field] for p in parts]) for field in shared}
+    order = np.argsort(columns.get("timestamp", columns["Instance"]), kind="stable")
+    columns = {field: column[order] for field, column in columns.items()}
+    return LogTable(name=parts[0].name, columns=columns, texts={})

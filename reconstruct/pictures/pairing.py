@@ -1,0 +1,221 @@
+"""Pictures of several cameras in folders: which are of one moment, by time where there is any.
+
+Times are those of a trigger log, else moments in the names of files, else EXIF's. Without them
+numbers in the names say which pictures belong together (`pair_pictures`).
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+
+import numpy as np
+
+from alice_survey.base.artefacts import read_csv
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import CalibrationError, ImageError, warn
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.picture_sets import pair_pictures
+from camera_calib.picture_files import time_taken
+from missions.logs.dive import finite_number
+from missions.logs.navigation_csv import utc_date
+from reconstruct.pictures.files import named, to_utc
+from reconstruct.pictures.heic import can_read_heic
+from reconstruct.pictures.moments import moments_of
+
+_EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|_(\d{9})|(\d{3}|\d{6}|\d{9}))?(?!\d)")
+"""Seconds since 1970 after September 2001, with or without a fraction, as robots write them."""
+_DATE = re.compile(
+    r"(?<!\d)(20\d\d)-?(\d\d)-?(\d\d)[T_ -]?(\d\d)[-:_]?(\d\d)[-:_]?(\d\d)"
+    r"(?:\.(\d{1,9})|_?(\d{6})|(\d{3}))?(?!\d)"
+)
+"""A date and a time of day. Fewer digits behind a dash are a counter, not a fraction."""
+_LEAST_PAIRED = 0.5
+"""Share of the pictures of the camera with fewest that times must pair."""
+_WHOLE_SECONDS_S = 4.0
+"""Times in whole seconds tell pictures apart that are this far from each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedPictures:
+    """Pictures by moment."""
+
+    stations: tuple[Mapping[str, Path], ...]
+    """Picture of each camera, by moment."""
+    time_s: Mapping[Path, float] = field(default_factory=dict)
+    """When pictures were taken by the trigger log, on its clock."""
+
+
+def pair_by_time(
+    sides: Mapping[str, Sequence[Path]], triggers: Path | None, zone: tzinfo
+) -> PairedPictures:
+    """Group the pictures of cameras by moment.
+
+    Args:
+        sides: pictures of each camera, in the order of their names.
+        triggers: CSV with `time_s` or `time_utc` and `image` or `number`, and `camera` where
+            cameras are triggered apart.
+        zone: of its dates that name none.
+
+    Raises:
+        ImageError: the trigger log is wrong or holds none of the pictures, or pictures do not pair.
+    """
+    if triggers is not None:
+        logged = _trigger_times(triggers, sides, zone)
+        known = {
+            side: sorted((p for p in paths if p in logged), key=logged.__getitem__)
+            for side, paths in sides.items()
+        }
+        moments = moments_of(
+            {side: np.array([logged[p] for p in paths]) for side, paths in known.items() if paths}
+        )
+        found = [{side: known[side][i] for side, i in moment.items()} for moment in moments]
+        return PairedPictures(stations=tuple(found), time_s=logged)
+    if len(sides) <= 1:
+        return PairedPictures(stations=tuple({s: p} for s, paths in sides.items() for p in paths))
+    return PairedPictures(stations=tuple(_timed(sides) or _numbered(sides)))
+
+
+def _timed(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
+    """Moments by names or EXIF; None where these give no times, or not of one clock."""
+    for source, read in (("their names", _time_in_name), ("EXIF", _time_in_exif)):
+        known = {side: [read(p) for p in paths] for side, paths in sides.items()}
+        if any(t is None for times in known.values() for t in times):
+            continue
+        times = {side: np.array(own, dtype=np.float64) for side, own in known.items()}
+        orders = {side: np.argsort(own, kind="stable") for side, own in times.items()}
+        times = {side: own[orders[side]] for side, own in times.items()}
+        if not _tells_apart(times):
+            continue
+        try:
+            moments = moments_of(times)
+        except ImageError:
+            moments = []
+        fewest = min(len(own) for own in times.values())
+        if sum(len(moment) > 1 for moment in moments) < _LEAST_PAIRED * fewest:
+            warn(
+                f"times in {source} are not of one clock: pictures are paired by numbers or order, "
+                "by which a picture that a camera dropped can shift the pairs after it; a trigger "
+                "log (--triggers) pairs them by time"
+            )
+            continue
+        return [
+            {side: sides[side][orders[side][i]] for side, i in moment.items()} for moment in moments
+        ]
+    return None
+
+
+def _tells_apart(times: Mapping[str, Array]) -> bool:
+    """Whether times are fine enough to tell one picture of a camera from the next."""
+    steps = [np.diff(own) for own in times.values() if len(own) > 1]
+    if not steps or any((own <= 0).any() for own in steps):
+        return False
+    if any((own % 1.0).any() for own in times.values()):
+        return True
+    return min(float(np.median(own)) for own in steps) >= _WHOLE_SECONDS_S
+
+
+def _numbered(sides: Mapping[str, Sequence[Path]]) -> list[Mapping[str, Path]]:
+    """Moments by numbers in names, else by order."""
+    try:
+        sets = pair_pictures(sides)
+    except CalibrationError as error:
+        raise ImageError(f"{error}; or give a trigger log with --triggers") from None
+    whole = [len(one.paths) == len(sides) for one in sets]
+    paired = [k for k, all_there in enumerate(whole) if all_there]
+    if paired and not all(whole) and all(whole[: paired[-1] + 1]):
+        rest = [path.name for one in sets[paired[-1] + 1 :] for path in one.paths.values()]
+        warn(
+            f"only the last pictures have no partner ({named(rest)}): a camera that counts its own "
+            "pictures and dropped one shifts the pairs after it; a trigger log (--triggers) pairs "
+            "by time"
+        )
+    return [one.paths for one in sets]
+
+
+def _time_in_name(path: Path) -> float | None:
+    """Seconds since 1970 by the name of a file; None where it holds no moment."""
+    stamp = _EPOCH.search(path.stem)
+    if stamp is not None:
+        return float(f"{stamp[1]}.{stamp[2] or stamp[3] or stamp[4] or 0}")
+    date = _DATE.search(path.stem)
+    if date is None:
+        return None
+    try:
+        whole = datetime(*(int(part) for part in date.groups()[:6]), tzinfo=UTC)  # type: ignore[arg-type,misc]
+    except ValueError:
+        return None
+    return whole.timestamp() + float(f"0.{date[7] or date[8] or date[9] or 0}")
+
+
+def _time_in_exif(path: Path) -> float | None:
+    can_read_heic()  # which makes Pillow know them
+    taken = time_taken(path)
+    return None if taken is None else to_utc(taken, UTC).timestamp()
+
+
+def _trigger_times(
+    triggers: Path, sides: Mapping[str, Sequence[Path]], zone: tzinfo
+) -> dict[Path, float]:
+    """Times of the pictures that a trigger log holds; the others are named in a warning."""
+    columns, rows = read_csv(triggers, exact=True, fault=ImageError)
+    when = next((name for name in ("time_s", "time_utc") if name in columns), None)
+    which = next((name for name in ("image", "number") if name in columns), None)
+    if when is None or which is None:
+        raise ImageError(
+            f"{triggers}: has {shown(', '.join(columns))}: a trigger log needs the columns image "
+            "(or number) and time_s (or time_utc), and camera where cameras are triggered apart"
+        )
+    logged: dict[tuple[str, str], float] = {}
+    for line, row in rows:
+        key = row.get("camera", "").strip(), _key(row[which], which)
+        time_s = _moment(row[when].strip(), when, zone)
+        if not np.isfinite(time_s) or not key[1]:
+            raise ImageError(f"{triggers} line {line}: {shown(str(row))} states no picture or time")
+        if logged.setdefault(key, time_s) != time_s:
+            raise ImageError(
+                f"{triggers} line {line}: {which} {shown(row[which])} has two times; a column "
+                "camera tells those of several cameras apart"
+            )
+    found, lost = {}, []
+    for side, paths in sides.items():
+        taken: dict[float, Path] = {}
+        for path in paths:
+            digits = re.findall(r"\d+", path.stem)
+            own = _key(path.name, which) if which == "image" else digits and _key(digits[-1], which)
+            time = logged.get((side, own or ""), logged.get(("", own or "")))
+            if time is None:
+                lost.append(path.name)
+                continue
+            other = taken.setdefault(time, path)
+            if other != path:
+                raise ImageError(
+                    f"{triggers}: {other.name} and {path.name} of {side} have the same time: give "
+                    "pictures by name, in a column image"
+                )
+            found[path] = time
+    if not found:
+        raise ImageError(
+            f"{triggers}: holds none of the pictures, such as {named(lost, 2)}; its first is "
+            f"{shown(rows[0][1][which]) if rows else 'missing'}"
+        )
+    if lost:
+        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {named(lost)}")
+    return found
+
+
+def _key(text: str, which: str) -> str:
+    """How a picture is found: by its name without folder and suffix, or by its number."""
+    if which == "image":
+        return Path(text.strip().replace("\\", "/")).stem.lower()
+    return text.strip().lstrip("0") or "0" if text.strip().isdecimal() else ""
+
+
+def _moment(text: str, column: str, zone: tzinfo) -> float:
+    if column == "time_s":
+        return finite_number(text)
+    try:
+        return utc_date(text, zone).timestamp()
+    except ValueError:
+        return float("nan")

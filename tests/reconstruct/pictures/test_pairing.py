@@ -1,0 +1,146 @@
+"""Folders of several cameras are paired by time where there is any, and else say how."""
+
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from alice_survey.base.errors import ImageError, heard
+from alice_survey.base.manifest import read_manifest
+from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.pairing import pair_by_time
+
+START = datetime(2024, 7, 1, 12, 0, 0, 250_000, tzinfo=UTC)
+COUNT = 12
+DROPPED = {"left": (3,), "right": (7,)}
+"""As many of each, so that counts and orders look right."""
+Name = Callable[[int, int, datetime], str]
+
+
+def moment(k: int) -> datetime:
+    return START + timedelta(seconds=0.5 * k)
+
+
+def write(
+    folder: Path,
+    name: Name,
+    *,
+    exif: bool = False,
+    late_s: Mapping[str, float] | None = None,
+    dropped: Mapping[str, Sequence[int]] = DROPPED,
+) -> dict[str, list[Path]]:
+    """Pictures by side; `name` takes the moment, the camera's own count and the time."""
+    found: dict[str, list[Path]] = {}
+    for side, seed in (("left", 0), ("right", 100)):
+        kept = [k for k in range(COUNT) if k not in dropped[side]]
+        for own, k in enumerate(kept):
+            time = moment(k) + timedelta(seconds=(late_s or {}).get(side, 0.0))
+            path = folder / side / f"{name(k, own, time)}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            tags = Image.Exif()
+            if exif:
+                tags.get_ifd(0x8769)[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S")
+                tags.get_ifd(0x8769)[0x9291] = f"{time.microsecond:06d}"
+            pixels = np.random.default_rng(seed + k).integers(0, 256, (24, 32), dtype=np.uint8)
+            Image.fromarray(pixels).save(path, exif=tags)
+            found.setdefault(side, []).append(path)
+    return found
+
+
+def true_moments(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]]:
+    at = {side: iter(paths) for side, paths in sides.items()}
+    return [
+        {side: next(at[side]) for side in sides if k not in DROPPED[side]} for k in range(COUNT)
+    ]
+
+
+NAMES: dict[str, tuple[Name, bool]] = {
+    "exif": (lambda k, own, time: f"IMG_{own:04d}", True),
+    "seconds since 1970": (lambda k, own, time: f"{time.timestamp():.3f}", False),
+    "of a bag": (
+        lambda k, own, time: f"{int(time.timestamp())}_{1000 * time.microsecond:09d}", False
+    ),
+    "nanoseconds": (lambda k, own, time: f"cam{round(time.timestamp() * 1e3) * 10**6}", False),
+    "date": (lambda k, own, time: time.strftime("%Y%m%d_%H%M%S.%f"), False),
+    "ISO": (lambda k, own, time: time.strftime("%Y-%m-%dT%H-%M-%S.%f"), False),
+    "numbers": (lambda k, own, time: f"{k + 1}", False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", NAMES)
+def test_dropped_frames_shift_nothing(tmp_path: Path, how: str) -> None:
+    name, exif = NAMES[how]
+    sides = write(tmp_path, name, exif=exif)
+    with heard() as said:
+        found = pair_by_time(sides, None, UTC)
+    assert list(found.stations) == true_moments(sides)
+    assert how == "numbers" or any("without one of another camera" in text for text in said)
+
+
+def test_a_trigger_log_pairs_and_times(tmp_path: Path) -> None:
+    sides = write(tmp_path, lambda k, own, time: f"shot{own:03d}")
+    rows = ["camera,image,time_utc"]
+    for side, paths in sides.items():
+        kept = [k for k in range(COUNT) if k not in DROPPED[side]]
+        rows += [
+            f"{side},{p.name},{moment(k).isoformat()}" for k, p in zip(kept, paths, strict=True)
+        ]
+    log = tmp_path / "triggers.csv"
+    log.write_text("\n".join(rows[:-1]))  # and none of the last picture
+    with heard() as said:
+        import_images(tmp_path / "w", [], cameras={s: tmp_path / s for s in sides}, triggers=log)
+    assert any("are not in" in text and sides["right"][-1].name in text for text in said)
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    expected = true_moments(sides)
+    del expected[-1]["right"]
+    assert {(r.image, r.station) for r in records} == {
+        (f"{side}/{path.name}", k) for k, one in enumerate(expected) for side, path in one.items()
+    }
+
+
+def test_a_trigger_log_by_number_times_one_camera(tmp_path: Path) -> None:
+    sides = write(tmp_path, lambda k, own, time: f"DSC_{k:05d}")
+    log = tmp_path / "triggers.csv"
+    log.write_text("number,time_s\n" + "\n".join(f"{k},{10 + 0.5 * k}" for k in range(COUNT)))
+    found = pair_by_time({"left": sides["left"]}, log, UTC)
+    expected = [10 + 0.5 * k for k in range(COUNT) if k not in DROPPED["left"]]
+    assert [found.time_s[one["left"]] for one in found.stations] == expected
+
+
+def test_cameras_whose_clocks_differ_are_paired_by_number_and_said(tmp_path: Path) -> None:
+    sides = write(
+        tmp_path, lambda k, own, time: f"IMG_{k:04d}", exif=True, late_s={"right": 3600.0}
+    )
+    with heard() as said:
+        found = pair_by_time(sides, None, UTC)
+    assert list(found.stations) == true_moments(sides)
+    assert any("not of one clock" in text and "--triggers" in text for text in said)
+
+
+def test_a_camera_with_fewer_pictures_that_counts_its_own_is_doubtful(tmp_path: Path) -> None:
+    sides = write(tmp_path, lambda k, own, time: f"{own:04d}", dropped={"left": (), "right": (5,)})
+    with heard() as said:
+        pair_by_time(sides, None, UTC)
+    assert any("only the last pictures have no partner (0011.jpg)" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "needs the columns"),
+        ("name,time\na,1\n", "needs the columns"),
+        ("image,time_s\n0001.jpg,soon\n", "line 2"),
+        ("image,time_s\n0001.jpg,1\n0001.tif,2\n", "two times"),
+        ("image,time_s\nother.png,1\n", "holds none of the pictures"),
+        ("number,time_s\n1,4\n2,4\n3,5\n", "have the same time"),
+    ],
+)
+def test_wrong_trigger_logs_end_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+    sides = write(tmp_path, lambda k, own, time: f"{k:04d}")
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(ImageError, match=words) as caught:
+        pair_by_time(sides, tmp_path / "t.csv", UTC)
+    assert "\n" not in str(caught.value)
