@@ -30,6 +30,9 @@ from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, me
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.cameras import changed
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
+from tests.missions.logs.test_import_pd0 import log_of
+from tests.missions.logs.test_import_ulog import dive as px4_dive
+from tests.missions.logs.test_import_ulog import ulog
 from tests.oracles_targets import BLACK, WALL, WHITE, to_srgb
 
 SAID = datetime(2024, 5, 1, 9, 0, 0, tzinfo=UTC)
@@ -288,6 +291,8 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
         ]
     bag.write(folder / "sparus2.bag")
     dvl.write(folder / "dvl.bag")
+    (folder / "flight.ulg").write_bytes(ulog(px4_dive()))
+    log_of(0x10, folder / "dvl.pd0", 100)
     (folder / "00000042.BIN").write_bytes(dataflash_log(messages))
     (folder / "dive.tlog").write_bytes(tlog(records))
     with (folder / "tides.csv").open("w", newline="") as file:
