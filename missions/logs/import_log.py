@@ -112,10 +112,7 @@ def import_log(
     dive = read_dive(path, options)
     if options.flip_velocity:
         dive = _flipped(path, dive)
-    if options.dead_reckon is not None:
-        dive = with_dead_reckoning(
-            dive, options.dead_reckon, options.start_at, options.declination_deg
-        )
+    dive = dead_reckoned(path, dive, options)
     dated = dive.dated or options.start_utc is not None
     if options.start_utc is not None:
         dive = _dated(dive, options.start_utc)
@@ -140,6 +137,22 @@ def import_log(
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     tidal = isinstance(tide, Signal) or tide != 0.0
     return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
+
+
+def dead_reckoned(path: Path, dive: LoggedDive, options: ImportOptions) -> LoggedDive:
+    """A log's dive with positions by dead reckoning, where the options ask for them.
+
+    Raises:
+        NavigationError: the log holds too little; the message names it.
+    """
+    if options.dead_reckon is None:
+        return dive
+    try:
+        return with_dead_reckoning(
+            dive, options.dead_reckon, options.start_at, options.declination_deg
+        )
+    except NavigationError as error:
+        raise NavigationError(f"{path}: {error}") from None
 
 
 def _flipped(path: Path, dive: LoggedDive) -> LoggedDive:

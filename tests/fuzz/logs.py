@@ -55,10 +55,11 @@ def _dvl(folder: Path) -> None:
 
 def read_dead_reckoned(path: Path) -> object:
     """As `import-log --dead-reckon`."""
-    from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-    from missions.logs.import_log import ImportOptions, read_dive
+    from missions.logs.dead_reckoning import TrackErrors
+    from missions.logs.import_log import ImportOptions, dead_reckoned, read_dive
 
-    return with_dead_reckoning(read_dive(path, ImportOptions()), TrackErrors(), (43.0, 5.0, 2.0))
+    options = ImportOptions(dead_reckon=TrackErrors(), start_at=(43.0, 5.0, 2.0))
+    return dead_reckoned(path, read_dive(path, options), options)
 
 
 def _dive() -> list[tuple[object, ...]]:
