@@ -13,6 +13,9 @@ from alice_survey.kit.words import digits, length, share
 from alice_survey.report.colours import read_shrunk
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, number
+from camera_calib.judge.mount_figure import paint_mount
+from camera_calib.mount import mount_line
+from camera_calib.rig import Rig
 
 
 def camera_sigmas(figures: Figures) -> Figure | None:
@@ -228,6 +231,26 @@ def stage_times(figures: Figures) -> Figure | None:
         title="Time and memory",
         alt="Time and memory of every stage",
         shows="What each step took on this machine.",
+    )
+
+
+def mount(rig: Rig) -> Figure:
+    """A rig with a known mount on its vehicle."""
+
+    def paint(axes: Sequence[Any]) -> None:
+        paint_mount(axes[0], axes[1], rig)
+        axes[1].legend()
+
+    return drawn(
+        paint,
+        3.4,
+        columns=2,
+        title="How the cameras are mounted",
+        alt="Cameras, their fields of view and the tops of their pictures on the vehicle",
+        shows=f"Places and fields of view of the cameras: {mount_line(rig)}.",
+        good="It looks as the vehicle does: bow, tops of the pictures, places of the cameras.",
+        otherwise="Positions are off by the error of the lever, headings by that of the mount: "
+        "state it with 'alice-survey camera mount'.",
     )
 
 

@@ -385,6 +385,8 @@ def _camera(figures: Figures) -> Section:
         elif calibrated is None and refined is None:
             text.append(f"The rig is as imported with the pictures: {rig.source}.")
         tables += _cameras(cameras, rig)
+        if rig is not None and rig.body_from_rig is not None:
+            drawn.append(plots.mount(rig))
     return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
 
 

@@ -42,20 +42,29 @@ def plot_mount(rig: Rig, path: Path) -> None:
     Raises:
         CalibrationError: its mount is unknown.
     """
+    figure = new_figure(_HEIGHT_IN, _WIDTH_IN)
+    above, side = figure.subplots(1, 2)
+    paint_mount(above, side, rig)
+    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    save_figure(figure, path)
+
+
+def paint_mount(above: Axes, side: Axes, rig: Rig) -> None:
+    """Draw a rig's cameras on two axes: from above, and from starboard.
+
+    Raises:
+        CalibrationError: its mount is unknown.
+    """
     if rig.body_from_rig is None:
         raise CalibrationError("nothing is drawn: the rig's mount is unknown")
     fields = {name: _field_of_view(rig, name) for name in rig.cameras}
     places = np.stack([field[0] for field in fields.values()])
     reach = _RAY_SHARE * max(float(np.abs(places).max()), _LEAST_M)
-    figure = new_figure(_HEIGHT_IN, _WIDTH_IN)
-    above, side = figure.subplots(1, 2)
     _paint(above, fields, reach, _FROM_ABOVE)
     _paint(side, fields, reach, _FROM_STARBOARD)
     above.set(title="from above", xlabel="right (m)", ylabel="forward (m)")
     side.set(title="from starboard", xlabel="forward (m)", ylabel="down (m)")
     side.invert_yaxis()
-    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    save_figure(figure, path)
 
 
 def _paint(axes: Axes, fields: Mapping[str, _Field], reach: float, shown: list[int]) -> None:

@@ -226,6 +226,7 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/colour-camera.md": _colour_camera,
     "how-to/divers.md": _divers,
     "how-to/no-navigation.md": _no_navigation,
+    "how-to/other-programs.md": _reef,
     "how-to/own-camera.md": _own_camera,
     "how-to/own-pictures.md": _own_pictures,
     "how-to/own-vehicle.md": _own_vehicle,
