@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
+from camera_calib.approximation.pinhole_warp import best_warp
+from camera_calib.mount import with_mount
+from camera_calib.rig import design_rig, write_rig
 from tests.alice_survey.report.tiny import tiny_workspace
 
 
@@ -123,6 +127,25 @@ def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) ->
     assert (
         json.loads((workspace / "report" / "report.json").read_text())["surface"]["covered"] is None
     )
+
+
+@pytest.mark.parametrize("mount", ["nadir-bow-up", "forward+30", None])
+def test_a_known_mount_is_drawn_and_an_unknown_one_is_not(
+    tmp_path: Path, mount: str | None
+) -> None:
+    workspace = tiny_workspace(tmp_path)
+    config = SurveyConfig()
+    rig = replace(design_rig(config.camera, config.water), body_from_rig=None)
+    if mount is not None:
+        rig = with_mount(rig, mount, (0.5, 0.0, 0.1))
+    warp = best_warp(rig.cameras["left"], 1.8, 2.4).to_json()
+    write_json(workspace / "sparse" / "cameras.json", {"cameras": {"left": warp}, "images": {}})
+    write_rig(workspace / "sparse" / "rig.json", rig)
+    assert spec("report").make(workspace, config, SERIAL)
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert ("How the cameras are mounted" in page) == (mount is not None)
+    if mount is not None:
+        assert f"0.0 deg from {mount}" in page
 
 
 def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
