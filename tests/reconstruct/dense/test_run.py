@@ -140,7 +140,15 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
     bands = ("dem", "sigma", "slope", "count", "stations", "surfaces", "lower")
     rasters = {f"{name}.tif" for name in bands}
     clouds = {"cloud.ply", "cloud.laz", "cloud.json"}
-    others = {"dem.png", "light.json", "surface.json", "plane.json", "stage.json"}
+    others = {
+        "dem.png",
+        "dem.qml",
+        "sigma.qml",
+        "light.json",
+        "surface.json",
+        "plane.json",
+        "stage.json",
+    }
     assert names == rasters | clouds | others
 
 
