@@ -36,6 +36,7 @@ _GOALS = {
     "error over sigma": Goal(least=0.8, most=1.5),
     "beyond 5 sigma": Goal(most=0.003),
     "both surfaces": Goal(least=0.97),
+    "mosaic": Goal(most=1.5),
 }
 
 
@@ -73,6 +74,7 @@ def _reconstruct(shoot: Shoot, workspace: Path, work: Path) -> Findings:
     shutil.rmtree(workspace, ignore_errors=True)
     print(import_survey(shoot.folder, workspace))
     line = [sys.executable, "-m", "alice_survey", "reconstruct", "-w", str(workspace)]
+    line += ["--plane", "level", "--plane", "wall=facing 180"]
     cost = measured(line, work / "reconstruct.log")
     took = (
         Figure(name="reconstruct, computing", value=cost.cpu_s, unit="s"),
@@ -111,6 +113,9 @@ def figures(found: dict[str, Any], *, quick: bool) -> tuple[Figure, ...]:
             twice = found[name]["complete"]["two or more instants"]
             add(f"{name}: complete", twice["complete"], "complete")
             add(f"{name}: both surfaces", found[name]["overhangs"].get("both"), "both surfaces")
+    for name in ("mosaic", "mosaic of the wall"):
+        if name in found:
+            add(f"{name}: shift, rms in pixels", found[name]["all"].get("rms_px"), "mosaic")
     return tuple(made)
 
 
@@ -147,6 +152,16 @@ def table(found: dict[str, Any]) -> str:
             for name, share in complete.items()
             if name not in groups
         ]
+    for name in ("mosaic", "mosaic of the wall"):
+        if name not in found:
+            lines.append(f"\n{name}: not made")
+            continue
+        lines.append(f"\n{name}: pixels of {found[name]['pixel_mm']:.2f} mm")
+        for part, one in {"all": found[name]["all"], **found[name]["by"]}.items():
+            rms = one.get("rms_px", float("nan"))
+            lines.append(
+                f"{part:22}{rms:7.2f} px rms in {one['clear']} of {one['patches']} patches"
+            )
     return "\n".join(lines)
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
+from benchmarks.harbour_mosaic import score_plane
 from benchmarks.harbour_scene import PARTS
 from benchmarks.harbour_sight import box_of_interest, instants_that_see, surface_samples, trace
 from benchmarks.harbour_survey import DISTANCE_M, Station, body_poses, harbour_rig, time_of
@@ -311,7 +312,10 @@ def judge(workspace: Path, truth: Truth) -> dict[str, Any]:
         found["dem"] = _score_dem(dense, moved, truth)
     if (workspace / "mesh" / "mesh.ply").exists():
         found["mesh"] = _score_mesh(workspace / "mesh", moved, truth)
-    wanted = ("cloud", "dem", "mesh")
+    for name, below in (("mosaic", Path()), ("mosaic of the wall", Path("planes/wall"))):
+        if (workspace / "mosaic" / below / "mosaic.tif").exists():
+            found[name] = score_plane(dense / below, workspace / "mosaic" / below, moved)
+    wanted = ("cloud", "dem", "mesh", "mosaic", "mosaic of the wall")
     found["left_out"] = [name for name in wanted if name not in found]
     return found
 

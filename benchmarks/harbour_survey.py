@@ -41,7 +41,7 @@ _BODY_FROM_RIG = RigidTransform.from_components(
     [0.3, -0.05, 0.1], mount_rotation(f"forward+{_TILT_DEG:g}")
 )
 _REACH_M = 6.0
-_SEED = 19
+SEED = 19
 _START = datetime(2024, 7, 1, 12, tzinfo=UTC)
 _WANDER_M, _SWAY_DEG = 0.03, 1.5
 _MIDDLE_E = 8000.0
@@ -122,13 +122,13 @@ def quick_stations() -> list[Station]:
 @lru_cache(maxsize=4)
 def harbour_rig(scale: int) -> Rig:
     """The rig as built, on its mount; a picture's pixel is `scale` of the sensor's each way."""
-    built = true_rig(CameraConfig(), WaterConfig(), scale=scale, seed=_SEED)
+    built = true_rig(CameraConfig(), WaterConfig(), scale=scale, seed=SEED)
     return replace(built, body_from_rig=_BODY_FROM_RIG)
 
 
 def body_poses(planned: Sequence[Station]) -> RigidTransform:
     """`ned_from_body` of the stations: as meant, but for the vehicle's wander and sway."""
-    rng = np.random.default_rng([_SEED, 1])
+    rng = np.random.default_rng([SEED, 1])
     rig_from_body = _BODY_FROM_RIG.inv()
     poses = []
     for one in planned:
@@ -178,12 +178,12 @@ def picture_at(shoot: Shoot, station: int, name: str) -> NDArray[np.uint8]:
     pose = body_poses(shoot.planned)[station] * rig.body_from_cam(name)
     still = still_harbour()
     terrain = replace(still, objects=still.objects + moving_at(time_of(station)))
-    scene = Scene(terrain=terrain, texture=survey_texture(_SEED))
+    scene = Scene(terrain=terrain, texture=survey_texture(SEED))
     seen = RigidTransform.from_matrix(pose.as_matrix()[None])
     radiance = render(scene, rig.cameras[name], _light(shoot.scale, name), seen, samples=2)
     per_e = _electrons(shoot.scale)
     sensor = Sensor(electrons_per_radiance=(per_e, per_e, per_e), full_well_e=1e5, read_noise_e=5.0)
-    rng = np.random.default_rng([_SEED, station, list(rig.cameras).index(name)])
+    rng = np.random.default_rng([SEED, station, list(rig.cameras).index(name)])
     return develop(expose(radiance, sensor, rng), MIDDLE_GREY / _MIDDLE_E)
 
 
@@ -211,7 +211,7 @@ def render_survey(shoot: Shoot, executor: Executor) -> None:
 
 def _write_navigation(shoot: Shoot) -> None:
     """Positions with a bias that is most of their sigma, attitudes with noise of theirs."""
-    rng = np.random.default_rng([_SEED, 2])
+    rng = np.random.default_rng([SEED, 2])
     sigma = np.array([SIGMA_HORIZONTAL_M, SIGMA_HORIZONTAL_M, SIGMA_DEPTH_M])
     bias = 0.9 * sigma * rng.standard_normal(3)
     turns = np.array([SIGMA_ATTITUDE_DEG, SIGMA_ATTITUDE_DEG, SIGMA_HEADING_DEG])
