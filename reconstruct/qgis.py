@@ -52,8 +52,5 @@ def write_style(raster: Path, ramp: str, unit: str) -> None:
             label=f"{value:.3g} {unit}",
         )  # fmt: skip
     ET.indent(root)
-    text = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + ET.tostring(
-        root, encoding="unicode"
-    )
     with atomic_path(raster.with_suffix(".qml")) as path:
-        path.write_text(text + "\n")
+        path.write_text(ET.tostring(root, encoding="unicode") + "\n")

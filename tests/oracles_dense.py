@@ -52,7 +52,7 @@ def merged(depths: Array, sigmas: Array, gate: float) -> tuple[float, float, int
 
 
 def fused(
-    heights: Array, sigmas: Array, views: Array, stations: Array, gate: float
+    heights: Array, sigmas: Array, views: Array, stations: Array, gate: float, shared: float
 ) -> tuple[float, float, int, int]:
     """`robust_height` of some points."""
     weights = 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2
@@ -67,7 +67,7 @@ def fused(
     variance = np.average((h - mean) ** 2, weights=w)
     formal = sum(w[v == view].mean() for view in np.unique(v))
     used = np.unique(v)
-    sigma = math.sqrt(2 / formal + variance / len(used))
+    sigma = math.sqrt((shared if len(used) > 1 else 1) / formal + variance / len(used))
     return float(mean), sigma, len(used), len(set(stations[used]))
 
 

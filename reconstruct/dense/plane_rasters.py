@@ -63,6 +63,8 @@ class Confirmed:
     """Views as matched, in the world."""
     sigma_factor: float
     """On the standard deviations of refined depths."""
+    shared: float
+    """Views whose depths rest on the same pair of pictures, in the mean, 1 to 2."""
     light: LightModel
     poses: ErrorsOfPoses | None
     executor: Executor
@@ -113,6 +115,7 @@ def fuse_planes(
         planes=tuple(planes),
         offset_enu=_offset(grid, summaries),
         sigma_factor=confirmed.sigma_factor,
+        shared=confirmed.shared,
     )
     tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
     tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))

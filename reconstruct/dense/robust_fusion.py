@@ -11,9 +11,6 @@ from reconstruct.dense.surfaces import sorted_ranks
 
 Float32 = NDArray[np.float32]
 
-_SHARED = 2.0
-"""Depths of views that are matched with each other count each pair of pictures twice."""
-
 
 @compiled
 def robust_height(
@@ -22,13 +19,14 @@ def robust_height(
     views: NDArray[np.int32],
     stations: NDArray[np.int64],
     gate: float,
+    shared: float,
 ) -> tuple[float, float, int, int]:
     """Robust height of some points: the weighted mean of what lies near the median.
 
     The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
     median's own sigma. The standard deviation adds the formal one to the scatter over the square
-    root of the number of views: pixels of one view share their errors. In the formal one the
-    certainty of a view counts half, since each pair of pictures is in the depths of both.
+    root of the number of views: pixels of one view share their errors, and so do views of which
+    one was refined by the other.
 
     Args:
         heights: (N,) sorted by view, one or more.
@@ -36,6 +34,7 @@ def robust_height(
         views: (N,) of the heights.
         stations: (V,) of every view, by its number.
         gate: in standard deviations.
+        shared: views whose depths rest on the same pair of pictures, in the mean, 1 to 2.
 
     Returns:
         Height and sigma, and number of views and of stations used (255 stands for more).
@@ -84,6 +83,8 @@ def robust_height(
         in_view += 1
         view_weight += w
     formal += view_weight / in_view
+    if seen > 1:
+        formal /= shared
     mean = total / weights
     variance = max(squares / weights - mean * mean, 0.0)
-    return median + mean, math.sqrt(_SHARED / formal + variance / seen), seen, min(companions, 255)
+    return median + mean, math.sqrt(1.0 / formal + variance / seen), seen, min(companions, 255)

@@ -21,7 +21,12 @@ from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_conditions
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
-from reconstruct.dense.stereo_pairs import choose_partners, neighbours, points_in_sight
+from reconstruct.dense.stereo_pairs import (
+    choose_partners,
+    depths_per_pair,
+    neighbours,
+    points_in_sight,
+)
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
     LOOKS,
@@ -89,6 +94,7 @@ def run_dense(
         store=store,
         model=replace(model, views=tuple(views)),
         sigma_factor=sigma_factor,
+        shared=depths_per_pair(looks),
         light=light,
         poses=find_errors_of_poses(workspace, model),
         executor=executor,

@@ -6,6 +6,8 @@ match that is good to s pixels is good to s (Z / f) (Z / B): the rig partner (B 
 covers everything but is coarse, neighbours along and across the track carry the precision.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -137,6 +139,19 @@ def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
             f"{_LEAST_OVERLAP:.0%} overlap to find depth with; add pictures that overlap"
         )
     return chosen
+
+
+def depths_per_pair(looked_at: Sequence[Sequence[int]]) -> float:
+    """Into how many depths a pair of pictures enters, in the mean.
+
+    Args:
+        looked_at: for every view the others that its depth was found with.
+
+    Returns:
+        From 1, where no two views look at each other, to 2, where all do.
+    """
+    looks = [(view, other) for view, others in enumerate(looked_at) for other in others]
+    return len(looks) / len({frozenset(pair) for pair in looks}) if looks else 1.0
 
 
 def _quality(ratio: float) -> float:

@@ -57,7 +57,7 @@ _SAME_SIDE = -0.2
 
 
 def fuse_surface(
-    points: Points, stations: NDArray[np.int64], cell: float, origin: Array
+    points: Points, stations: NDArray[np.int64], cell: float, origin: Array, shared: float
 ) -> NDArray[Any]:
     """Fuse points into one for each cell of a surface.
 
@@ -66,6 +66,7 @@ def fuse_surface(
         stations: (V,) of every view, by its number.
         cell: side of a cell.
         origin: (3,) from which cells start at whole multiples of their side.
+        shared: views whose depths rest on the same pair of pictures, in the mean, 1 to 2.
 
     Returns:
         (M,) records of `SURFACE_POINT`.
@@ -73,7 +74,7 @@ def fuse_surface(
     known = points.part(np.isfinite(points.normals[:, 0]))
     return np.concatenate(
         [
-            _fuse_along(known, stations, cell, origin, axis, sign)
+            _fuse_along(known, stations, cell, origin, shared, axis, sign)
             for axis in (2, 0, 1)
             for sign in (1.0, -1.0)
         ]
@@ -85,6 +86,7 @@ def _fuse_along(
     stations: NDArray[np.int64],
     cell: float,
     origin: Array,
+    shared: float,
     axis: int,
     sign: float,
 ) -> NDArray[Any]:
@@ -99,7 +101,7 @@ def _fuse_along(
     found = fuse_cells(
         np.append(starts, len(at)), origin[across] + (at[starts] + 0.5) * cell, ranked.enu,
         ranked.normals, ranked.colours, ranked.sigmas, ranked.views, stations, cell,
-        (across[0], across[1], axis), sign, _GATE,
+        (across[0], across[1], axis), sign, _GATE, shared,
     )  # fmt: skip
     records = np.zeros(len(found[0]), SURFACE_POINT)
     names = ("enu", "normal", "colour", "sigma", "views", "stations")
@@ -122,6 +124,7 @@ def fuse_cells(
     axes: tuple[int, int, int],
     sign: float,
     gate: float,
+    shared: float,
 ) -> tuple[Float32, Float32, NDArray[np.uint8], Float32, NDArray[np.uint16], NDArray[np.uint8]]:
     """Fuse the points of cells that lie across one direction.
 
@@ -140,6 +143,7 @@ def fuse_cells(
         axes: the two axes of the cells, and that of the direction.
         sign: 1 or -1, of the direction along its axis.
         gate: in standard deviations.
+        shared: views whose depths rest on the same pair of pictures, in the mean, 1 to 2.
 
     Returns:
         Columns of `SURFACE_POINT` without what points share.
@@ -189,7 +193,7 @@ def fuse_cells(
                 heights[i] = sign * enu[first + i, along] + lift / up
             members = layer == one
             height, deviation, in_views, at_stations = robust_height(
-                heights[members], spreads[members], numbers[members], stations, gate
+                heights[members], spreads[members], numbers[members], stations, gate, shared
             )
             middle[along] = sign * height
             for k in range(3):

@@ -52,6 +52,8 @@ class FuseSetup:
     """Origin near the points."""
     sigma_factor: float
     """On the standard deviations of refined depths."""
+    shared: float
+    """Views whose depths rest on the same pair of pictures, in the mean, 1 to 2."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,9 +121,8 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
     low, high = _corners(grid)
     rim = _RIM_CELLS * grid.cell
     points = _points_over(setup, task, offset, (low - rim, high + rim))
-    surface = fuse_surface(
-        points, setup.stations, grid.cell, np.array([grid.west, grid.north, 0.0])
-    )
+    origin = np.array([grid.west, grid.north, 0.0])
+    surface = fuse_surface(points, setup.stations, grid.cell, origin, setup.shared)
     surface = settled(surface, grid.cell, low - rim, high + rim)
     place = surface["enu"][:, :2].astype(np.float64)
     surface = surface[((place >= low) & (place < high)).all(axis=1)]

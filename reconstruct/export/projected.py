@@ -36,7 +36,7 @@ _TILE = 4 * BLOCK
 
 
 @dataclass(frozen=True, kw_only=True)
-class Target:
+class Destination:
     """Where products go."""
 
     frame: WorldFrame
@@ -91,7 +91,7 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
             "import navigation with positions, or control points"
         )
     local = pyproj.CRS.from_wkt(local_crs(frame.datum).to_wkt())
-    target = Target(frame=frame, local=local, crs=_projected(crs, frame), name=crs)
+    target = Destination(frame=frame, local=local, crs=_projected(crs, frame), name=crs)
     folder = "".join(c if c.isalnum() else "-" for c in crs)[:60].strip("-")
     stage = Stage(
         name=folder,
@@ -128,7 +128,7 @@ def _projected(crs: str, frame: WorldFrame) -> pyproj.CRS:
     return found
 
 
-def _export(workspace: Path, target: Target, folder: Path) -> None:
+def _export(workspace: Path, target: Destination, folder: Path) -> None:
     dense, mosaic = workspace / "dense", workspace / "mosaic"
     for name in _RASTERS:
         _resample(dense / f"{name}.tif", folder / f"{name}.tif", target)
@@ -153,7 +153,7 @@ def _export(workspace: Path, target: Target, folder: Path) -> None:
 
 @progress.step("resample rasters")
 @small_cache()
-def _resample(source: Path, path: Path, target: Target) -> None:
+def _resample(source: Path, path: Path, target: Destination) -> None:
     """Resample a raster, block by block: measured values bilinear, numbers by the nearest cell."""
     with opened_raster(source) as raster:
         transform, width, height = calculate_default_transform(
@@ -190,7 +190,7 @@ def _resample(source: Path, path: Path, target: Target) -> None:
 
 
 @progress.step("transform the cloud")
-def _cloud(source: Path, path: Path, target: Target) -> None:
+def _cloud(source: Path, path: Path, target: Destination) -> None:
     import laspy
 
     with laspy.open(source) as file:
@@ -218,7 +218,7 @@ def _cloud(source: Path, path: Path, target: Target) -> None:
 
 
 @progress.step("transform the mesh")
-def _mesh(source: Path, folder: Path, target: Target) -> list[float]:
+def _mesh(source: Path, folder: Path, target: Destination) -> list[float]:
     """Write the textured mesh; return the easting, northing and height of its coordinates' zero."""
     old = np.array(MeshRecord.read(source / "mesh.json").offset_east_north_up)
     offset = np.round([*target.places(old[None, :2])[0], old[2]])
@@ -247,7 +247,7 @@ def _mesh(source: Path, folder: Path, target: Target) -> list[float]:
     return [float(v) for v in offset]
 
 
-def _track(source: Path, path: Path, target: Target) -> None:
+def _track(source: Path, path: Path, target: Destination) -> None:
     with source.open(newline="") as file:
         rows = list(csv.DictReader(file))
     local = np.array([[float(row["east_m"]), float(row["north_m"])] for row in rows])

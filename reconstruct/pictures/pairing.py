@@ -86,7 +86,7 @@ def _timed(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
         times = {side: np.array(own, dtype=np.float64) for side, own in known.items()}
         orders = {side: np.argsort(own, kind="stable") for side, own in times.items()}
         times = {side: own[orders[side]] for side, own in times.items()}
-        if not _tells_apart(times):
+        if not _distinct(times):
             continue
         try:
             moments = moments_of(times)
@@ -106,7 +106,7 @@ def _timed(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
     return None
 
 
-def _tells_apart(times: Mapping[str, Array]) -> bool:
+def _distinct(times: Mapping[str, Array]) -> bool:
     """Whether times are fine enough to tell one picture of a camera from the next."""
     steps = [np.diff(own) for own in times.values() if len(own) > 1]
     if not steps or any((own <= 0).any() for own in steps):

@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError
-from reconstruct.dense.stereo_pairs import choose_partners, in_frame, neighbours, points_in_sight
+from reconstruct.dense.stereo_pairs import (
+    choose_partners,
+    depths_per_pair,
+    in_frame,
+    neighbours,
+    points_in_sight,
+)
 from reconstruct.views.model import points_of_views
 from tests.oracles_dense import ALTITUDE_M, Scene, flat, position_code, sparse_model, stereo_views
 
@@ -71,6 +77,19 @@ def test_points_in_sight_are_all_that_lie_in_the_frame_and_near():
         expected = model.points_world[in_frame(view, model.points_world) & (away <= reach)]
         np.testing.assert_array_equal(points, expected)
         assert len(points) >= len(seen)
+
+
+@pytest.mark.parametrize(
+    ("looks", "expected"),
+    [
+        ([[1], [2], [0]], 1.0),
+        ([[1, 2], [0, 2], [0, 1]], 2.0),
+        ([[1, 2], [0], [], [0]], 4 / 3),
+        ([[], []], 1.0),
+    ],
+)
+def test_depths_of_a_pair_are_those_of_views_that_look_at_each_other(looks, expected):
+    assert depths_per_pair(looks) == pytest.approx(expected)
 
 
 def test_neighbours_share_most_points():

@@ -48,7 +48,9 @@ def test_a_plane_is_found_whichever_way_it_faces(up: float, azimuth: float):
     rng = np.random.default_rng(1)
     level = math.sqrt(1.0 - up * up)
     normal = np.array([level * math.sin(azimuth), level * math.cos(azimuth), up])
-    found = fuse_surface(patch(normal, rng), STATIONS, CELL_M, np.array([0.003, -0.002, 0.001]))
+    found = fuse_surface(
+        patch(normal, rng), STATIONS, CELL_M, np.array([0.003, -0.002, 0.001]), 1.4
+    )
     off = found["enu"] @ normal
     np.testing.assert_allclose(found["normal"] @ normal, 1.0, atol=1e-4)
     assert np.abs(off).max() < 5 * SIGMA_M
@@ -66,7 +68,7 @@ def test_a_ball_is_covered_from_all_sides_without_gaps():
     normals = rng.normal(size=(400_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radius = 0.25
-    found = fuse_surface(seen(radius * normals, normals, rng), STATIONS, CELL_M, np.zeros(3))
+    found = fuse_surface(seen(radius * normals, normals, rng), STATIONS, CELL_M, np.zeros(3), 1.4)
     found = settled(found, CELL_M, *NO_BOUND)
     off = np.linalg.norm(found["enu"], axis=1) - radius
     assert np.sqrt(np.mean(off**2)) < 0.6 * SIGMA_M  # many points a cell
@@ -78,7 +80,8 @@ def test_a_ball_is_covered_from_all_sides_without_gaps():
     assert outwards.min() > 0.99
 
 
-def test_cells_fused_from_points_of_one_direction_equal_their_slow_twin():
+@pytest.mark.parametrize("shared", [1.0, 1.4, 2.0])
+def test_cells_fused_from_points_of_one_direction_equal_their_slow_twin(shared: float):
     rng = np.random.default_rng(3)
     count = 600
     views = np.sort(rng.integers(0, 6, count)).astype(np.int32)
@@ -91,13 +94,13 @@ def test_cells_fused_from_points_of_one_direction_equal_their_slow_twin():
         sigmas=sigmas,
         views=views,
     )
-    found = fuse_surface(points, STATIONS, CELL_M, np.zeros(3))
+    found = fuse_surface(points, STATIONS, CELL_M, np.zeros(3), shared)
     assert len(found) == 36
     for one in found:
         middle = one["enu"][:2]
         inside = (np.abs(places[:, :2] - middle) < CELL_M / 2).all(axis=1)
         height, sigma, n, places_met = fused(
-            points.enu[inside, 2], sigmas[inside], views[inside], STATIONS, 3.0
+            points.enu[inside, 2], sigmas[inside], views[inside], STATIONS, 3.0, shared
         )
         np.testing.assert_allclose(one["enu"][2], height, atol=1e-6)
         np.testing.assert_allclose(one["sigma"], sigma, rtol=1e-3)
@@ -111,9 +114,9 @@ def test_a_slope_within_a_cell_is_no_scatter(slope_deg: float):
     rng = np.random.default_rng(4)
     slope = math.radians(slope_deg)
     normal = np.array([math.sin(slope), 0.0, math.cos(slope)])
-    found = fuse_surface(patch(normal, rng, 40_000), STATIONS, CELL_M, np.zeros(3))
+    found = fuse_surface(patch(normal, rng, 40_000), STATIONS, CELL_M, np.zeros(3), 1.4)
     level = fuse_surface(patch(np.array([0.0, 0.0, 1.0]), rng, 40_000), STATIONS, CELL_M,
-                         np.zeros(3))  # fmt: skip
+                         np.zeros(3), 1.4)  # fmt: skip
     assert np.median(found["sigma"]) == pytest.approx(np.median(level["sigma"]), rel=0.1)
 
 
@@ -126,7 +129,7 @@ def test_both_sides_of_a_thin_wall_stay_apart():
         Points(**{name: np.concatenate([getattr(front, name), getattr(other, name)])[
             np.argsort(np.concatenate([front.views, other.views]), kind="stable")]
             for name in vars(front)}),
-        STATIONS, CELL_M, np.zeros(3),
+        STATIONS, CELL_M, np.zeros(3), 1.4,
     )  # fmt: skip
     ahead = found["normal"][:, 1] > 0
     np.testing.assert_allclose(found["enu"][ahead, 1], 0.02, atol=5 * SIGMA_M)
@@ -138,7 +141,7 @@ def fused_floor(rng: np.random.Generator, side_m: float = 0.3) -> np.ndarray:
     spots = rng.uniform(-side_m / 2, side_m / 2, (int(2e5 * side_m**2), 2))
     places = np.column_stack([spots, np.zeros(len(spots))])
     up = np.tile([0.0, 0.0, 1.0], (len(spots), 1))
-    return fuse_surface(seen(places, up, rng), STATIONS, CELL_M, np.zeros(3))
+    return fuse_surface(seen(places, up, rng), STATIONS, CELL_M, np.zeros(3), 1.4)
 
 
 def test_small_patches_off_the_surface_go_unless_they_may_go_on_elsewhere():
@@ -174,9 +177,9 @@ def test_tiles_agree_where_they_meet():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = seen(0.2 * normals, normals, rng)
     origin = np.array([0.0, 0.0, 0.0])
-    whole = fuse_surface(points, STATIONS, CELL_M, origin)
+    whole = fuse_surface(points, STATIONS, CELL_M, origin, 1.4)
     west = points.part(points.enu[:, 0] < 5 * CELL_M)
-    part = fuse_surface(west, STATIONS, CELL_M, origin)
+    part = fuse_surface(west, STATIONS, CELL_M, origin, 1.4)
 
     def own(found: np.ndarray) -> np.ndarray:
         return np.sort(found[found["enu"][:, 0] < 4 * CELL_M], order=("enu", "normal"))

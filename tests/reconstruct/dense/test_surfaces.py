@@ -64,7 +64,7 @@ def together(*sheets: Points) -> Points:
 
 def fused(points: Points, cells: int = 30) -> FusedCells:
     grid = DemGrid(west=0.0, north=CELL_M, cell=CELL_M, rows=1, columns=cells)
-    return cells_over(grid, fuse_surface(points, STATIONS, CELL_M, np.zeros(3)))
+    return cells_over(grid, fuse_surface(points, STATIONS, CELL_M, np.zeros(3), 1.4))
 
 
 def test_an_overhang_above_the_floor_is_two_surfaces():
