@@ -392,6 +392,7 @@ def _mosaic_inputs(workspace: Path) -> list[Path]:
     dense = workspace / "dense"
     planes = sorted((dense / "planes").glob("*/dem.tif"))
     about = _there(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
+    about += _there(dense / "moving.csv")
     return [dense / "dem.tif", *planes, *about, *_model_inputs(workspace)]
 
 
@@ -406,7 +407,7 @@ def _mosaic_summary(folder: Path) -> Summary:
 
 def _mesh_inputs(workspace: Path) -> list[Path]:
     dense = [workspace / "dense" / name for name in ("cloud.ply", "cloud.json", "light.json")]
-    return [*dense, *_model_inputs(workspace)]
+    return [*dense, *_there(workspace / "dense" / "moving.csv"), *_model_inputs(workspace)]
 
 
 def _mesh_summary(folder: Path) -> Summary:
@@ -665,7 +666,9 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.dense.run:run_dense",
         takes=("reconstruct",),
         needs=("image", "placing"),
-        settings=only("reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes"),
+        settings=only(
+            "reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes", "mask_moving"
+        ),
         inputs=_dense_inputs,
         summary=_dense_summary,
         resumes=True,
@@ -674,16 +677,17 @@ STAGES: tuple[StageSpec, ...] = (
             "sigma.tif": "sigma of its heights",
             "planes": "the same over further planes",
             "cloud.laz": "point cloud with colour, normal, sigma",
+            "moving": "masks of what moves",
         },
         picture="dem.png",
-        reported=("dem.tif", "sigma.tif", "plane.json", "planes"),
+        reported=("dem.tif", "sigma.tif", "plane.json", "planes", "moving.png"),
     ),
     StageSpec(
         name="mosaic",
         folder="mosaic",
         command="reconstruct",
         about="the orthomosaic, painted on the surface",
-        version=6,
+        version=7,
         work="reconstruct.mosaic.run:run_mosaic",
         takes=("reconstruct", "water", "area.seafloor_depth_m"),
         needs=("image", "placing", "dense"),
@@ -708,7 +712,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="mesh",
         command="reconstruct",
         about="the textured mesh",
-        version=1,
+        version=2,
         work="reconstruct.mesh.run:run_mesh",
         takes=("reconstruct",),
         needs=("image", "placing", "dense"),

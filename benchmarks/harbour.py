@@ -37,6 +37,9 @@ _GOALS = {
     "beyond 5 sigma": Goal(most=0.003),
     "both surfaces": Goal(least=0.97),
     "mosaic": Goal(most=1.5),
+    "masks, recall": Goal(least=0.8),
+    "masks, precision": Goal(least=0.6),
+    "masks, still": Goal(most=0.01),
 }
 
 
@@ -113,6 +116,11 @@ def figures(found: dict[str, Any], *, quick: bool) -> tuple[Figure, ...]:
             twice = found[name]["complete"]["two or more instants"]
             add(f"{name}: complete", twice["complete"], "complete")
             add(f"{name}: both surfaces", found[name]["overhangs"].get("both"), "both surfaces")
+    if "masks" in found:
+        masks = found["masks"]
+        add("masks: fish seen behind by two others", masks["recall_seen_behind"], "masks, recall")
+        add("masks: right", masks["precision"], "masks, precision")
+        add("masks: of what stays and is lit", masks["still_masked"], "masks, still")
     for name in ("mosaic", "mosaic of the wall"):
         if name in found:
             add(f"{name}: shift, rms in pixels", found[name]["all"].get("rms_px"), "mosaic")
@@ -152,6 +160,9 @@ def table(found: dict[str, Any]) -> str:
             for name, share in complete.items()
             if name not in groups
         ]
+    if "masks" in found:
+        shares = {name: value for name, value in found["masks"].items() if name != "fish_pixels"}
+        lines.append("\nmasks: " + ", ".join(f"{n} {v:.2%}" for n, v in shares.items()))
     for name in ("mosaic", "mosaic of the wall"):
         if name not in found:
             lines.append(f"\n{name}: not made")

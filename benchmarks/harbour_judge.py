@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.executor import local_executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
+from benchmarks.harbour_masks import score_masks
 from benchmarks.harbour_mosaic import score_plane
 from benchmarks.harbour_scene import PARTS
 from benchmarks.harbour_sight import box_of_interest, instants_that_see, surface_samples, trace
@@ -25,6 +27,7 @@ from benchmarks.harbour_truth import clearance, distances, moving_distance, norm
 from camera_calib.camera import Camera
 from reconstruct.evaluate.elevation import elevation_in
 from reconstruct.evaluate.mesh import read_mesh
+from reconstruct.pictures.undistorted import MOVING
 from reconstruct.placing.track import read_track_poses
 from reconstruct.ply import read_header, read_ply_points
 
@@ -315,7 +318,9 @@ def judge(workspace: Path, truth: Truth) -> dict[str, Any]:
     for name, below in (("mosaic", Path()), ("mosaic of the wall", Path("planes/wall"))):
         if (workspace / "mosaic" / below / "mosaic.tif").exists():
             found[name] = score_plane(dense / below, workspace / "mosaic" / below, moved)
-    wanted = ("cloud", "dem", "mesh", "mosaic", "mosaic of the wall")
+    if (dense / MOVING).is_dir():
+        found["masks"] = score_masks(dense / MOVING, truth.planned, truth.scale, local_executor())
+    wanted = ("cloud", "dem", "mesh", "masks", "mosaic", "mosaic of the wall")
     found["left_out"] = [name for name in wanted if name not in found]
     return found
 

@@ -46,7 +46,7 @@ _START = datetime(2024, 7, 1, 12, tzinfo=UTC)
 _WANDER_M, _SWAY_DEG = 0.03, 1.5
 _MIDDLE_E = 8000.0
 """Electrons of a middling pixel at the nominal distance: a hundredth of noise."""
-_STROBES = ImagingConfig(strobes_body_m=((0.05, 0.5, 0.05), (0.05, -0.5, 0.05)))
+STROBES = ImagingConfig(strobes_body_m=((0.05, 0.5, 0.05), (0.05, -0.5, 0.05)))
 """To the right and the left of the cameras, in the frame of a body that looks down."""
 SIGMA_HORIZONTAL_M, SIGMA_DEPTH_M, SIGMA_ATTITUDE_DEG, SIGMA_HEADING_DEG = 0.1, 0.02, 0.3, 1.0
 
@@ -161,7 +161,7 @@ def _light(scale: int, name: str) -> CameraLight:
     # Strobes are described on a body that looks down, with the left camera at its origin.
     level = RigidTransform.from_rotation(BODY_FROM_NADIR_CAM)
     pose = level * rig.cam_from_rig[name].inv()
-    return camera_light(rig.cameras[name], pose, _STROBES, water_optics("II"), _REACH_M)
+    return camera_light(rig.cameras[name], pose, STROBES, water_optics("II"), _REACH_M)
 
 
 @lru_cache(maxsize=1)

@@ -332,6 +332,7 @@ class ReconstructConfig(Config):
     dense_partners: int = Field(4, ge=1, le=12)
     dem_cell_m: float | None = Field(None, gt=0, le=10)
     planes: tuple[str, ...] = ("level",)
+    mask_moving: bool = True
     mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
     mesh_triangles: int | None = Field(None, ge=100, le=50_000_000)
     mesh_error_px: float = Field(0.25, ge=0.01, le=10)

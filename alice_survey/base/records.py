@@ -416,6 +416,16 @@ class PlaneRecord(JsonRecord):
     vertical_datum: str
 
 
+class MovingMasks(JsonRecord):
+    """Pictures parts of which are masked since they move."""
+
+    pictures: int
+    """Looked at."""
+    masked: int
+    masked_share: float
+    """Of the area of all."""
+
+
 class SurfaceRecord(JsonRecord):
     """`dense/surface.json`."""
 
@@ -423,6 +433,7 @@ class SurfaceRecord(JsonRecord):
     match_sigma_px: float
     pose_sigma: float | None = None
     vertical_datum: str
+    moving: MovingMasks | None = None
 
 
 class MosaicRecord(JsonRecord):

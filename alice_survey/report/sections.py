@@ -260,10 +260,28 @@ def _surface(figures: Figures) -> Section:
         ("stations that see a spot, median", f"{surface.stations_median:.0f}"),
         ("heights count from", found.vertical_datum),
     ]
-    drawn = [plots.heights(figures), plots.sigma_test(figures), plots.seen_by(figures)]
+    text = []
+    moving = found.moving
+    if moving is not None and moving.masked:
+        text.append(
+            f"Parts of {moving.masked} of {count(moving.pictures, 'picture')} are masked "
+            f"({moving.masked_share:.2%} of the area of all): other stations show something else "
+            "there. They move, or are shadows that move with the lamps. Mosaic and texture do "
+            "without them. mask_moving = false below [reconstruct] keeps them."
+        )
+    drawn = [
+        plots.heights(figures), plots.sigma_test(figures), plots.seen_by(figures),
+        *_stills(held, [
+            ("dense/moving.png", "What moves",
+             "Masked parts of the pictures in which they are largest, outlined.",
+             "Fish, weed, divers, shadows.",
+             "Look at dense/moving; mask_moving = false below [reconstruct] keeps all."),
+        ]),
+    ]  # fmt: skip
     return Section(
         name="surface",
         title="Surface",
+        text=text,
         tables=[Table(title="Elevation model", header=("what", "value"), rows=rows)],
         figures=[figure for figure in drawn if figure is not None],
     )

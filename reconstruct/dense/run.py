@@ -19,6 +19,7 @@ from alice_survey.base.plane_settings import parse_planes
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_conditions
+from reconstruct.dense.moving import clear_moving, mask_moving, show_moving
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
 from reconstruct.dense.stereo_pairs import (
@@ -90,6 +91,12 @@ def run_dense(
         [view.camera for view in views],
     )
     write_light(folder / "light.json", light)
+    moving = []
+    clear_moving(folder)
+    if reconstruct.mask_moving:
+        mask = partial(mask_moving, workspace, folder, light)
+        moving = list(executor.map(mask, checks, label="mask what moves"))
+        show_moving(workspace, folder, moving)
     confirmed = Confirmed(
         store=store,
         model=replace(model, views=tuple(views)),
@@ -118,6 +125,11 @@ def run_dense(
             "vertical_datum": model.frame.vertical_datum,
             "planes": [fused.plane.name for fused in made],
             "pairs": sum(len(chosen) for chosen in partners),
+            "moving": {
+                "pictures": len(moving),
+                "masked": sum(one.masked > 0 for one in moving),
+                "masked_share": float(np.mean([one.masked for one in moving] or [0.0])),
+            },
             "gaps_bridged_cells": FILL_CELLS,
             "notes": list(model.frame.notes),
         },

@@ -121,7 +121,7 @@ def export_view(workspace: Path, folder: Path, task: tuple[View, float]) -> Expo
         task: the view, and its depth where it sees nothing of the mesh.
     """
     view, depth = task
-    pictures, name = Pictures.open(workspace), exported_name(view.image)
+    pictures, name = Pictures.still(workspace), exported_name(view.image)
     target = folder / "images" / name
     mask = folder / "masks" / f"{name}.png"
     width, height = view.pinhole.size_px

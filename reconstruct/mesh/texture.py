@@ -209,7 +209,7 @@ def seam_colours(workspace: Path, light: LightModel, task: tuple[View, Array]) -
         task: the view and the pixels.
     """
     view, pixels = task
-    pictures = Pictures.open(workspace)
+    pictures = Pictures.still(workspace)
     even = even_colour(pictures, view, light)
     weight = pictures.valid(view.image).astype(np.float32)
     even *= weight[..., None]
@@ -375,7 +375,7 @@ def paint_view(
     picture = np.zeros((1, 1, 3), np.float32)
     valid = np.ones((1, 1), np.uint8)
     if task.view is not None:
-        pictures = Pictures.open(workspace)
+        pictures = Pictures.still(workspace)
         picture = even_colour(pictures, task.view, light)
         valid = pictures.valid(task.view.image).astype(np.uint8)
         if atlas.scale < 1.0:

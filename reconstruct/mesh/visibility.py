@@ -88,7 +88,7 @@ def see_faces(
     """
     vertices, triangles, offset, scene, spheres = _geometry(mesh, mesh.stat().st_mtime_ns)
     near = vertices_near(view, vertices, spheres, offset)
-    valid = Pictures.open(workspace).valid(view.image)
+    valid = Pictures.still(workspace).valid(view.image)
     pixels = np.full((len(vertices), 2), np.nan)
     pixels[near] = view.project(to_world(vertices[near], offset))
     faces = np.flatnonzero(usable_pixels(pixels, valid)[triangles].all(axis=1))

@@ -104,7 +104,7 @@ def encoded(light: Float32) -> Float32:
 @small_cache()
 def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasures:
     """Measure a picture of a workspace and write its small copy to a folder."""
-    pictures = Pictures.open(workspace)
+    pictures = Pictures.still(workspace)
     taken, usable = pictures.taken(view.image), pictures.usable(view.image)
     height, width = taken.shape[:2]
     table = linear_table()

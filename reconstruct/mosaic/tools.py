@@ -43,7 +43,7 @@ class Tools:
     """What a process keeps between tasks."""
 
     def __init__(self, survey: MosaicSetup) -> None:
-        self._pictures = Pictures.open(survey.workspace)
+        self._pictures = Pictures.still(survey.workspace)
         self.small = lru_cache(maxsize=_SMALL_COPIES)(partial(read_small, survey.scratch))
         self.table = linear_table()
         self.weights = lanczos_weights()

@@ -1,5 +1,6 @@
 """Pictures as the ideal pinholes of the sparse model see them: for dense stereo and mosaics."""
 
+from copy import copy
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from reconstruct.pictures.normalise import Grey, normalise
 
 Colour = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+MOVING = "moving"
+"""Folder in `dense` with masks of what moves."""
 _ROWS = 256
 """Rows of a warp computed at a time, which bounds its memory."""
 _BEYOND = 0.05
@@ -109,6 +112,11 @@ def _where_invertible(warp: PinholeWarp, pixels: Array) -> Array:
     return np.where((inside & folded)[:, None], np.nan, taken)
 
 
+def moving_path(folder: Path, image: str) -> Path:
+    """The mask (0 = leave out) of what moves in a picture; there where anything does."""
+    return (folder / image).with_suffix(".png")
+
+
 class Pictures:
     """Pictures of a workspace without refraction and distortion, computed on request.
 
@@ -123,6 +131,7 @@ class Pictures:
         self._warps = warps
         self._cameras = cameras
         self._masks: dict[str, str] = {}
+        self._moving: Path | None = None
         self._maps = lru_cache(maxsize=None)(lambda camera: undistortion_maps(warps[camera]))
         self._inside = lru_cache(maxsize=None)(self._camera_inside)
 
@@ -136,6 +145,13 @@ class Pictures:
         path = workspace / "sparse" / "cameras.json"
         written_ns = path.stat().st_mtime_ns if path.is_file() else 0
         return _opened(workspace / "images", path, written_ns)
+
+    @classmethod
+    def still(cls, workspace: Path) -> "Pictures":
+        """As `open`, with what moves masked as well where the dense stage found it."""
+        pictures = copy(cls.open(workspace))
+        pictures._moving = workspace / "dense" / MOVING
+        return pictures
 
     @classmethod
     def from_json(cls, images: Path, cameras_json: Path) -> "Pictures":
@@ -179,9 +195,12 @@ class Pictures:
         Raises:
             ImageError: the mask is missing, cannot be decoded or is of another size.
         """
-        if image not in self._masks:
-            return None
-        return read_mask(self._images / self._masks[image], self.warp(image).size_px)
+        paths = [self._images / self._masks[image]] if image in self._masks else []
+        moving = None if self._moving is None else moving_path(self._moving, image)
+        if moving is not None and moving.is_file():
+            paths.append(moving)
+        masks = [read_mask(path, self.warp(image).size_px) for path in paths]
+        return np.logical_and.reduce(masks) if masks else None
 
     def maps(self, image: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Where each pixel of a picture's pinhole lies in it as taken; see `undistortion_maps`."""

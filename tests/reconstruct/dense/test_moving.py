@@ -1,0 +1,180 @@
+"""Masks of what moves, by pictures into which bodies were drawn that float above the sea floor."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.executor import SERIAL
+from alice_survey.stages import spec
+from reconstruct.dense.moving import agreed, odd_ones, splat
+from reconstruct.pictures.undistorted import Pictures
+from reconstruct.views.model import View
+from tests.oracles_dense import (
+    ALTITUDE_M,
+    DEPTH_M,
+    HEIGHT,
+    WIDTH,
+    Scene,
+    sloped_with_step,
+    sparse_model,
+    speckle,
+    stereo_views,
+    write_workspace,
+)
+
+SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+CONFIG = SurveyConfig(reconstruct=ReconstructConfig(dense_partners=3))
+SEMI_AXES_M = (0.14, 0.06)
+
+
+def survey_views() -> list[View]:
+    """Two lines, half a metre apart, of four stereo stations each."""
+    along, aside = np.meshgrid([-0.05, 0.2, 0.45, 0.7], [0.1, 0.6])
+    return stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
+
+
+def body_mask(view: View, middle: np.ndarray) -> np.ndarray:
+    """Where a level ellipse around a place (3,) is seen, (H, W)."""
+    turn = np.linspace(0, 2 * np.pi, 90)
+    rim = np.column_stack([SEMI_AXES_M[0] * np.cos(turn), SEMI_AXES_M[1] * np.sin(turn), 0 * turn])
+    at = view.project(middle + rim)
+    drawn = np.zeros((HEIGHT, WIDTH), np.uint8)
+    cv2.fillPoly(drawn, [np.rint(at - 0.5).astype(np.int32)], 1)
+    return drawn > 0
+
+
+def place_of(station: int) -> np.ndarray:
+    """Where the body is at a station's time: it crosses the survey, 0.4 m above the floor."""
+    return np.array([0.1 + 0.08 * station, -0.1 + 0.12 * station, DEPTH_M - 0.2 * ALTITUDE_M])
+
+
+def with_light(folder: Path, views: list[View], bodies: bool) -> dict[str, np.ndarray]:
+    """Draw bodies, a lamp's pattern and noise into the pictures; where the bodies are."""
+    rng = np.random.default_rng(4)
+    x, y = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
+    lamp = np.exp(-0.35 * (x - 0.2) ** 2 - 0.25 * y**2)
+    found = {}
+    for view in views:
+        path = folder / "images" / view.image
+        picture = cv2.imread(str(path)).astype(np.float64)
+        mask = body_mask(view, place_of(view.station)) & bodies
+        scales = 60.0 + 40.0 * np.sin(x * 70 + view.station) * np.sin(y * 55)
+        picture[mask] = (scales[..., None] * [0.9, 1.0, 1.2])[mask]
+        gain = 1.0 + 0.1 * np.sin(view.station)
+        picture = picture * lamp[..., None] * gain + rng.normal(0, 2.0, picture.shape)
+        cv2.imwrite(str(path), np.clip(np.rint(picture), 0, 255).astype(np.uint8))
+        found[view.image] = mask
+    return found
+
+
+def made(folder: Path, bodies: bool, config: SurveyConfig = CONFIG) -> dict[str, np.ndarray]:
+    views = survey_views()
+    write_workspace(folder, sparse_model(views, SCENE), SCENE)
+    truth = with_light(folder, views, bodies)
+    assert spec("dense").make(folder, config, SERIAL)
+    return truth
+
+
+def masks(folder: Path) -> dict[str, np.ndarray]:
+    """What is left out of each picture."""
+    still = Pictures.still(folder)
+    usable = {view.image: still.usable(view.image) for view in survey_views()}
+    nothing = np.ones((HEIGHT, WIDTH), bool)
+    return {name: ~(nothing if mask is None else mask) for name, mask in usable.items()}
+
+
+@pytest.fixture(scope="module")
+def crossed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    folder = tmp_path_factory.mktemp("crossed")
+    return folder, made(folder, True)
+
+
+def test_a_body_that_crosses_is_masked(crossed: tuple[Path, dict[str, np.ndarray]]):
+    folder, truth = crossed
+    found = masks(folder)
+    kernel = np.ones((13, 13), np.uint8)
+    body = sum(int(mask.sum()) for mask in truth.values())
+    assert body > 20_000
+    hit = sum(int((found[name] & truth[name]).sum()) for name in truth)
+    assert hit / body > 0.9
+    wrong = sum(
+        int((found[name] & ~(cv2.dilate(truth[name].astype(np.uint8), kernel) > 0)).sum())
+        for name in truth
+    )
+    assert wrong / sum(mask.size for mask in truth.values()) < 0.002
+    either = sum(int((found[name] | truth[name]).sum()) for name in truth)
+    assert 0.6 < hit / either < 1.0  # rims are left out too
+
+
+def test_it_is_said_and_shown(crossed: tuple[Path, dict[str, np.ndarray]]):
+    folder, truth = crossed
+    about = read_json(folder / "dense" / "surface.json")["moving"]
+    assert about["pictures"] == len(truth)
+    assert about["masked"] >= sum(mask.sum() > 2000 for mask in truth.values())
+    assert cv2.imread(str(folder / "dense" / "moving.png")).shape[1] == 3 * 480
+    rows = (folder / "dense" / "moving.csv").read_text().splitlines()
+    assert rows[0] == "image,masked_share,compared_share"
+    assert len(rows) == 1 + len(truth)
+
+
+def test_a_still_survey_keeps_its_pictures_whole(tmp_path: Path):
+    made(tmp_path, False)
+    found = masks(tmp_path)
+    assert np.mean([mask.mean() for mask in found.values()]) < 5e-4
+    assert not (tmp_path / "dense" / "moving.png").exists() or any(m.any() for m in found.values())
+
+
+def test_switched_off_nothing_is_masked(tmp_path: Path):
+    config = replace_setting(mask_moving=False)
+    made(tmp_path, True, config)
+    assert not any(mask.any() for mask in masks(tmp_path).values())
+    assert read_json(tmp_path / "dense" / "surface.json")["moving"]["pictures"] == 0
+
+
+def replace_setting(**changes: object) -> SurveyConfig:
+    return CONFIG.model_copy(
+        update={"reconstruct": CONFIG.reconstruct.model_copy(update=dict(changes))}
+    )
+
+
+def test_the_nearest_depth_that_two_stations_share():
+    nan = np.nan
+    stack = np.array([[1.0, 1.0, 2.0, nan], [1.01, 1.01, 2.02, 3.0], [1.5, 0.5, 2.5, nan]])
+    found = agreed(stack[:, None].astype(np.float32), np.array([0, 0, 1]), 0.02)
+    assert np.isnan(found).all()  # the first two share a station
+    found = agreed(stack[:, None].astype(np.float32), np.array([0, 1, 1]), 0.02)[0]
+    np.testing.assert_allclose(found[:3], [1.005, 1.005, 2.01], rtol=1e-6)
+    assert np.isnan(found[3])
+
+
+def test_the_nearest_of_points_is_drawn_into_the_cells_around_them():
+    depth = np.full((3, 4), np.nan, np.float32)
+    splat(np.array([[1.5, 1.0], [1.9, 1.0], [9.0, 9.0]]), np.float32([2.0, 1.5, 1.0]), depth)
+    expected = np.full((3, 4), np.nan)
+    expected[0:2, 1:3] = 1.5
+    np.testing.assert_array_equal(depth, expected)
+
+
+def test_a_cell_is_odd_where_others_agree_on_something_else():
+    box = np.array([0.0, -0.1, 0.1])
+
+    def light(level: float) -> np.ndarray:
+        return np.tile((level + box)[:, None], (1, 3)).astype(np.float32)
+
+    own = np.stack([light(0.0), light(1.0), light(0.05), light(1.0)])
+    shown = np.stack(
+        [
+            np.stack([light(v) for v in row])
+            for row in ((0.0, 0.0, 0.0, 0.0), (0.02, 0.02, 0.02, 2.0), (0.01, 0.01, 0.01, 4.0))
+        ]
+    )
+    sigma = np.full(3, 0.1, np.float32)
+    misfit, votes = odd_ones(own, shown, np.array([0, 1, 2]), sigma, 2.0)
+    np.testing.assert_allclose(misfit[:3], [0.0, (1.0 - 0.11) / 0.1, 0.0], atol=1e-4)
+    assert votes[:3].tolist() == [3, 3, 3]
+    assert votes[3] == 0  # they do not agree with each other
+    assert odd_ones(own, shown, np.array([0, 0, 0]), sigma, 2.0)[1].max() == 1
