@@ -31,6 +31,8 @@ from reconstruct.views.model import View
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+COMPARED = 16
+"""Neighbouring views that a view is compared with."""
 LATTICE_PX = 256
 """Cells across a view in which views are compared, about."""
 _SAME_DEPTH = 0.02
@@ -45,7 +47,7 @@ _LEAST_SIGMA = 0.02
 """Of logarithms of light: what differs less is never told apart."""
 _SEED, _GROWN = 4.5, 2.2
 """Standard deviations from which cells differ, and to which what differs is grown."""
-_SEED_SHARE, _LEAST_AREA = 0.6, 12
+_SEED_SHARE, _LEAST_AREA = 0.3, 12
 """Of the cells of a part, those that differ by far; and its cells. In other light, differences
 that fade out are many."""
 _GAP_CELLS, _RIM_CELLS = 5, 3

@@ -19,7 +19,7 @@ from alice_survey.base.plane_settings import parse_planes
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_conditions
-from reconstruct.dense.moving import clear_moving, mask_moving, show_moving
+from reconstruct.dense.moving import COMPARED, clear_moving, mask_moving, show_moving
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
 from reconstruct.dense.stereo_pairs import (
@@ -95,7 +95,8 @@ def run_dense(
     clear_moving(folder)
     if reconstruct.mask_moving:
         mask = partial(mask_moving, workspace, folder, light)
-        moving = list(executor.map(mask, checks, label="mask what moves"))
+        others = tasks(neighbours(model, COMPARED))
+        moving = list(executor.map(mask, others, label="mask what moves"))
         show_moving(workspace, folder, moving)
     confirmed = Confirmed(
         store=store,

@@ -100,7 +100,7 @@ def test_a_body_that_crosses_is_masked(crossed: tuple[Path, dict[str, np.ndarray
     body = sum(int(mask.sum()) for mask in truth.values())
     assert body > 20_000
     hit = sum(int((found[name] & truth[name]).sum()) for name in truth)
-    assert hit / body > 0.9
+    assert 0.9 < hit / body
     wrong = sum(
         int((found[name] & ~(cv2.dilate(truth[name].astype(np.uint8), kernel) > 0)).sum())
         for name in truth
