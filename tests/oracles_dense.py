@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import write_json
+from alice_survey.base.artefacts import write_csv, write_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, best_warp
@@ -370,9 +370,24 @@ def write_workspace(
             },
         },
     )
+    _write_track(sparse / "track.csv", model.views)
     for stage in ("images", "sparse"):
         write_json(folder / stage / "stage.json", {})
     return folder
+
+
+def _write_track(path: Path, views: tuple[View, ...]) -> None:
+    """What the mosaic's figure of the track reads of `sparse/track.csv`."""
+    header = ("image", "station", "time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
+    write_csv(
+        path,
+        header,
+        [
+            (view.image, view.station, float(view.station), *view.world_from_cam.translation,
+             *view.world_from_cam.rotation.as_quat())
+            for view in views
+        ],
+    )  # fmt: skip
 
 
 def _warp(view: View) -> dict[str, object]:

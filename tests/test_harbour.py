@@ -1,5 +1,9 @@
 """The harbour's truth, its judge, and its pictures, each by a second route."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -20,6 +24,7 @@ from benchmarks.harbour_judge import (
     slope_class,
     true_harbour,
 )
+from benchmarks.harbour_masks import MaskTask, count_pixels, fish_along, fish_in, shadow_in, shares
 from benchmarks.harbour_meshes import moving_at, solid_mesh, still_harbour
 from benchmarks.harbour_scene import BOULDERS, FISH, HULL, PARTS, PILE, SOLIDS, Ellipsoid
 from benchmarks.harbour_sight import instants_that_see, surface_samples, trace
@@ -295,3 +300,63 @@ def test_the_renderer_sees_what_snell_and_the_closed_form_say(row: str) -> None:
     # Where an edge is off by a share of a pixel, that share of the pixels along it disagrees.
     wrong = (near & ~close).sum()
     assert wrong < 0.25 * max(edges.sum(), 40)
+
+
+def fishy_station() -> int:
+    """The one that sees most of a fish."""
+    seen = [
+        fish_in("left", 12, body_poses(QUICK)[k] * harbour_rig(12).body_from_cam("left"),
+                time_of(k)).sum()
+        for k in range(len(QUICK))
+    ]  # fmt: skip
+    assert max(seen) > 1000
+    return int(np.argmax(seen))
+
+
+def test_fish_of_the_judge_are_those_of_the_renderer() -> None:
+    station = fishy_station()
+    camera = harbour_rig(12).cameras["left"]
+    pose = body_poses(QUICK)[station] * harbour_rig(12).body_from_cam("left")
+    fish = tuple(one for one in moving_at(time_of(station)) if one.name == "fish")
+    assert len(fish) == len(FISH)
+    still = still_harbour()
+    without, with_fish = (
+        range_map(Scene(terrain=terrain, texture=Texture(seed=1)), camera, pose, reach_m=4.0)
+        for terrain in (still, replace(still, objects=still.objects + fish))
+    )
+    shown = np.nan_to_num(with_fish, nan=9.0) < np.nan_to_num(without, nan=9.0) - 0.01
+    found = fish_in("left", 12, pose, time_of(station))
+    assert (shown & found).sum() / (shown | found).sum() > 0.97
+    assert abs(int(shown.sum()) - int(found.sum())) < 0.02 * shown.sum()
+
+
+def test_a_ray_to_the_middle_of_a_fish_ends_on_its_skin() -> None:
+    time_s = 7.0
+    fish = FISH[0]
+    ahead = fish.turn(time_s).apply([1.0, 0.0, 0.0])
+    start = fish.place(time_s) - 0.5 * ahead
+    path = fish_along(start[None], ahead[None], time_s)
+    np.testing.assert_allclose(path, 0.5 - fish.semi_axes[0], atol=1e-9)
+    assert np.isinf(fish_along(start[None], -ahead[None], time_s)).all()
+
+
+def test_masks_are_judged_by_what_moves_and_by_shadows(tmp_path: Path) -> None:
+    station = fishy_station()
+    task = MaskTask(masks=tmp_path, planned=QUICK, scale=12, name="left", station=station)
+    pose = body_poses(QUICK)[station] * harbour_rig(12).body_from_cam("left")
+    fish = fish_in("left", 12, pose, time_of(station))
+    nothing = shares(count_pixels(task))
+    assert (nothing["recall"], nothing["still_masked"]) == (0.0, 0.0)
+    (tmp_path / "left").mkdir()
+    path = tmp_path / "left" / f"{station:04d}.png"
+    cv2.imwrite(str(path), np.where(fish, 0, 255).astype(np.uint8))
+    right = shares(count_pixels(task))
+    assert (right["recall"], right["precision"], right["shadow_share"]) == (1.0, 1.0, 0.0)
+    cv2.imwrite(str(path), np.zeros(fish.shape, np.uint8))
+    all_masked = count_pixels(task)
+    assert all_masked["hit"] == fish.sum()
+    assert shares(all_masked)["still_masked"] == 1.0
+    # A fish that is seen before a wall casts a shadow on it, about as large as itself.
+    shadow = shadow_in(task, pose, ~fish)
+    assert 0.3 * fish.sum() < shadow.sum() < 0.7 * fish.size
+    assert all_masked["masked"] == fish.size

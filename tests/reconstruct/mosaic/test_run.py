@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.base.artefacts import read_json, write_csv, write_json
+from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.config import CameraConfig, ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import SERIAL
@@ -57,25 +57,10 @@ def write_surface(folder: Path) -> None:
     write_json(dense / "stage.json", {})
 
 
-def write_track(folder: Path, views: list[View]) -> None:
-    """What the mosaic's figure of the track reads of `sparse/track.csv`."""
-    header = ("image", "station", "time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
-    write_csv(
-        folder / "sparse" / "track.csv",
-        header,
-        [
-            (view.image, view.station, float(view.station), *view.world_from_cam.translation,
-             *view.world_from_cam.rotation.as_quat())
-            for view in views
-        ],
-    )  # fmt: skip
-
-
 def make_workspace(folder: Path, views: list[View], scene: Scene) -> Path:
     """All that the mosaic is made of."""
     write_workspace(folder, sparse_model(views, scene), scene)
     write_surface(folder)
-    write_track(folder, views)
     return folder
 
 
