@@ -43,6 +43,9 @@ from camera_calib.camera import camera_from_json
 from camera_calib.rig import Rig, read_rig
 from missions.values.plan_file import Plan
 
+_MOST_LOST = 20
+"""Pictures that are not in the model, of which more are only counted."""
+
 
 def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
     """All parts for which there is something, and what is needed to reproduce the survey."""
@@ -332,13 +335,24 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
             (f"sigma north, east and depth {what}", ", ".join(length(value) for value in apart))
         )
         rows.append((f"sigma of heading {what}", _degrees(joint.sigma_heading_deg)))
+    lost = figures.held.rows("sparse/unregistered.csv")
+    tables = [Table(title="Model", header=("what", "value"), rows=rows)]
+    if lost:
+        shown = [(row["image"], row["reason"], row["placed_by"] or "not placed") for row in lost]
+        if len(shown) > _MOST_LOST:
+            rest = f"{len(shown) - _MOST_LOST} more in sparse/unregistered.csv"
+            shown = [*shown[:_MOST_LOST], (rest, "", "")]
+        tables.append(
+            Table(title="Pictures not in the model", header=("picture", "why", "placed by"),
+                  rows=shown)
+        )  # fmt: skip
     notes = figures.held.frame.notes
     drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
     return Section(
         name="model",
         title="Camera track and points",
         text=[f"How it was made: {'; '.join(notes)}."] if notes else [],
-        tables=[Table(title="Model", header=("what", "value"), rows=rows)],
+        tables=tables,
         figures=[figure for figure in drawn if figure is not None],
     )
 

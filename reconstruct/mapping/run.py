@@ -27,6 +27,7 @@ from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
+from reconstruct.mapping.unregistered import FEW_FEATURES, UNREGISTERED, reasons, write_reasons
 from reconstruct.mapping.working_range import (
     WorkingDistances,
     find_distances,
@@ -99,7 +100,7 @@ def _map(
     inputs: Inputs, settings: ReconstructConfig, seed: int, executor: Executor, folder: Path
 ) -> None:
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-    features = _find_all(inputs, folder / "features", settings, executor)
+    features, counts = _find_all(inputs, folder / "features", settings, executor)
     warps, distances = _warps(inputs, features, settings, executor)
     cameras, exif_focal = _cameras(inputs, warps)
     pairs = _match_all(inputs, features, cameras, warps, seed, executor)
@@ -129,6 +130,15 @@ def _map(
         mapped, refracted = refract(mapped, seen, folder, poses, settle=not mapped.scaled)
     else:
         mapped, refracted = map_self_calibrated(seen, exif_focal, folder, seed), None
+    registered = {image.name for image in mapped.model.images.values() if image.has_pose}
+    images = [record.image for record in inputs.records]
+    words = reasons(images, registered, counts, pairs)
+    write_reasons(folder / UNREGISTERED, inputs.records, words)
+    if words:
+        warn(
+            f"{len(words)} of {len(images)} pictures are not in the model, "
+            f"mapping/{UNREGISTERED} says why: {named(list(words))}"
+        )
     _write(folder, inputs, mapped, distances, refracted)
     shutil.rmtree(folder / "features")
 
@@ -153,8 +163,8 @@ def _grey_file(features: Path) -> Path:
 
 def _find_all(
     inputs: Inputs, folder: Path, settings: ReconstructConfig, executor: Executor
-) -> list[Path]:
-    """Files of features, in the order of the pictures."""
+) -> tuple[list[Path], list[int]]:
+    """Files of features, in the order of the pictures, and how many each has."""
     targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
     tasks = [
         _FeatureTask(
@@ -169,10 +179,10 @@ def _find_all(
     ]
     folder.mkdir(parents=True, exist_ok=True)
     counts = list(executor.map(extract, tasks, label="features"))
-    poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < 100]
+    poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < FEW_FEATURES]
     if poor:
-        warn(f"{len(poor)} pictures have fewer than 100 features: {named(poor)}")
-    return targets
+        warn(f"{len(poor)} pictures have fewer than {FEW_FEATURES} features: {named(poor)}")
+    return targets, counts
 
 
 def _warps(
@@ -296,9 +306,6 @@ def _write(
 ) -> None:
     model = mapped.model
     registered = {image.name for image in model.images.values() if image.has_pose}
-    lost = [r.image for r in inputs.records if r.image not in registered]
-    if lost:
-        warn(f"{len(lost)} of {len(inputs.records)} pictures are not in the model: {named(lost)}")
     (partial / "model").mkdir(exist_ok=True)
     model.write_binary(partial / "model")
     CamerasRecord.save(

@@ -16,6 +16,7 @@ from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import (
     AcceptanceRecord,
     CamerasRecord,
@@ -29,11 +30,12 @@ from alice_survey.base.records import (
     SimilarityRecord,
 )
 from camera_calib.freedom import knowing_water
-from camera_calib.rig import mounted, write_rig
+from camera_calib.rig import Rig, mounted, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
+from reconstruct.mapping.unregistered import UNREGISTERED
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
 from reconstruct.placing.groups import join_groups, joints_of
 from reconstruct.placing.navigation_equations import PLACE, Installation
@@ -48,8 +50,12 @@ from reconstruct.placing.track import (
     write_track_geojson,
     write_track_tum,
 )
+from reconstruct.placing.unregistered import navigation_places, read_reasons, write_unregistered
 from reconstruct.views.model import read_warps, write_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction
+
+_LEFT_OUT = "in a part of the model that neither pictures nor navigation tie to the rest"
+_UNKNOWN = "not known: the mapping was made by an earlier version"
 
 
 def run_sparse(
@@ -158,9 +164,40 @@ def run_sparse(
         bends = () if placed.fit is None else placed.fit.bends
         doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum, bends)
     joints = () if shape is None or placed.fit is None else joints_of(placed.fit, shape.modes)
+    _unregistered(workspace, folder, inputs.records, rows, known_mount, placed)
     _registration(model, mapping, placed, rows, doming, accepted, joints).write(
         folder / "registration.json"
     )
+
+
+def _unregistered(
+    workspace: Path,
+    folder: Path,
+    records: Sequence[ImageRecord],
+    rows: Sequence[TrackRow],
+    rig: Rig | None,
+    placed: Placed,
+) -> None:
+    """Say why pictures are not in the model, and place them by navigation where there is any."""
+    registered = {row.image for row in rows}
+    lost = [record for record in records if record.image not in registered]
+    if not lost:
+        return
+    words = read_reasons(workspace / "mapping")
+    mapped = CamerasRecord.read(workspace / "mapping" / "cameras.json").images
+    words = {
+        r.image: _LEFT_OUT if r.image in mapped else words.get(r.image, _UNKNOWN) for r in lost
+    }
+    datum, places = placed.frame.datum, None
+    if datum is not None and placed.fit is not None:
+        of_name = {record.image: record for record in records}
+        places = navigation_places(lost, of_name, rows, rig, datum)
+        if places.images:
+            warn(
+                f"{len(places.images)} of {len(lost)} pictures that are not in the model are "
+                f"placed by navigation alone: sparse/{UNREGISTERED}"
+            )
+    write_unregistered(folder / UNREGISTERED, lost, words, places, datum)
 
 
 def _mapped(workspace: Path, mapping: MappingRecord) -> Mapped:
