@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from alice_survey.base.artefacts import atomic_path
 
 _DEPTH_STEP = 2e-5
-"""Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7."""
+"""Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7. In pictures that
+look along a floor or past a foreground, where they span more, steps are larger."""
+_DEPTH_CODES = 65535
 _SIGMA_STEP = 0.05
 _SIGMA_LEAST = 1e-6
 """Relative to the depth; 254 steps of 5 % reach a third of the depth."""
@@ -57,21 +59,21 @@ class ViewStore:
     ) -> None:
         """Keep depth (H, W) and its standard deviation, rounded; NaN where unknown."""
         known = np.isfinite(depth) & np.isfinite(sigma)
-        middle = np.float32(np.log(np.median(depth[known]))) if known.any() else np.float32(0.0)
+        ends = np.array([depth[known].min(), depth[known].max()] if known.any() else [1.0, 1.0])
+        least, most = np.log(ends.astype(np.float64))
+        step = max(_DEPTH_STEP, float(most - least) / (_DEPTH_CODES - 1))
         with np.errstate(invalid="ignore", divide="ignore"):
-            level = np.rint((np.log(depth) - middle) / _DEPTH_STEP) + 32768
+            level = np.rint((np.log(depth) - np.float32(least)) / np.float32(step)) + 1
             share = np.rint(np.log(sigma / depth / _SIGMA_LEAST) / _SIGMA_STEP) + 1
-        known &= (level >= 1) & (level <= 65535)
-        self.save(view, f"{name}.middle", np.array([middle], np.float32))
+        self.save(view, f"{name}.scale", np.array([least, step]))
         self.save(view, f"{name}.sigma", _code(np.clip(share, 1, 255), known, np.uint8))
-        self.save(view, name, _code(level, known, np.uint16))
+        self.save(view, name, _code(np.clip(level, 1, _DEPTH_CODES), known, np.uint16))
 
     def load_depth(self, view: int, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth (H, W) and its standard deviation, NaN where unknown."""
         level, share = self.load(view, name), self.load(view, f"{name}.sigma")
-        middle = float(self.load(view, f"{name}.middle")[0])
-        codes = np.arange(65536)
-        depths = np.exp(middle + (codes - 32768) * _DEPTH_STEP).astype(np.float32)
+        least, step = self.load(view, f"{name}.scale")
+        depths = np.exp(least + (np.arange(_DEPTH_CODES + 1) - 1) * step).astype(np.float32)
         shares = (_SIGMA_LEAST * np.exp((np.arange(256) - 1) * _SIGMA_STEP)).astype(np.float32)
         depths[0], shares[0] = np.nan, np.nan
         depth = depths[level]

@@ -25,6 +25,18 @@ def test_depth_comes_back_within_a_fiftieth_of_a_millimetre(tmp_path: Path):
     assert sum(sizes) < 3 * depth.size + 500
 
 
+def test_no_depth_of_a_view_along_the_floor_is_lost(tmp_path: Path):
+    depth = np.geomspace(0.3, 30.0, 4000, dtype=np.float32).reshape(50, 80)
+    depth[:40] = np.linspace(0.9, 1.1, 40 * 80).reshape(40, 80)  # most of it is near
+    store = ViewStore(tmp_path)
+
+    store.save_depth(0, "fine", depth, 0.01 * depth)
+    z, s = store.load_depth(0, "fine")
+
+    np.testing.assert_allclose(z, depth, rtol=4e-5)
+    assert np.isfinite(s).all()
+
+
 def test_nothing_known_stays_unknown(tmp_path: Path):
     store = ViewStore(tmp_path)
     nowhere = np.full((4, 5), np.nan, np.float32)
