@@ -5,12 +5,14 @@ true surface by its closed form and painted there; a patch of the mosaic that is
 shows something that lies elsewhere.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform
 
@@ -22,7 +24,7 @@ from benchmarks.harbour_scene import PARTS
 from benchmarks.harbour_survey import SEED
 from benchmarks.harbour_truth import distances, normals
 
-_PATCH_PX = 64
+PATCH_PX = 64
 _STEP_PX = 48
 _CLEAR = 0.15
 """Response of phase correlation (1 for equal patches) from which a match counts."""
@@ -50,43 +52,46 @@ def score_plane(dense: Path, mosaic: Path, truth_from_world: RigidTransform) -> 
     texture = survey_texture(SEED)
     found: dict[str, list[Array]] = {}
     looked: dict[str, int] = {}
-    for row in range(0, picture.shape[1] - _PATCH_PX, _STEP_PX):
-        for column in range(0, picture.shape[2] - _PATCH_PX, _STEP_PX):
-            window = (slice(row, row + _PATCH_PX), slice(column, column + _PATCH_PX))
-            shown = picture[(slice(None), *window)]
-            if (shown[-1] == 0).mean() > _HOLES:
-                continue
-            rows, columns = np.mgrid[window] + 0.5
-            x, y = at.c + columns * at.a, at.f + rows * at.e
-            cells = to_cell * (x.ravel(), y.ravel())
-            height = map_coordinates(
-                heights, [cells[1] - 0.5, cells[0] - 0.5], order=1, cval=np.nan
-            )
-            places = truth_from_world.apply(_world_ned(axes, x.ravel(), y.ravel(), height))
-            known = np.isfinite(places).all(axis=1)
-            if not known.mean() > 1 - _HOLES:
-                continue
-            places[~known] = places[known].mean(axis=0)
-            off, part = distances(places)
-            if np.abs(off[known]).max() > _NEAR_M:
-                continue
-            places = places - off[:, None] * normals(places)
-            name = PARTS[int(np.bincount(part).argmax())]
-            material = np.array([_MATERIALS[one] for one in PARTS], np.float32)[part]
-            footprint = np.full(len(places), at.a, np.float32)
-            true = texture.albedo(places, material, footprint).mean(axis=1)
-            looked[name] = looked.get(name, 0) + 1
-            shift = _shift_px(
-                shown[:-1].mean(axis=0), true.reshape(_PATCH_PX, _PATCH_PX).astype(np.float64)
-            )
-            if shift is not None:
-                found.setdefault(name, []).append(shift)
+    for shown, rows, columns in windows_in(picture):
+        x, y = at.c + columns * at.a, at.f + rows * at.e
+        column, row = to_cell * (x.ravel(), y.ravel())
+        height = map_coordinates(heights, [row - 0.5, column - 0.5], order=1, cval=np.nan)
+        places = truth_from_world.apply(plane_points_ned(axes, x.ravel(), y.ravel(), height))
+        known = np.isfinite(places).all(axis=1)
+        if not known.mean() > 1 - _HOLES:
+            continue
+        places[~known] = places[known].mean(axis=0)
+        off, part = distances(places)
+        if np.abs(off[known]).max() > _NEAR_M:
+            continue
+        places = places - off[:, None] * normals(places)
+        name = PARTS[int(np.bincount(part).argmax())]
+        material = np.array([_MATERIALS[one] for one in PARTS], np.float32)[part]
+        footprint = np.full(len(places), at.a, np.float32)
+        true = texture.albedo(places, material, footprint).mean(axis=1)
+        looked[name] = looked.get(name, 0) + 1
+        shift = shift_px(
+            shown[:-1].mean(axis=0), true.reshape(PATCH_PX, PATCH_PX).astype(np.float64)
+        )
+        if shift is not None:
+            found.setdefault(name, []).append(shift)
     every = [shift for shifts in found.values() for shift in shifts]
     parts = {name: _figures(found.get(name, []), count, at.a) for name, count in looked.items()}
     return {"pixel_mm": 1e3 * at.a, "all": _figures(every, sum(looked.values()), at.a), "by": parts}
 
 
-def _world_ned(axes: dict[str, Any], x: Array, y: Array, height: Array) -> Array:
+def windows_in(picture: NDArray[np.uint8]) -> Iterator[tuple[NDArray[np.uint8], Array, Array]]:
+    """Patches of a mosaic (bands, H, W) without holes, and rows and columns of their pixels."""
+    for row in range(0, picture.shape[1] - PATCH_PX, _STEP_PX):
+        for column in range(0, picture.shape[2] - PATCH_PX, _STEP_PX):
+            window = (slice(row, row + PATCH_PX), slice(column, column + PATCH_PX))
+            shown = picture[(slice(None), *window)]
+            if (shown[-1] == 0).mean() <= _HOLES:
+                rows, columns = np.mgrid[window] + 0.5
+                yield shown, rows, columns
+
+
+def plane_points_ned(axes: dict[str, Any], x: Array, y: Array, height: Array) -> Array:
     """Points (N, 3) of a plane's coordinates, by its `plane.json`."""
     right, up, out = (np.array(axes[f"{name}_enu"]) for name in ("right", "up", "out"))
     enu = np.array(axes["origin_enu"]) + np.outer(x, right) + np.outer(y, up)
@@ -108,9 +113,9 @@ def _figures(shifts: list[Array], patches: int, pixel_m: float) -> dict[str, flo
     return figures
 
 
-def _shift_px(picture: Array, true: Array) -> Array | None:
+def shift_px(picture: Array, true: Array) -> Array | None:
     """Columns and rows by which a picture is off; None where that is not clear."""
-    window = cv2.createHanningWindow((_PATCH_PX, _PATCH_PX), cv2.CV_64F)
+    window = cv2.createHanningWindow((PATCH_PX, PATCH_PX), cv2.CV_64F)
     flat = [np.log(one + 1e-2 * one.max() + 1e-9) for one in (true, picture.astype(np.float64))]
     flat = [one - cv2.GaussianBlur(one, (0, 0), 8) for one in flat]
     (x, y), response = cv2.phaseCorrelate(flat[0], flat[1], window)
