@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from alice_survey.base.artefacts import atomic_path
 
 _DEPTH_STEP = 2e-5
-"""Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7. Where those of a
-picture span more, as along a floor or past a foreground, steps are larger."""
+"""Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7. Where those of
+a picture span more, as along a floor or past a foreground, steps are larger."""
 _DEPTH_CODES = 65535
 _SIGMA_STEP = 0.05
 _SIGMA_LEAST = 1e-6
