@@ -51,6 +51,8 @@ _LEAST_SHARE = 0.4
 """Share of a window's weight that a neighbour must see."""
 _OUTLYING = 2.5
 """Deviations beyond which a pixel counts less than half."""
+_LEAST_UNSEEN = 0.005
+"""Share of a view that no other station sees, from which its own station's pictures are asked."""
 _LONGEST_STEP_PX = 1.0
 """Longest step of a round, along the epipolar line of the neighbour that moves most."""
 
@@ -211,7 +213,11 @@ class _NeighbourSums:
 
 
 def refine(
-    reference: ComparedView, depth: Float32, sigma: Float32, others: Sequence[ComparedView]
+    reference: ComparedView,
+    depth: Float32,
+    sigma: Float32,
+    others: Sequence[ComparedView],
+    spare: Sequence[ComparedView] = (),
 ) -> RefinedDepth:
     """Correct a depth map by all neighbours at once.
 
@@ -223,16 +229,17 @@ def refine(
         depth: (H, W) along its axis, NaN where unknown.
         sigma: (H, W) of the depth.
         others: neighbours to compare with.
+        spare: those to compare with where none of the others sees the spot.
     """
     inverse = (1.0 / depth).astype(np.float32)
-    first = _sums(reference, inverse, others)
+    first = _sums_of(reference, inverse, others, spare)
     moved, step_px = _stepped(inverse, first)
     sums = first
     far = (step_px > _CONVERGED_PX).astype(np.uint8)
     if far.any():  # elsewhere a second round would change little
         window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
         part = np.where(cv2.dilate(far, window) > 0, moved, np.float32(np.nan))
-        second = _sums(reference, part, others)
+        second = _sums_of(reference, part, others, spare)
         again = np.isfinite(part) & (second.curvature > 0)
         sums = _chosen(again, second, first)
         moved = np.where(again, _stepped(part, second)[0], moved)
@@ -272,6 +279,21 @@ def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
     reach = _LONGEST_STEP_PX / fast
     step: Float32 = np.clip(sums.pull / (sums.curvature + fast * fast), -reach, reach)
     return inverse + step, np.abs(step) * sums.speed
+
+
+def _sums_of(
+    reference: ComparedView,
+    inverse: Float32,
+    others: Sequence[ComparedView],
+    spare: Sequence[ComparedView],
+) -> _NeighbourSums:
+    """What the others say, and where none of them sees a spot what the spare ones say."""
+    sums = _sums(reference, inverse, others)
+    unseen = np.isfinite(inverse) & ~(sums.curvature > 0)
+    if not spare or unseen.mean() < _LEAST_UNSEEN:
+        return sums
+    alone = _sums(reference, np.where(unseen, inverse, np.float32(np.nan)), spare)
+    return _chosen(unseen, alone, sums)
 
 
 def _sums(

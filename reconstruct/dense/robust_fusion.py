@@ -26,7 +26,7 @@ def robust_height(
     The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
     median's own sigma. The standard deviation adds the formal one to the scatter over the square
     root of the number of views: pixels of one view share their errors, and so do views of which
-    one was refined by the other.
+    one was refined by the other. Views of a single station count as one.
 
     Args:
         heights: (N,) sorted by view, one or more.
@@ -83,7 +83,9 @@ def robust_height(
         in_view += 1
         view_weight += w
     formal += view_weight / in_view
-    if seen > 1:
+    if companions == 1:
+        formal /= seen  # one pair of pictures, however often looked at
+    elif seen > 1:
         formal /= shared
     mean = total / weights
     variance = max(squares / weights - mean * mean, 0.0)

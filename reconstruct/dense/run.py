@@ -102,7 +102,12 @@ def run_dense(
         store=store,
         model=replace(model, views=tuple(views)),
         sigma_factor=sigma_factor,
-        shared=depths_per_pair(looks),
+        shared=depths_per_pair(
+            [
+                [m for m in chosen if views[m].station != views[n].station]
+                for n, chosen in enumerate(looks)
+            ]
+        ),
         light=light,
         poses=find_errors_of_poses(workspace, model),
         executor=executor,

@@ -34,7 +34,9 @@ _BOUND_PERCENT = 0.1
 _LIGHT_LATTICE = 28
 """Pixels along a picture's width at which the light of views is compared."""
 LOOKS = 4
-"""Neighbours by which depth is refined."""
+"""Neighbours at other stations by which depth is refined: their baselines determine it best."""
+_ENOUGH_APART = 2
+"""From so many on the pictures of its own station only serve where none of them sees."""
 _COMPARED_VIEWS = 12
 _COMPARED_STEP_PX = 7
 """Views, and pixels between the pixels of each, by which the sigma factor is measured."""
@@ -118,16 +120,29 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
 
 
 def refine_view(task: ViewTask) -> None:
-    """Make a view's depth exact by its best neighbours at once."""
+    """Make a view's depth exact by its best neighbours at once.
+
+    Pictures of its own station serve where no other station sees, or where there is hardly one.
+    """
     store = task.store
     if store.has(task.index, "fine"):
         return
-    looks = []
-    for number, view in ((task.index, task.view), *task.others):
+
+    def look(number: int, view: View) -> ComparedView:
         contrast, spline, valid = _look(store, number, view.pinhole.width_px)
-        looks.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
+        return ComparedView(view=view, contrast=contrast, spline=spline, valid=valid)
+
+    apart = [other for other in task.others if other[1].station != task.view.station]
+    rig = [other for other in task.others if other[1].station == task.view.station]
+    first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
     depth, sigma = store.load_depth(task.index, "depth")
-    refined = refine(looks[0], depth, sigma, looks[1:])
+    refined = refine(
+        look(task.index, task.view),
+        depth,
+        sigma,
+        [look(*other) for other in first],
+        [look(*other) for other in spare],
+    )
     agreeing = np.asarray(store.load(task.index, "agreeing"))
     support = np.where(np.isfinite(depth), np.maximum(agreeing, refined.seen), refined.seen)
     store.save(task.index, "seen", support.astype(np.uint8))
@@ -172,12 +187,9 @@ def disagreement(task: ViewTask) -> float:
 
 
 def looked_at(views: Sequence[View], index: int, partners: Sequence[int]) -> list[int]:
-    """Views to refine depth with: partners at other stations, whose baselines determine depth best.
-
-    That of the same station is taken where there are fewer than two others.
-    """
+    """Views to refine depth with: the best partners at other stations, and those of its own."""
     apart = [n for n in partners if views[n].station != views[index].station]
-    return list(apart if len(apart) >= 2 else partners)[:LOOKS]
+    return [n for n in partners if n not in apart[LOOKS:]]
 
 
 def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:

@@ -5,6 +5,7 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruct.dense.refine_depth import ComparedView, compare, pixel_lines, prepared, refine
+from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
 SCENE = Scene(
@@ -12,12 +13,13 @@ SCENE = Scene(
     paint=speckle(),
 )
 VIEWS = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]))
+FAR_VIEWS = stereo_views(np.array([0.1, 0.9]), np.array([0.3, 0.4]))
 
 
 @cache
-def looks() -> list[ComparedView]:
+def looks(*, far: bool = False) -> list[ComparedView]:
     found = []
-    for view in VIEWS:
+    for view in FAR_VIEWS if far else VIEWS:
         grey = cv2.cvtColor(render(view, SCENE), cv2.COLOR_BGR2GRAY)
         contrast, spline, valid = prepared(grey, np.ones(grey.shape, bool))
         found.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
@@ -111,3 +113,29 @@ def test_a_view_without_neighbours_keeps_no_depth():
     found = refine(looks()[0], depth, np.full_like(depth, 0.004), [])
     assert not np.isfinite(found.depth).any()
     assert (found.seen == 0).all()
+
+
+def test_what_no_other_station_sees_rests_on_the_pair_with_a_larger_sigma():
+    true = true_depth().astype(np.float32)
+    start = true + np.float32(0.004) * np.sin(np.arange(true.shape[1]) / 40).astype(np.float32)
+    sigma = np.full_like(start, 0.01)
+    one, ahead, pair, ahead_right = looks(far=True)
+    apart = [ahead, ahead_right]
+    pixels = np.indices(true.shape)[::-1].reshape(2, -1).T + 0.5
+    points = one.view.at_depth(pixels, true.ravel().astype(np.float64))
+    there = [in_frame(other.view, points).reshape(true.shape) for other in (pair, *apart)]
+    alone = ndimage.binary_erosion(there[0] & ~there[1] & ~there[2], iterations=6)
+    assert alone.mean() > 0.1
+
+    without = refine(one, start, sigma, apart)
+    found = refine(one, start, sigma, apart, [pair])
+
+    assert not np.isfinite(without.depth[alone]).any()
+    assert np.isfinite(found.depth[alone]).mean() > 0.98
+    error = (found.depth - true)[alone & np.isfinite(found.depth)]
+    over = error / found.sigma[alone & np.isfinite(found.depth)]
+    assert 2e-4 < np.sqrt(np.mean(error**2)) < 0.003
+    assert 0.3 < 1.4826 * np.median(np.abs(over)) < 2.0
+    seen = np.isfinite(without.depth)
+    np.testing.assert_array_equal(found.depth[seen], without.depth[seen])
+    assert np.nanmedian(found.sigma[alone]) > 2.0 * np.nanmedian(found.sigma[seen])

@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from scipy import ndimage
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
@@ -10,6 +11,7 @@ from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.executor import SERIAL, local_executor
 from alice_survey.stages import spec
 from reconstruct.dense import plane_rasters
+from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -203,3 +205,20 @@ def test_a_workspace_without_model_names_the_command_that_makes_one(tmp_path: Pa
     (tmp_path / "sparse" / "stage.json").unlink()
     with pytest.raises(WorkspaceError, match="reconstruct"):
         spec("dense").make(tmp_path, CONFIG, SERIAL)
+
+
+def test_what_one_stereo_pair_alone_sees_is_kept_with_an_honest_sigma(workspace: Path):
+    height, north, east = read(workspace / "dense" / "dem.tif")
+    sigma, _, _ = read(workspace / "dense" / "sigma.tif")
+    true = sloped_with_step(north, east)
+    ground = np.stack([north.ravel(), east.ravel(), true.ravel()], axis=1)
+    left, right = np.split(np.array([in_frame(view, ground) for view in survey_views()]), 2)
+    alone = ((left & right).sum(axis=0) == 1) & (left.sum(axis=0) + right.sum(axis=0) == 2)
+    alone = alone.reshape(height.shape) & (np.hypot(north - 0.3, east - 0.35) > 0.4)
+    alone = ndimage.binary_erosion(alone, iterations=2)  # of windows at a picture's border
+    assert alone.sum() > 300
+
+    known = np.isfinite(height) & alone
+    ratio = (height + true)[known] / sigma[known]
+    assert known.sum() > 0.9 * alone.sum()
+    assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.3
