@@ -103,7 +103,8 @@ def _map(
     features, counts = _find_all(inputs, folder / "features", settings, executor)
     warps, distances = _warps(inputs, features, settings, executor)
     cameras, exif_focal = _cameras(inputs, warps)
-    pairs = _match_all(inputs, features, cameras, warps, seed, executor)
+    known = None if distances is None or not distances.measured else distances
+    pairs = _match_all(inputs, features, cameras, warps, known, seed, executor)
     refined = refine_tracks(
         features,
         [_grey_file(path) for path in features],
@@ -256,22 +257,26 @@ def _match_all(
     features: Sequence[Path],
     cameras: Mapping[str, pycolmap.Camera],
     warps: Mapping[str, PinholeWarp],
+    distances: WorkingDistances | None,
     seed: int,
     executor: Executor,
 ) -> list[VerifiedPair]:
     rig = mounted(inputs.rig)
-    placed = placed_pictures(inputs.records, rig, inputs.datum)
-    lost = [i for i in range(len(inputs.records)) if i not in placed]
+    range_m = None if distances is None else (distances.near_m, distances.far_m)
+    everything = set(range(len(inputs.records)))
+    lost = everything - placed_pictures(inputs.records, rig, inputs.datum, range_m)
+    aside = sorted(everything - placed_pictures(inputs.records, rig, inputs.datum))
     unseen = sum(inputs.records[i].has_attitude for i in lost)
     if rig is not None and inputs.datum is not None and unseen:
         warn(
             f"{unseen} pictures with an attitude have no footprint (they see the horizon, or have "
-            "no altitude): their partners are sought in their order and by their looks"
+            "no altitude), and the working range is not known: their partners are sought in their "
+            "order and by their looks"
         )
     alike: list[tuple[int, int]] = []
     if len(inputs.records) > SMALL_SET:
-        alike = alike_pairs(features, lost, _ALIKE, seed=seed, executor=executor)
-    sure, maybe = choose_pairs(inputs.records, rig, inputs.datum, alike)
+        alike = alike_pairs(features, aside, _ALIKE, seed=seed, executor=executor)
+    sure, maybe = choose_pairs(inputs.records, rig, inputs.datum, alike, range_m)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
     counts = executor.map(coarse_matches, looks, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]

@@ -28,6 +28,8 @@ _LARGEST_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
 """Nearest and farthest distances over the working range, when only the range is known."""
+_ANY = "no refraction"
+"""Source of distances where any would do."""
 _LARGEST_CONTRACTION = 0.5
 """At which warped pictures are stretched by half, or twice as dense; at 1 they fold."""
 _LARGEST_CUT = 0.05
@@ -41,6 +43,11 @@ class WorkingDistances:
     near_m: float
     far_m: float
     source: str
+
+    @property
+    def measured(self) -> bool:
+        """Whether they are those of this survey, and not any."""
+        return self.source != _ANY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +82,7 @@ def find_distances(
         ReconstructionError: none of the three is there, and a camera refracts.
     """
     if not any(camera.refracts for camera in rig.cameras.values()):
-        return WorkingDistances(near_m=_NEAR, far_m=_FAR, source="no refraction")  # any would do
+        return WorkingDistances(near_m=_NEAR, far_m=_FAR, source=_ANY)
     if given_m is not None:
         return WorkingDistances(
             near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m"

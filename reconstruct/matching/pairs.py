@@ -8,7 +8,7 @@ the mean of the vectors is taken off.
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -24,9 +24,7 @@ from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
-
-Pair = tuple[int, int]
-"""Indices of two pictures, the smaller first."""
+from reconstruct.matching.frusta import Frusta, Pair, all_round, frusta_of, near_pairs, shared
 
 SMALL_SET = 60
 """Up to this many pictures every pair gets at least a coarse look."""
@@ -57,6 +55,7 @@ def choose_pairs(
     rig: Rig | None,
     datum: Datum | None,
     alike: Sequence[Pair] = (),
+    range_m: tuple[float, float] | None = None,
 ) -> tuple[list[Pair], list[Pair]]:
     """Pairs to match fully, and pairs to match only if a coarse look finds something.
 
@@ -66,45 +65,62 @@ def choose_pairs(
     such link joins: one that looks ahead sees what another that looks astern sees later. Of many,
     every picture chooses the best conditioned in all directions (`well_conditioned`), so that the
     work for a picture does not grow with the survey nor with the times that a place was visited.
-    With positions only: the nearest pictures. Without either: neighbours in order, pictures that
-    look alike, and every other pair where the pictures are few. Pictures of one station are always
-    matched.
+    Pictures without a footprint, since they look at a wall or have no altitude, are paired by what
+    their frusta share where it is known how far the surface is, and by their looks. With positions
+    only: the nearest pictures. Without either: neighbours in order, pictures that look alike, and every other pair
+    where the pictures are few. Pictures of one station are always matched.
 
     Args:
         records: pictures.
         rig: calibrated cameras, when known.
         datum: origin of local coordinates; None without positions.
-        alike: pairs that look alike, for pictures without navigation.
+        alike: pairs that look alike, for pictures without a footprint.
+        range_m: least and greatest distance of the surface from the cameras; None if unknown.
     """
     sure = neighbours(records, 0)
     maybe: set[Pair] = set()
-    placed = placed_pictures(records, rig, datum)
+    placed = placed_pictures(records, rig, datum, range_m)
+    level = placed_pictures(records, rig, datum)
     if datum is not None and rig is not None:
-        posed = sorted(placed)
-        near, touching = _overlapping([records[i] for i in posed], rig, datum)
-        sure |= {(posed[i], posed[j]) for i, j in near}
-        maybe |= {(posed[i], posed[j]) for i, j in touching}
+        above = sorted(level)
+        groups = [(above, *_overlapping([records[i] for i in above], rig, datum))]
+        if range_m is not None and len(level) < len(placed):
+            posed = sorted(placed)
+            looks_aside = np.array([i not in level for i in posed])
+            groups.append(
+                (posed, *_sharing([records[i] for i in posed], rig, datum, range_m, looks_aside))
+            )
+        for members, near, touching in groups:
+            sure |= {(members[i], members[j]) for i, j in near}
+            maybe |= {(members[i], members[j]) for i, j in touching}
     elif datum is not None and len(records) > SMALL_SET:
         maybe |= _nearest(records, datum)
         sure |= neighbours(records, 1)
+    # A link between parts that look elsewhere may be one that no frusta of such a length show.
+    maybe |= {(i, j) for i, j in alike if i not in level or j not in level}
     if len(placed) < len(records):
         in_order = neighbours(records, NEIGHBOURS)
         sure |= {(i, j) for i, j in in_order if i not in placed or j not in placed}
-        maybe |= {(i, j) for i, j in alike if i not in placed or j not in placed}
         if len(records) <= SMALL_SET:
             maybe |= set(itertools.combinations(range(len(records)), 2))
     return sorted(sure), sorted(maybe - sure)
 
 
 def placed_pictures(
-    records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
+    records: Sequence[ImageRecord],
+    rig: Rig | None,
+    datum: Datum | None,
+    range_m: tuple[float, float] | None = None,
 ) -> set[int]:
     """Pictures whose partners navigation names.
 
-    One that sees the horizon has no footprint: what it shares with others is not known.
+    One that sees the horizon or has no altitude has no footprint: what it shares with others is not
+    known, unless it is known how far the surface is from the cameras.
     """
     if datum is None:
         return set()
+    if rig is not None and range_m is not None:
+        return {i for i, r in enumerate(records) if r.has_position and r.has_attitude}
     if rig is not None:
         posed = [i for i, r in enumerate(records) if _has_pose(r)]
         ground = footprints([records[i] for i in posed], rig, datum)
@@ -180,7 +196,7 @@ def _overlapping(
     polygons = footprints(records, rig, datum)
     wider = [p.buffer(_reach_m(r)) for p, r in zip(polygons, records, strict=True)]
     centres = np.array([p.centroid.coords[0] for p in polygons]).reshape(-1, 2)
-    group = joined_cameras(records, polygons)
+    group = joined_cameras(records, lambda i, j: _overlap(polygons[i], polygons[j]))
     sure: dict[Pair, float] = {}
     across: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
@@ -202,12 +218,54 @@ def _overlapping(
     return chosen | nearest_each(across, away, _SECTORS), nearest_each(maybe, away, _LOOKS)
 
 
-def joined_cameras(records: Sequence[ImageRecord], polygons: Sequence[Polygon]) -> dict[str, str]:
+def _sharing(
+    records: Sequence[ImageRecord],
+    rig: Rig,
+    datum: Datum,
+    range_m: tuple[float, float],
+    chosen: NDArray[np.bool_],
+) -> tuple[set[Pair], set[Pair]]:
+    """Pairs by frusta in which a chosen picture is, as `_overlapping` by footprints."""
+    frusta = frusta_of(records, rig, datum, *range_m)
+    slack = np.array([_slack_m(r, float(np.mean(range_m))) for r in records])
+    group = joined_cameras(records, lambda i, j: _shared_middle(frusta, i, j))
+
+    def linked_within(i: int, j: int) -> bool:
+        cameras = records[i].camera, records[j].camera
+        return cameras[0] != cameras[1] and group[cameras[0]] == group[cameras[1]]
+
+    pairs = [pair for pair in near_pairs(frusta, chosen, slack) if not linked_within(*pair)]
+    sure: dict[Pair, float] = {}
+    maybe: dict[Pair, float] = {}
+    for pair, (middle, most) in shared(frusta, pairs, slack).items():
+        if middle >= _SURE_OVERLAP:
+            sure[pair] = middle
+        elif most >= _LEAST_OVERLAP:
+            maybe[pair] = most
+    middles = frusta.middles
+    away = {(i, j): float(np.linalg.norm(middles[i] - middles[j])) for i, j in maybe}
+    chosen_pairs = all_round(frusta, sure, _SECTORS)
+    return chosen_pairs, nearest_each(maybe, away, _LOOKS)
+
+
+def _shared_middle(frusta: Frusta, i: int, j: int) -> float:
+    return shared(frusta, [(i, j)], np.zeros(len(frusta.cameras)))[i, j][0]
+
+
+def _slack_m(record: ImageRecord, distance_m: float) -> float:
+    """How far a picture's middle may be from where navigation has it; 0 where no sigma is known."""
+    tilt = np.deg2rad(np.nan_to_num(record.sigma_attitude_deg)) * distance_m
+    return float(_SIGMAS * np.hypot(np.nan_to_num(record.sigma_horizontal_m), tilt))
+
+
+def joined_cameras(
+    records: Sequence[ImageRecord], overlap: Callable[[int, int], float]
+) -> dict[str, str]:
     """The cameras that overlap within most stations, one with the next, by a name for all of them.
 
     Args:
         records: pictures.
-        polygons: their footprints.
+        overlap: of two of them.
     """
     stations: dict[int, list[int]] = {}
     for i, record in enumerate(records):
@@ -216,7 +274,7 @@ def joined_cameras(records: Sequence[ImageRecord], polygons: Sequence[Polygon]) 
     for members in stations.values():
         for i, j in itertools.combinations(members, 2):
             cameras = records[i].camera, records[j].camera
-            overlaps.setdefault(cameras, []).append(_overlap(polygons[i], polygons[j]))
+            overlaps.setdefault(cameras, []).append(overlap(i, j))
     group = {record.camera: record.camera for record in records}
     for (one, other), shares in sorted(overlaps.items()):
         if np.median(shares) >= _SURE_OVERLAP:

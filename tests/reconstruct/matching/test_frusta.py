@@ -1,0 +1,180 @@
+"""Partners of pictures that look at walls, and round a pile, by what they truly share."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
+from camera_calib.rig import Rig
+from reconstruct.matching.frusta import frusta_of, near_pairs, shared
+from reconstruct.matching.pairs import choose_pairs, neighbours, placed_pictures
+from tests.reconstruct.scenes import DATUM, make_scene
+
+DISTANCE_M = 2.0
+RANGE_M = (1.6, 2.5)
+
+
+def forward_rig() -> Rig:
+    """Of the scenes, looking ahead with the image's top up."""
+    rig = make_scene(lines=1, stations=2, points=20).rig
+    ahead = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    return replace(rig, body_from_rig=RigidTransform.from_components([0, 0, 0], ahead_of(ahead)))
+
+
+def ahead_of(matrix: Array) -> object:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrix)
+
+
+def records_at(
+    places_ned: Array, headings_deg: Sequence[float], cameras: Sequence[str] = ("left", "right")
+) -> list[ImageRecord]:
+    geodetic = DATUM.geodetic_from_ned(np.asarray(places_ned, dtype=np.float64))
+    return [
+        ImageRecord(
+            image=f"{camera}/{i}.png", camera=camera, station=i, latitude_deg=float(place[0]),
+            longitude_deg=float(place[1]), depth_m=float(place[2]), roll_deg=0.0, pitch_deg=0.0,
+            heading_deg=float(heading) % 360.0,
+        )
+        for i, (place, heading) in enumerate(zip(geodetic, headings_deg, strict=True))
+        for camera in cameras
+    ]  # fmt: skip
+
+
+def wall(columns: int, rows: int, step_m: float) -> list[ImageRecord]:
+    """Rows of stations that look north at a wall, there and back."""
+    order = [
+        (row, column if row % 2 == 0 else columns - 1 - column)
+        for row in range(rows)
+        for column in range(columns)
+    ]
+    return records_at(
+        np.array([[0.0, step_m * c, 10.0 + step_m * r] for r, c in order]), [0.0] * len(order)
+    )
+
+
+def width_m(rig: Rig) -> tuple[float, float]:
+    """Of what a picture shows of the wall, across and down, through the exact port."""
+    camera = rig.cameras["left"]
+    w, h = camera.width_px, camera.height_px
+    ends = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
+    start, way = camera.unproject(ends)
+    hits = start + ((DISTANCE_M - start[:, 2]) / way[:, 2])[:, None] * way
+    return float(hits[1, 0] - hits[0, 0]), float(hits[3, 1] - hits[2, 1])
+
+
+def test_shares_are_those_of_the_wall() -> None:
+    rig = forward_rig()
+    wide, high = width_m(rig)
+    right, down = 0.3 * wide, 0.4 * high
+    records = records_at(
+        np.array([[0, 0, 10], [0, right, 10], [0, 0, 10 + down], [0, right, 10 + down]]),
+        [0.0] * 4,
+        ["left"],
+    )
+    frusta = frusta_of(records, rig, DATUM, DISTANCE_M, DISTANCE_M * (1 + 1e-9))
+    found = shared(frusta, [(0, 1), (0, 2), (0, 3)], np.zeros(4))
+    # A lattice of six rays a side counts in sixths.
+    for pair, expected in {(0, 1): 0.7, (0, 2): 0.6, (0, 3): 0.42}.items():
+        assert found[pair][0] == pytest.approx(expected, abs=0.13)
+        assert found[pair][1] >= found[pair][0]
+
+
+def test_pictures_of_a_wall_are_paired_with_all_around_and_no_others() -> None:
+    rig = forward_rig()
+    wide, high = width_m(rig)
+    step = 0.35 * min(wide, high)
+    records = wall(12, 4, step)
+    assert not placed_pictures(records, rig, DATUM)
+    assert placed_pictures(records, rig, DATUM, RANGE_M) == set(range(len(records)))
+    sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
+    places = np.array([[r.depth_m, r.longitude_deg] for r in records])
+    places[:, 1] = (
+        (places[:, 1] - DATUM.longitude_deg)
+        * np.deg2rad(1.0)
+        * 6.378e6
+        * np.cos(np.deg2rad(DATUM.latitude_deg))
+    )
+    partners: dict[int, set[int]] = {i: set() for i in range(len(records))}
+    same_station = neighbours(records, 0)
+    for i, j in set(sure) - same_station:
+        assert records[i].camera == records[j].camera
+        across, down = abs(places[i] - places[j])[::-1]
+        overlap = (1 - across / wide) * (1 - down / high)
+        assert overlap > 0.1, (i, j)
+        partners[i].add(j)
+        partners[j].add(i)
+    for i, record in enumerate(records):
+        near = {
+            j for j, other in enumerate(records)
+            if other.camera == record.camera
+            and 0 < np.abs(places[i] - places[j]).max() < 1.05 * step
+            and np.abs(places[i] - places[j]).min() < 0.05 * step
+        }  # fmt: skip
+        joined = {j for j in near if tuple(sorted((i, j))) in set(sure) | set(maybe)}
+        assert joined == near, record.image
+    counts = [len(found) for found in partners.values()]
+    assert max(counts) <= 40
+    assert not {(0, len(records) - 1)} & (set(sure) | set(maybe))
+
+
+def test_partners_do_not_grow_with_the_wall() -> None:
+    rig = forward_rig()
+    step = 0.35 * min(width_m(rig))
+    per_picture = []
+    for columns in (10, 30):
+        records = wall(columns, 2, step)
+        sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
+        per_picture.append((len(sure) + len(maybe)) / len(records))
+    assert per_picture[1] < 1.3 * per_picture[0]
+
+
+def test_opposite_sides_of_a_pile_are_no_partners() -> None:
+    rig = forward_rig()
+    angles = np.deg2rad(np.arange(0, 360, 15))
+    places = np.column_stack([-2.3 * np.cos(angles), -2.3 * np.sin(angles), np.full(24, 8.0)])
+    records = records_at(places, np.rad2deg(angles), ["left"])
+    sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
+    apart = {
+        pair: abs((pair[0] - pair[1] + 12) % 24 - 12) * 15
+        for pair in itertools.combinations(range(24), 2)
+    }
+    assert {pair for pair, angle in apart.items() if angle == 15} <= set(sure)
+    # Rays meet under 70 degrees at most; those of a frame are up to 25 degrees off its axis.
+    assert all(apart[pair] <= 75 for pair in sure)
+    assert all(apart[pair] <= 105 for pair in maybe)
+
+
+def test_uncertain_positions_widen_the_search() -> None:
+    rig = forward_rig()
+    wide, _ = width_m(rig)
+    far = records_at(np.array([[0, 0, 10], [0, 1.3 * wide, 10]]), [0.0, 0.0], ["left"])
+    assert choose_pairs(far, rig, DATUM, (), RANGE_M) == ([], [])
+    unsure = [replace(r, sigma_horizontal_m=0.3 * wide) for r in far]
+    assert choose_pairs(unsure, rig, DATUM, (), RANGE_M) == ([], [(0, 1)])
+
+
+def test_pictures_that_look_down_are_paired_as_before() -> None:
+    scene = make_scene(lines=2, stations=6, points=50)
+    assert choose_pairs(scene.records, scene.rig, DATUM, (), RANGE_M) == choose_pairs(
+        scene.records, scene.rig, DATUM
+    )
+
+
+def test_without_altitudes_pictures_that_look_down_are_paired_by_frusta() -> None:
+    scene = make_scene(lines=2, stations=6, points=50)
+    blind = [replace(r, altitude_m=np.nan) for r in scene.records]
+    by_floor, _ = choose_pairs(scene.records, scene.rig, DATUM)
+    sure, maybe = choose_pairs(blind, scene.rig, DATUM, (), RANGE_M)
+    assert len(set(by_floor) & {*sure, *maybe}) > 0.9 * len(by_floor)
+
+
+def test_nothing_is_near_nothing() -> None:
+    frusta = frusta_of([], forward_rig(), DATUM, *RANGE_M)
+    assert near_pairs(frusta, np.zeros(0, np.bool_), np.zeros(0)) == []
