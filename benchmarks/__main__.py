@@ -2,6 +2,7 @@
 
     .venv/bin/python -m benchmarks --work FOLDER [--quick] [--repeat N] [--only NAME ...]
         [--data ../shared/data] [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--aquacal PYTHON]
+        [--mitsuba PYTHON]
 
 Each part runs in a process of its own, in a fixed order: three times where that takes less than
 ten minutes on two cores, once where it takes more (marked long in `parts.py`) and with `--quick`.
@@ -37,6 +38,7 @@ def main() -> int:
         demo=options.demo,
         pyorthomosaic=options.pyorthomosaic,
         aquacal=options.aquacal,
+        mitsuba=options.mitsuba,
     )
     about: dict[str, Any] = {
         "date": dt.datetime.now().astimezone().isoformat(timespec="seconds"),
@@ -120,6 +122,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--demo", type=Path, help="workspace with the demo's rendered pictures")
     parser.add_argument("--pyorthomosaic", metavar="PYTHON", help="a Python that has pyOrthomosaic")
     parser.add_argument("--aquacal", metavar="PYTHON", help="a Python that has AquaCal")
+    parser.add_argument("--mitsuba", metavar="PYTHON", help="a Python that has Mitsuba")
     options = parser.parse_args()
     try:
         options.parts = chosen(options.only)

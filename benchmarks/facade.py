@@ -45,7 +45,7 @@ _LENGTH_BETWEEN = ((-1.95, 0.0, 2.45), (1.95, 0.0, 2.45))
 _LENGTH_IN = 4
 """The known length, and the picture in which its ends are picked."""
 _NEAR_PX = 3.0
-_SAMPLES = 20_000
+_SAMPLES = 10_000
 _INSTANTS = 3
 _HEADER_BYTES = 2**40
 
@@ -147,14 +147,15 @@ def projected(points: Array, camera: dict[str, Any]) -> Array:
 def surface_samples() -> tuple[Array, Array]:
     """Points (N, 3) spread over the surface that a visitor may see, and normals."""
     rng = np.random.default_rng(6)
-    points = rng.uniform([-4.0, -1.5, -0.02], [4.0, 0.4, 5.0], (40 * _SAMPLES, 3))
+    points = rng.uniform([-4.0, -1.5, -0.02], [4.0, 0.4, 5.0], (15 * _SAMPLES, 3))
     points = points[np.abs(scene.distance(points)) < 0.02]
     for _ in range(3):
         points = points - scene.distance(points)[:, None] * scene.normals(points)
     points = points[np.abs(scene.distance(points)) < 1e-6]
     points = points[rng.permutation(len(points))[:_SAMPLES]]
     away = scene.normals(points)
-    facing = away[:, 1] < 0.99  # the back of the wall
+    # Neither the back of the wall nor where two solids touch.
+    facing = (away[:, 1] < 0.99) & (scene.distance(points + 1e-3 * away) > 0.9e-3)
     return points[facing], away[facing]
 
 

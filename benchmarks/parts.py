@@ -24,6 +24,8 @@ class Settings:
     """A Python that has pyOrthomosaic."""
     aquacal: str | None = None
     """A Python that has AquaCal."""
+    mitsuba: str | None = None
+    """A Python that has Mitsuba."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +110,15 @@ def _real(folder: str) -> Callable[[Settings], str | None]:
     return needs
 
 
+def _facade(settings: Settings, work: Path) -> Sequence[str]:
+    python = () if settings.mitsuba is None else ("--mitsuba", settings.mitsuba)
+    return ("--work", str(work), *python)
+
+
+def _need_mitsuba(settings: Settings) -> str | None:
+    return None if settings.mitsuba is not None else "no --mitsuba PYTHON to render it with"
+
+
 PARTS = (
     Part(name="camera-speed", module="camera", arguments=_speed),
     Part(name="camera-pose", module="camera", arguments=lambda _, __: ("--only", "pose")),
@@ -173,6 +184,7 @@ PARTS = (
         arguments=lambda _, work: ("--work", str(work)),
         long=True,
     ),
+    Part(name="facade", module="facade", arguments=_facade, long=True, needs=_need_mitsuba),
     Part(
         name="mosaic",
         module="mosaic",

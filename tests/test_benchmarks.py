@@ -37,7 +37,7 @@ def test_every_benchmark_that_hands_figures_over_is_a_part() -> None:
 
     assert found == MODULES
     assert {"camera", "planner", "vehicle", "features", "refraction", "bend", "bend_power",
-            "block_size", "precision", "reconstruct", "mosaic", "harbour",
+            "block_size", "precision", "reconstruct", "mosaic", "harbour", "facade",
             "real_pictures"} == {*MODULES}  # fmt: skip
 
 
@@ -70,7 +70,9 @@ def missing_packages(part: Part) -> str | None:
 
 def test_parts_have_names_of_their_own_and_commands_for_one_part() -> None:
     assert len({part.name for part in PARTS}) == len(PARTS)
-    settings = Settings(work=Path("W"), quick=True, demo=Path("D"), pyorthomosaic="P", aquacal="A")
+    settings = Settings(
+        work=Path("W"), quick=True, demo=Path("D"), pyorthomosaic="P", aquacal="A", mitsuba="M"
+    )
     commands = [part.command(settings) for part in PARTS]
     assert len({tuple(command) for command in commands}) == len(PARTS)
     assert all(command[-1] == "--quick" for command in commands)

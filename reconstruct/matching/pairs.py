@@ -67,8 +67,8 @@ def choose_pairs(
     work for a picture does not grow with the survey nor with the times that a place was visited.
     Pictures without a footprint, since they look at a wall or have no altitude, are paired by what
     their frusta share where it is known how far the surface is, and by their looks. With positions
-    only: the nearest pictures. Without either: neighbours in order, pictures that look alike, and every other pair
-    where the pictures are few. Pictures of one station are always matched.
+    only: the nearest pictures. Without either: neighbours in order, pictures that look alike, and
+    every other pair where the pictures are few. Pictures of one station are always matched.
 
     Args:
         records: pictures.

@@ -1,0 +1,83 @@
+"""The facade's truth and judge, each by a second route."""
+
+import numpy as np
+import pytest
+
+from benchmarks import facade_scene as scene
+from benchmarks.facade import looks, pictures_that_see, projected, surface_samples
+
+CAMERAS = scene.cameras()
+
+
+def ray_triangles(start: np.ndarray, way: np.ndarray) -> float:
+    """Distance to the nearest triangle of the mesh (Moeller & Trumbore 1997); inf if none."""
+    corners, triangles, _ = scene.mesh()
+    a, b, c = corners[triangles].transpose(1, 0, 2)
+    normal = np.cross(way, c - a)
+    inverse = 1.0 / np.where(np.abs(d := ((b - a) * normal).sum(axis=1)) < 1e-12, np.nan, d)
+    u = ((start - a) * normal).sum(axis=1) * inverse
+    across = np.cross(start - a, b - a)
+    v = (across @ way) * inverse
+    t = ((c - a) * across).sum(axis=1) * inverse
+    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6)
+    return float(np.min(t[hit], initial=np.inf))
+
+
+def test_rays_meet_the_mesh_where_the_distance_is_zero() -> None:
+    rng = np.random.default_rng(2)
+    met = 0
+    for camera in CAMERAS[::5]:
+        turn, eye = looks(camera)
+        for slope in rng.uniform(-0.5, 0.5, (12, 2)):
+            way = turn.T @ np.array([*slope, 1.0])
+            way /= np.linalg.norm(way)
+            length = ray_triangles(eye, way)
+            if length == np.inf:
+                continue
+            met += 1
+            end = (eye + length * way)[None]
+            assert abs(scene.distance(end)[0]) < 1e-4  # a column's chord is 0.04 mm off
+            near = eye + 0.98 * length * way
+            assert scene.reached(eye[None], near[None]).all()
+            assert not scene.reached(eye[None], eye[None] + 1.2 * length * way).any()
+    assert met > 30
+
+
+def test_a_camera_sees_its_target_in_the_middle_with_what_is_above_on_top() -> None:
+    steps = np.array([[0, 0, 0], [0, 0, 0.2], [0.2, 0, 0]])
+    for camera in CAMERAS:
+        target = np.array(camera["target"])
+        middle, above, right = projected(target + steps, camera)
+        np.testing.assert_allclose(middle, np.array(scene.SIZE_PX) / 2, atol=1e-9)
+        assert above[1] < middle[1] - 10
+        assert right[0] > middle[0] + 10
+    # half the width of the picture at a distance of one is the tangent of half the angle
+    eye, target = np.array([0.0, -5.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    camera = {"eye": eye, "target": target, "up": [0.0, 0.0, 1.0]}
+    half = 5.0 * np.tan(np.deg2rad(scene.FOV_DEG / 2))
+    edge = projected(np.array([[half, 0.0, 1.0]]), camera)[0]
+    np.testing.assert_allclose(edge, [scene.SIZE_PX[0], scene.SIZE_PX[1] / 2], atol=1e-9)
+
+
+def test_samples_are_spread_over_what_is_in_sight() -> None:
+    points, away = surface_samples()
+    assert np.abs(scene.distance(points)).max() < 1e-6
+    np.testing.assert_allclose(scene.distance(points + 1e-3 * away), 1e-3, atol=2e-4)
+    seen = pictures_that_see(points[:600], away[:600], CAMERAS)
+    assert 0.5 < (seen >= 3).mean() < 0.98
+    under = (np.abs(points[:600, 2] - 2.38) < 1e-6) & (away[:600, 2] < -0.9)
+    high = np.array([c["eye"][2] for c in CAMERAS]) > 2.4
+    from_above = pictures_that_see(
+        points[:600], away[:600], [c for c, up in zip(CAMERAS, high, strict=True) if up]
+    )
+    assert under.sum() > 5
+    assert not from_above[under].any()  # the underside of the balcony
+
+
+def test_texture_coordinates_of_the_wall_are_places_on_it() -> None:
+    corners, triangles, places = scene.mesh()
+    flat = triangles[np.ptp(corners[triangles][..., 1], axis=1) == 0].ravel()
+    np.testing.assert_allclose(places[flat] * scene.TEXTURE_M, corners[flat][:, [0, 2]])
+    assert scene.texture().shape == (scene.TEXTURE_PX, scene.TEXTURE_PX, 3)
+    assert 30 < scene.texture().std() < 90
+    assert pytest.approx(1.0) == np.linalg.norm(scene.normals(corners[:40] + 0.01), axis=1)
