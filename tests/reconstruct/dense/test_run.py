@@ -147,6 +147,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
         "dem.qml",
         "sigma.qml",
         "light.json",
+        "moving.csv",
         "surface.json",
         "plane.json",
         "stage.json",
