@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
+from reconstruct.dense.free_space import look_at_points
 from reconstruct.dense.points import EDGE_ON, Points, joined, points_in_box
 from reconstruct.dense.pose_part import ErrorsOfPoses
 from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settled
@@ -15,7 +16,7 @@ from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightModel
 from reconstruct.planes import Plane
 from reconstruct.raster import DemGrid, tiles_of
-from reconstruct.views.model import View
+from reconstruct.views.model import View, enu_from_cam
 
 _TILE_CELLS = 256
 _WORST_CELLS = 4.0
@@ -123,6 +124,7 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
     points = _points_over(setup, task, offset, (low - rim, high + rim))
     origin = np.array([grid.west, grid.north, 0.0])
     surface = fuse_surface(points, setup.stations, grid.cell, origin, setup.shared)
+    surface = surface[~_seen_through(setup, task, offset, surface)]
     surface = settled(surface, grid.cell, low - rim, high + rim)
     place = surface["enu"][:, :2].astype(np.float64)
     surface = surface[((place >= low) & (place < high)).all(axis=1)]
@@ -177,6 +179,30 @@ def tiles_over(tiles: Sequence[SurfaceTile], plane: Plane, grid: DemGrid) -> lis
     return found
 
 
+def _seen_through(
+    setup: FuseSetup, task: FuseTask, offset: Array, surface: NDArray[Any]
+) -> NDArray[np.bool_]:
+    """Which points of a tile more views see through than find."""
+    found, through = (np.zeros(len(surface), np.int64) for _ in range(2))
+    points, sigmas = (np.ascontiguousarray(surface[name]) for name in ("enu", "sigma"))
+    for index, view in task.views:
+        depth, sigma = _depth_of(setup, index)
+        to_enu = np.vstack([enu_from_cam(view, offset), [0.0, 0.0, 0.0, 1.0]])
+        to_cam = np.ascontiguousarray(np.linalg.inv(to_enu)[:3])
+        at, beyond = look_at_points(
+            points, sigmas, to_cam, depth, sigma, view.kernel_lens, task.grid.cell
+        )
+        found += at
+        through += beyond
+    return through > found
+
+
+def _depth_of(setup: FuseSetup, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Refined depth (H, W) of a view and its standard deviation."""
+    depth, sigma = setup.store.load_depth(index, "fine")
+    return depth, sigma * np.float32(setup.sigma_factor)
+
+
 def _points_over(
     setup: FuseSetup, task: FuseTask, offset: Array, box: tuple[Array, Array]
 ) -> Points:
@@ -184,8 +210,7 @@ def _points_over(
     store, (low, high) = setup.store, box
     parts = []
     for index, view in task.views:
-        depth, sigma = store.load_depth(index, "fine")
-        sigma *= np.float32(setup.sigma_factor)
+        depth, sigma = _depth_of(setup, index)
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * task.grid.cell
         parts.append(
