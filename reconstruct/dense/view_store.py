@@ -19,6 +19,8 @@ _DEPTH_STEP = 2e-5
 """Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7. Where those of
 a picture span more, as along a floor or past a foreground, steps are larger."""
 _DEPTH_CODES = 65535
+_MOST_RATIO = 16.0
+"""Depths nearer or farther than the median by more than this are of wrong matches, and left out."""
 _SIGMA_STEP = 0.05
 _SIGMA_LEAST = 1e-6
 """Relative to the depth; 254 steps of 5 % reach a third of the depth."""
@@ -59,6 +61,8 @@ class ViewStore:
     ) -> None:
         """Keep depth (H, W) and its standard deviation, rounded; NaN where unknown."""
         known = np.isfinite(depth) & np.isfinite(sigma)
+        middle = float(np.median(depth[known])) if known.any() else 1.0
+        known &= (depth > middle / _MOST_RATIO) & (depth < middle * _MOST_RATIO)
         ends = np.array([depth[known].min(), depth[known].max()] if known.any() else [1.0, 1.0])
         least, most = np.log(ends.astype(np.float64))
         step = max(_DEPTH_STEP, float(most - least) / (_DEPTH_CODES - 1))
