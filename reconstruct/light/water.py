@@ -172,7 +172,7 @@ def _solve(samples: LightSamples, dark: Mapping[str, Array], cameras: Sequence[s
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Step:
+class _PairEquations:
     """Equations of a round: dense[c] @ (m, u, b, log B, s) + gains = target[:, c], N rows."""
 
     dense: list[csr_array]
@@ -187,7 +187,7 @@ class _Step:
 def _linearised(
     light: Array, ranges: Array, middle: float, at: tuple[csr_array, ...], gain: csr_array,
     level: Array, u: Array, log_b: Array, solution: Array, first: bool,
-) -> _Step:  # fmt: skip
+) -> _PairEquations:  # fmt: skip
     nodes = len(level)
     count = 2 * nodes + 3
     growth = np.exp(log_b)
@@ -223,7 +223,7 @@ def _linearised(
         logs = np.log(left)
         targets.append(logs[:, 0] - logs[:, 1] + by_u @ u[:, c] + by_growth * log_b[c])
         sizes.append(((shown / left) ** 2).mean(axis=1))
-    return _Step(
+    return _PairEquations(
         dense=dense, target=np.stack(targets, axis=1), size=np.stack(sizes, axis=1), usable=usable
     )
 
@@ -238,7 +238,7 @@ def _slope_of_growth(growth: float, ranges: Array, middle: float) -> Array:
     return found
 
 
-def _noise(rest: Array, step: _Step) -> Array:
+def _noise(rest: Array, step: _PairEquations) -> Array:
     """Sigmas of the part that channels share, and of their own over root of `size`."""
     own = [
         (rest[:, c] - rest[:, GREEN]) / np.sqrt(step.size[:, c] + step.size[:, GREEN])
@@ -251,7 +251,7 @@ def _noise(rest: Array, step: _Step) -> Array:
     return np.array([math.sqrt(max(green**2 - sigma**2 * size, sigma**2)), sigma])
 
 
-def _weights(rest: Array, step: _Step, noise: Array, robust: bool) -> Array:
+def _weights(rest: Array, step: _PairEquations, noise: Array, robust: bool) -> Array:
     """(N, 3, 3) inverse covariances of samples, Huber's weights in."""
     covariance = noise[0] ** 2 + noise[1] ** 2 * step.size[:, :, None] * np.eye(3)
     inverse = np.linalg.inv(covariance)
@@ -263,7 +263,7 @@ def _weights(rest: Array, step: _Step, noise: Array, robust: bool) -> Array:
     return found
 
 
-def _normal(step: _Step, gain: csr_array, weights: Array) -> tuple[csr_array, Array]:
+def _normal(step: _PairEquations, gain: csr_array, weights: Array) -> tuple[csr_array, Array]:
     """Normal equations of what the channels share, dense unknowns of all channels first."""
     whole = [block_array([[dense, gain]], format="csr") for dense in step.dense]
     count, size = step.dense[0].shape[1], whole[0].shape[1]
