@@ -49,6 +49,8 @@ _NODES = GRID[0] * GRID[1]
 _B, _LOG_GROWTH, _SPREAD = -3, -2, -1
 """Places of b, log B and s among a channel's unknowns, after m and u."""
 _ROUNDS = 10
+_GAIN_ROUNDS = (0, 4, 9)
+"""Rounds that solve for gains too, which takes long; the others hold them."""
 _STEP = 0.6
 """Share of a step in u and log B that is taken, but in the last rounds."""
 _SHARE, _SHARE_SIGMA = 0.5, 0.5
@@ -148,7 +150,8 @@ def _solve(samples: LightSamples, dark: Mapping[str, Array], cameras: Sequence[s
         dense, right = _normal(step, gain, weights)
         gains = np.full(3 * pictures, gain_sigma**-2)
         prior = _prior(len(names), middle, spread)
-        solution, sigmas = _eliminated(dense, right, prior, gains, (3 * count, pictures))
+        held = None if turn in _GAIN_ROUNDS else solution[:, count:].ravel()
+        solution, sigmas = _solved(dense, right, prior, gains, held, 3 * count)
         part = _STEP if turn < _ROUNDS - 2 else 1.0
         found = np.clip(solution[:, nodes : 2 * nodes].T, 0.0, 1.0)
         u = u + part * (found - u)
@@ -280,18 +283,21 @@ def _normal(step: _PairEquations, gain: csr_array, weights: Array) -> tuple[csr_
     return block_array(blocks.tolist(), format="csr")[order][:, order], right.ravel()[order]
 
 
-def _eliminated(
+def _solved(
     matrix: csr_array, right: Array, prior: tuple[Array, Array], gains: Array,
-    sizes: tuple[int, int],
+    held: Array | None, dense: int,
 ) -> tuple[Array, tuple[Array, Array, Array]]:  # fmt: skip
-    """Solve with the gains eliminated first; (3, unknowns), and sigmas of u, b and b - green's."""
-    dense, pictures = sizes
+    """Solve with the gains eliminated, or held; (3, unknowns), and sigmas of u, b, b - green's."""
     count = dense // 3
     mixed = matrix[:dense, dense:]
-    block = splu((matrix[dense:, dense:] + diags_array(gains)).tocsc())
-    solved = block.solve(np.column_stack([mixed.T.toarray(), right[dense:]]))
-    taken = mixed @ solved
-    kept = matrix[:dense, :dense].toarray() - taken[:, :-1]
+    kept, ends = matrix[:dense, :dense].toarray(), right[:dense] + np.tile(prior[1], 3)
+    if held is None:
+        block = splu((matrix[dense:, dense:] + diags_array(gains)).tocsc())
+        solved = block.solve(np.column_stack([mixed.T.toarray(), right[dense:]]))
+        taken = mixed @ solved
+        kept, ends = kept - taken[:, :-1], ends - taken[:, -1]
+    else:
+        ends = ends - mixed @ held
     for c in range(3):
         at = slice(c * count, (c + 1) * count)
         kept[at, at] += prior[0]
@@ -303,12 +309,11 @@ def _eliminated(
         looks[c * count + nodes : c * count + 2 * nodes, c] = 1.0 / nodes
         looks[(c + 1) * count + _B, [3 + c, 6 + c]] = 1.0
         looks[(GREEN + 1) * count + _B, 6 + c] -= 1.0
-    ends = right[:dense] + np.tile(prior[1], 3) - taken[:, -1]
     both = solve_symmetric(kept, np.column_stack([ends, looks]))
     x = both[:, 0]
     sigmas = np.sqrt(np.maximum((looks * both[:, 1:]).sum(axis=0), 0.0))
-    gain = solved[:, -1] - (solved[:, :-1] * x).sum(axis=1)
-    solution = np.concatenate([x.reshape(3, count), gain.reshape(3, pictures)], axis=1)
+    gain = held if held is not None else solved[:, -1] - (solved[:, :-1] * x).sum(axis=1)
+    solution = np.concatenate([x.reshape(3, count), gain.reshape(3, -1)], axis=1)
     return solution, (sigmas[:3], sigmas[3:6], sigmas[6:])
 
 
