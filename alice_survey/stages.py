@@ -33,6 +33,7 @@ LOOSE_FOLDERS = ("quality", "reference", "against")
 """Folders that commands write next to those of the stages, and that a report shows."""
 CONTROL_FILES = ("control.csv", "picks.csv", "markers.csv")
 SCALE_FILE = "scale.json"
+COLOUR_FILE = "colour_reference.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -392,7 +393,7 @@ def _mosaic_inputs(workspace: Path) -> list[Path]:
     dense = workspace / "dense"
     planes = sorted((dense / "planes").glob("*/dem.tif"))
     about = _there(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
-    about += _there(dense / "moving.csv")
+    about += _there(dense / "moving.csv", workspace / COLOUR_FILE)
     return [dense / "dem.tif", *planes, *about, *_model_inputs(workspace)]
 
 
@@ -687,7 +688,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="mosaic",
         command="reconstruct",
         about="the orthomosaic, painted on the surface",
-        version=7,
+        version=8,
         work="reconstruct.mosaic.run:run_mosaic",
         takes=("reconstruct", "water", "area.seafloor_depth_m"),
         needs=("image", "placing", "dense"),

@@ -192,6 +192,12 @@ PARTS = (
         long=True,
     ),
     Part(
+        name="colour",
+        module="colour",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="real-pictures",
         module="real_pictures",
         arguments=lambda settings, work: (str(settings.data), str(work)),

@@ -45,7 +45,7 @@ _NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
 SAMPLES_PER_FACT = 20.0
 """Samples of one pair of pictures that together count as much as one independent one."""
 _ROUNDS = 6
-_FALL_OFF_SIGMA = 4.0
+FALL_OFF_SIGMA = 4.0
 """Expected logarithm of the light lost over the middle range."""
 _SCENE_SIGMA = 0.5
 """Spread of the sea floor's own logarithmic brightness from picture to picture."""
@@ -261,7 +261,7 @@ def solve_patterns(
     if samples.ranges is not None and len(samples.views):
         middle = float(np.median(samples.ranges))
     equations = _equations(samples, camera_of, len(names))
-    bends = _prior(len(names), _FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
+    bends = _prior(len(names), FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
     pull, pulled = _typical(nodes, camera_of, len(names))
     brightness, known_gain = _brightness(nodes, camera_of, len(names))
     levels = samples.levels.astype(np.float64)
@@ -331,8 +331,8 @@ def node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]
     return nodes, weights
 
 
-def _prior(cameras: int, fall_off_sigma: float) -> Array:
-    """Normal matrix of smooth patterns around 0, and of a fall-off, last."""
+def bending() -> Array:
+    """Normal matrix (nodes, nodes) of the second differences over a picture."""
     rows, columns = GRID
     number = np.arange(rows * columns).reshape(rows, columns)
     triples = np.concatenate(
@@ -343,7 +343,19 @@ def _prior(cameras: int, fall_off_sigma: float) -> Array:
     )
     bend = np.zeros((len(triples), rows * columns))
     np.put_along_axis(bend, triples, np.array([[1.0, -2.0, 1.0]]) / _BEND_SIGMA, axis=1)
-    one = bend.T @ bend + np.eye(rows * columns) / _NODE_SIGMA**2
+    found: Array = bend.T @ bend
+    return found
+
+
+def around_zero() -> Array:
+    """Normal matrix (nodes, nodes) of a smooth pattern around 0."""
+    found: Array = bending() + np.eye(GRID[0] * GRID[1]) / _NODE_SIGMA**2
+    return found
+
+
+def _prior(cameras: int, fall_off_sigma: float) -> Array:
+    """Normal matrix of smooth patterns around 0, and of a fall-off, last."""
+    one = around_zero()
     matrix = np.zeros((cameras * len(one) + 1,) * 2)
     for camera in range(cameras):
         at = slice(camera * len(one), (camera + 1) * len(one))

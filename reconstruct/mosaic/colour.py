@@ -4,13 +4,13 @@ Light that reaches the camera is that of the sea floor, weakened, and that which
 back (Akkaynak & Treibitz 2018, "A revised underwater image formation model"; the direct and the
 backscattered light have separate coefficients):
 
-    I = J exp(m(camera, place) + g(picture) - b (z - z0)) + A(camera, place)
+    I = J exp(m(camera, place) + g(picture) - b (z - z0)) (z0 / z)^s + A(camera, place, z)
 
-with z the distance, per channel, in linear light. m, g and b follow from pairs of views of one spot
-(`light`). A is the light of the darkest pixels that each place of the picture ever shows (dark
-pixels, as in Akkaynak & Treibitz 2019, "Sea-thru"; a robust additive map of the survey, as in
-Koeser et al. 2021), times a share per channel that the pairs themselves give: of two views of a
-bright and of a dark spot a wrong A fits at most one.
+with z the distance, per channel, in linear light. All follow from pairs of views of one spot:
+b and A by `light.water`, then m and g by `light.solve`. White is that of a reference in a picture
+where there is one. Otherwise it is between two guesses that each are off by as much: a lamp and a
+camera that are white together, whose light the water weakened by exp(-b z0), and a sea floor whose
+bright spots are grey.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,6 @@ from alice_survey.base.run import progress
 from reconstruct.light.solve import (
     BRIGHT_PERCENT,
     GRID,
-    SAMPLES_PER_FACT,
     LightModel,
     LightSamples,
     bilinear,
@@ -36,8 +35,10 @@ from reconstruct.light.solve import (
     node_weights,
     solve_patterns,
 )
-from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
+from reconstruct.light.water import GREEN, LEAST_LEFT, WaterLight, grown, solve_water
+from reconstruct.mosaic.finish import LEAST_RANGE, MOST_RANGE
 from reconstruct.mosaic.picture_measures import PictureMeasures
+from reconstruct.mosaic.reference import ReferencePatch
 
 Float32 = NDArray[np.float32]
 Colour = Literal["even", "water", "raw"]
@@ -48,14 +49,12 @@ _DARK_QUANTILE = 0.15
 """Quantile of the pictures' darkest light at a place, which a few black outliers do not move."""
 _GAIN_SIGMA = 1.0
 """Expected size of the logarithm of a picture's own light: a stop and a half either way."""
-_SHARES = np.linspace(0.0, 1.0, 6)
 _MOST_SAMPLES = 20_000
-"""Most samples that the share of the additive light is found from."""
-_LARGEST_SIGMA = 0.25
-"""Largest sigma of a share that is used."""
-_LARGEST_WATER_SIGMA = 0.15
-"""Largest sigma of the logarithm of the colour ratios lost to the water, for a correction by them.
-"""
+"""Most samples that the light of the water is found from."""
+_WHITE_SIGMA = 0.2
+"""Sigma of the logarithm of a colour's ratio to green, of lamp and camera, and of the sea floor."""
+_NEAREST = 8
+"""Samples next to a patch that give its range."""
 _LARGEST_LIFT = 30.0
 _BRIGHT_LIGHT = 0.68
 _MIDDLE_LIGHT = 0.22
@@ -73,13 +72,8 @@ class ColourModel:
     """What turns the linear light of pictures into that of the sea floor."""
 
     light: LightModel
-    added: Mapping[str, Array]
-    """Per camera (rows, columns, 3): light that the water adds at the nodes, BGR."""
-    shares: Array
-    """(3,) share of the darkest pixels' light that is taken to be the water's; 0 where not known.
-    """
-    share_sigmas: Array
-    """(3,) sigmas of the shares."""
+    water: WaterLight | None
+    """Light that the water adds; None where none is taken away."""
     notes: tuple[str, ...]
     black: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) level of the corrected light that is shown as black; white stays white."""
@@ -88,14 +82,36 @@ class ColourModel:
         """(rows, columns, 6) factors, and light that is taken away before, at the nodes, BGR."""
         lift = np.exp(-(self.light.patterns[camera] + self.light.gains[image]))
         lift = np.clip(lift, 1.0 / _LARGEST_LIFT, _LARGEST_LIFT) * self.light.white
-        both: Float32 = np.concatenate([lift, self.added[camera]], axis=2).astype(np.float32)
+        added = np.zeros_like(lift) if self.water is None else self.water.added[camera]
+        both: Float32 = np.concatenate([lift, added], axis=2).astype(np.float32)
         return np.ascontiguousarray(both)
 
     @property
-    def law(self) -> Float32:
-        """(10,) fall-off and middle range, light that is black, factors: see `finish_colours`."""
+    def growth(self) -> Array:
+        """(3,) coefficient with which the light that the water adds grows; 0 where it does not."""
+        return np.zeros(3) if self.water is None else self.water.growth
+
+    @property
+    def spread(self) -> float:
+        """Power of range by which light spreads, apart from the fall-off."""
+        return 0.0 if self.water is None else self.water.spread
+
+    def weakening(self, ranges: NDArray[np.floating[Any]]) -> Array:
+        """(..., 3) logarithm of the light at ranges (...) over that at the middle range."""
         model = self.light
-        values = [*model.fall_off, model.middle_range, *self.black, *(1.0 / (1.0 - self.black))]
+        found = -(np.asarray(ranges)[..., None] - model.middle_range) * model.fall_off
+        if self.spread:
+            found = found - self.spread * np.log(ranges / model.middle_range)[..., None]
+        return np.asarray(found)
+
+    @property
+    def law(self) -> Float32:
+        """(14,) numbers of the correction: see `finish_colours`."""
+        model = self.light
+        values = [
+            *model.fall_off, model.middle_range, *self.black, *(1.0 / (1.0 - self.black)),
+            *self.growth, self.spread,
+        ]  # fmt: skip
         return np.array(values, np.float32)
 
     def corrected(
@@ -113,13 +129,14 @@ class ColourModel:
         model = self.light
         x, y = np.ascontiguousarray((places * np.array([GRID[1] - 1, GRID[0] - 1], np.float32)).T)
         found = bilinear(self.nodes(camera, image), x, y).reshape(*light.shape[:2], 6)
-        left = np.maximum(light - found[..., 3:], LEAST_LEFT * light)
-        result: Float32 = left * found[..., :3]
+        ranges = np.where(np.isfinite(ranges), ranges, np.float32(model.middle_range))
+        added = found[..., 3:]
+        if self.growth.any():
+            added = added * grown(self.growth, ranges, model.middle_range).astype(np.float32)
+        result: Float32 = np.maximum(light - added, LEAST_LEFT * light) * found[..., :3]
         if model.fall_off.any():
-            beyond = np.nan_to_num(ranges - np.float32(model.middle_range))
-            for channel in range(3):
-                fall_off = np.float32(model.fall_off[channel])
-                result[..., channel] *= np.clip(np.exp(fall_off * beyond), LEAST_RANGE, MOST_RANGE)
+            back = np.exp(-self.weakening(ranges)).astype(np.float32)
+            result *= np.clip(back, LEAST_RANGE, MOST_RANGE)
         return result
 
     def to_json(self) -> dict[str, Any]:
@@ -130,16 +147,24 @@ class ColourModel:
             "fall_off_sigma_blue_green_red": self.light.fall_off_sigma,
             "black_blue_green_red": self.black,
             "middle_range": float(self.light.middle_range),
-            "added_light_share_blue_green_red": self.shares,
-            "added_light_share_sigma_blue_green_red": self.share_sigmas,
         }
+        if self.water is not None:
+            values |= {
+                "added_light_share_blue_green_red": self.water.share,
+                "added_light_share_sigma_blue_green_red": self.water.share_sigma,
+                "spread": self.water.spread,
+                "added_light_growth_per_unit_blue_green_red": self.water.growth,
+            }
         found: dict[str, Any] = json_values(values)
         return found
 
 
 @progress.step("even the light")
 def solve_colour(
-    wanted: Colour, samples: LightSamples, facts: Sequence[PictureMeasures]
+    wanted: Colour,
+    samples: LightSamples,
+    facts: Sequence[PictureMeasures],
+    references: Sequence[ReferencePatch] = (),
 ) -> ColourModel:
     """Find the model from spots that two views see.
 
@@ -147,52 +172,50 @@ def solve_colour(
         wanted: `raw`: pictures as they are; `even`: without m, g and b; `water`: without A too.
         samples: linear light; its logarithm and ranges.
         facts: of all pictures.
+        references: patches of known reflectance; where there are any, light is reflectance.
     """
     nothing = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
+    gains = {fact.image: np.zeros(3) for fact in facts}
     model = ColourModel(
-        light=LightModel(
-            patterns=nothing, gains={fact.image: np.zeros(3) for fact in facts}, white=np.ones(3)
-        ),
-        added=nothing,
-        shares=np.zeros(3),
-        share_sigmas=np.full(3, np.nan),
+        light=LightModel(patterns=nothing, gains=gains, white=np.ones(3)),
+        water=None,
         notes=("colours: as the pictures show them",),
     )
     if wanted == "raw":
         return model
-    notes = []
-    if wanted == "water":
-        added, shares, sigmas, note = _added(samples, facts)
-        model = replace(model, added=added, shares=shares, share_sigmas=sigmas)
+    notes = ["colours: light of lamp, lens and range evened out over the survey"]
+    if wanted == "water" and samples.ranges is not None and len(samples.views):
+        water, note = _water(samples, facts)
+        model = replace(
+            model,
+            water=water,
+            light=replace(
+                model.light,
+                fall_off=water.fall_off,
+                fall_off_sigma=water.fall_off_sigma,
+                middle_range=water.middle_range,
+            ),
+        )
         notes.append(note)
-    cleaned = without(samples, model.added, facts)
-    patterns = _patterns(cleaned, model.added, facts)
-    model = replace(model, light=patterns)
-    neutral = _unweakened(patterns) if wanted == "water" else None
-    white = _white(cleaned, model, facts, neutral)
-    if neutral is None:
-        notes.append(
-            "colours: light of lamp, lens and range evened out over the survey; one factor per "
-            "colour for the whole survey makes what is bright in it neutral"
-        )
-        if wanted == "water":
-            notes.append(
-                "colours: ranges differ too little to find how much the water weakens each colour"
-            )
-    else:
-        notes.append(
-            "colours: light of lamp, lens and range evened out over the survey; each colour "
-            "strengthened by what the water took over the middle range, as under a white lamp"
-        )
+    cleaned = _without_water(samples, model, facts)
+    model = replace(model, light=_patterns(cleaned, model, facts))
+    if found := _reference_white(samples, model, facts, references):
+        white, note = found
+        light = replace(model.light, white=white)
+        return replace(model, light=light, notes=(*notes, note))
+    white, note = _white(cleaned, model, facts)
+    notes.append(note)
     notes.append(
         "brightness: one factor puts the survey's median at most at 22 % and 98 % of it below "
         "68 % of white; sRGB"
     )
-    model = replace(model, light=replace(patterns, white=white))
-    black = _black(model, facts)
+    model = replace(model, light=replace(model.light, white=white))
+    cleared = model.water is not None and model.water.share.any()
+    black = np.zeros(3) if cleared else _black(model, facts)
     if black.any():
         grow = _brighter(cleaned, model, facts, black)
-        model = replace(model, light=replace(patterns, white=white * grow), black=black * grow)
+        light = replace(model.light, white=white * grow)
+        model = replace(model, light=light, black=black * grow)
         notes.append(
             f"contrast: light below {100 * _BLACK_SHARE:.0f} % of what the survey's darkest pixels "
             "show is black; one straight line from there to white"
@@ -200,21 +223,60 @@ def solve_colour(
     return replace(model, notes=tuple(notes))
 
 
+def _water(samples: LightSamples, facts: Sequence[PictureMeasures]) -> tuple[WaterLight, str]:
+    """What the water adds and takes, and a note."""
+    dark = darkest(facts)
+    few = dark is None
+    if dark is None:
+        dark = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
+    thin = _part(samples, slice(None, None, max(1, -(-len(samples.views) // _MOST_SAMPLES))))
+    water = solve_water(thin, dark, [fact.camera for fact in facts])
+    if few:
+        note = (
+            f"colours: fewer than {_FEWEST_PICTURES} pictures of a camera show each place of it; "
+            "no light of the water taken away"
+        )
+    elif not water.share.any():
+        words = ", ".join(f"{s:.2f}" for s in water.share_sigma)
+        note = (
+            f"colours: overlaps do not determine the water's light (sigma of its share {words} for "
+            "blue, green, red); none taken away"
+        )
+    else:
+        note = (
+            "colours: light that the water adds taken away, as overlaps determine it: a share of "
+            "what the darkest pixels at each place of the pictures show, which grows with range"
+        )
+    return water, note
+
+
 def _patterns(
-    cleaned: LightSamples, added: Mapping[str, Array], facts: Sequence[PictureMeasures]
+    cleaned: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
 ) -> LightModel:
-    """The light of lamps, pictures and ranges, once that which the water adds is taken away."""
+    """The light of lamps and pictures, once that which the water adds is taken away.
+
+    The fall-off with range too, unless it is known.
+    """
     nodes = np.exp(np.stack([fact.nodes for fact in facts]))
-    left = nodes - np.stack([added[fact.camera] for fact in facts])
+    water, known = model.water, model.light
+    added = np.zeros_like(nodes)
+    if water is not None:
+        added = np.stack([water.added[fact.camera] for fact in facts])
+        levels = cleaned.levels - model.weakening(np.asarray(cleaned.ranges))
+        cleaned = replace(cleaned, levels=levels.astype(np.float32), ranges=None)
+    left = nodes - added
     with np.errstate(invalid="ignore"):
         usable = left > LEAST_LEFT * nodes
-    return solve_patterns(
+    found = solve_patterns(
         cleaned,
         np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan),
         [fact.image for fact in facts],
         [fact.camera for fact in facts],
         _GAIN_SIGMA,
     )
+    if water is None:
+        return found
+    return replace(known, patterns=found.patterns, gains=found.gains)
 
 
 def _black(model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
@@ -249,26 +311,24 @@ def _brighter(
     )
 
 
-def _weakening(samples: LightSamples, light: LightModel, facts: Sequence[PictureMeasures]) -> Array:
-    """(N, 2, 3) logarithm by which light weakens what both views show of the samples."""
-    gains = np.stack([light.gains[fact.image] for fact in facts])
-    factor = sampled(samples, light.patterns, facts) + gains[samples.views]
-    if samples.ranges is not None:
-        factor = factor - (samples.ranges - light.middle_range)[..., None] * light.fall_off
-    return factor
-
-
 def _levels(samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
     """(N, 3) light of the first views of samples, evened out, white not yet balanced."""
-    return np.asarray(np.exp(samples.levels[:, 0] - _weakening(samples, model.light, facts)[:, 0]))
+    gains = np.stack([model.light.gains[fact.image] for fact in facts])
+    factor = sampled(samples, model.light.patterns, facts)[:, 0] + gains[samples.views[:, 0]]
+    if samples.ranges is not None:
+        factor = factor + model.weakening(samples.ranges[:, 0])
+    return np.asarray(np.exp(samples.levels[:, 0] - factor))
 
 
-def without(
-    samples: LightSamples, added: Mapping[str, Array], facts: Sequence[PictureMeasures]
+def _without_water(
+    samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
 ) -> LightSamples:
     """Samples minus the light that the water adds; where too little is left they are dropped."""
+    if model.water is None:
+        return samples
     light = np.exp(samples.levels.astype(np.float64))
-    left = light - sampled(samples, added, facts)
+    beyond = grown(model.growth, np.asarray(samples.ranges), model.light.middle_range)
+    left = light - sampled(samples, model.water.added, facts) * beyond
     kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
     return replace(_part(samples, kept), levels=np.log(left[kept]).astype(np.float32))
 
@@ -312,104 +372,66 @@ def darkest(facts: Sequence[PictureMeasures]) -> dict[str, Array] | None:
     return maps
 
 
-def _added(
-    samples: LightSamples, facts: Sequence[PictureMeasures]
-) -> tuple[Mapping[str, Array], Array, Array, str]:
-    """The water's light, its share of the darkest pixels' per channel with sigma, and a note."""
-    nothing = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
-    unknown = np.full(3, np.nan)
-    dark = darkest(facts)
-    if dark is None:
-        note = (
-            f"colours: fewer than {_FEWEST_PICTURES} pictures of a camera show each place of it; "
-            "no light of the water taken away"
-        )
-        return nothing, np.zeros(3), unknown, note
-    thin = _part(samples, slice(None, None, max(1, -(-len(samples.views) // _MOST_SAMPLES))))
-    cost = np.empty((len(_SHARES), 3))
-    for n, share in enumerate(_SHARES):
-        cost[n] = _misfit(thin, {name: share * level for name, level in dark.items()}, facts)
-    shares, sigmas = np.zeros(3), unknown.copy()
-    for channel in range(3):
-        shares[channel], sigmas[channel] = _lowest(cost[:, channel])
-    known = sigmas <= _LARGEST_SIGMA
-    if not known.all():
-        words = ", ".join(f"{s:.2f}" for s in sigmas)
-        note = (
-            f"colours: overlaps do not determine the water's light (sigma of its share {words} for "
-            "blue, green, red); none taken away"
-        )
-        return nothing, np.zeros(3), sigmas, note
-    note = (
-        "colours: light that the water adds taken away: what the darkest pixels at each place of "
-        "the pictures show, times a share per colour that overlaps determine"
-    )
-    return {name: shares * level for name, level in dark.items()}, shares, sigmas, note
-
-
-def _misfit(
-    samples: LightSamples, added: Mapping[str, Array], facts: Sequence[PictureMeasures]
-) -> Array:
-    """(3,) twice the negative logarithm of the likelihood of an additive light, robust.
-
-    Of two views I1 = M1 J + A1 and I2 = M2 J + A2 the difference (I1 - A1) M2 - (I2 - A2) M1 holds
-    only noise, whose size is that of I and does not shrink as A grows.
-    """
-    light = np.exp(samples.levels.astype(np.float64))
-    left = light - sampled(samples, added, facts)
-    model = _patterns(without(samples, added, facts), added, facts)
-    factor = np.exp(_weakening(samples, model, facts))
-    rest = left[:, 0] * factor[:, 1] - left[:, 1] * factor[:, 0]
-    size = np.hypot(light[:, 0] * factor[:, 1], light[:, 1] * factor[:, 0])
-    # for errors of Laplace's distribution, whose size the rest itself gives
-    rest = np.abs(rest / size)
-    mean = np.minimum(rest, 4.0 * np.median(rest, axis=0)).mean(axis=0) + 1e-9
-    return np.asarray(2.0 * len(rest) / SAMPLES_PER_FACT * np.log(mean))
-
-
-def _lowest(cost: Array) -> tuple[float, float]:
-    """Where a parabola through the costs of `_SHARES` is lowest between 0 and 1, and its sigma."""
-    best = int(np.clip(np.argmin(cost), 1, len(cost) - 2))
-    step = _SHARES[1] - _SHARES[0]
-    curve = (cost[best - 1] - 2.0 * cost[best] + cost[best + 1]) / step**2
-    if not curve > 0:
-        curve = max(curve, np.polyfit(_SHARES, cost, 2)[0] * 2.0)
-    if not curve > 0:
-        return 0.0, float("inf")
-    slope = (cost[best + 1] - cost[best - 1]) / (2.0 * step)
-    at = float(np.clip(_SHARES[best] - slope / curve, 0.0, 1.0))
-    return at, float(np.sqrt(2.0 / curve))
-
-
-def _unweakened(light: LightModel) -> Array | None:
-    """(3,) factors, of mean 1, by which the water weakened colours over the middle range.
-
-    Spreading weakens all colours alike, so that only their differences say something of the water.
-
-    Returns:
-        None where the differences are not known well enough.
-    """
-    sigma = np.hypot(light.fall_off_sigma[[0, 2]], light.fall_off_sigma[1]) * light.middle_range
-    if not (light.middle_range > 0 and (sigma < _LARGEST_WATER_SIGMA).all()):
-        return None
-    factors = np.exp(light.fall_off * light.middle_range)
-    unweakened: Array = factors / factors.mean()
-    return unweakened
-
-
-def _white(
+def _reference_white(
     samples: LightSamples,
     model: ColourModel,
     facts: Sequence[PictureMeasures],
-    neutral: Array | None,
-) -> Array:
-    """Factors that make what is bright neutral, and the survey light without burning out.
+    references: Sequence[ReferencePatch],
+) -> tuple[Array, str] | None:
+    """Factors that make light the reflectance of patches, and a note; None where none is seen."""
+    cameras = {fact.image: fact.camera for fact in facts}
+    numbers = {fact.image: number for number, fact in enumerate(facts)}
+    ratios = []
+    for patch in references:
+        near = _range_near(samples, numbers[patch.image], patch.place)
+        if near is None:
+            continue
+        shown = model.corrected(
+            patch.light[None, None].astype(np.float32), cameras[patch.image], patch.image,
+            patch.place[None], np.full((1, 1), near, np.float32),
+        )  # fmt: skip
+        ratios.append(np.log(patch.reflectance / shown[0, 0]))
+    if not ratios:
+        return None
+    apart = np.exp(np.std(ratios, axis=0).max()) - 1.0
+    note = (
+        f"colours: levels are reflectances (1 is white; sRGB) as {len(ratios)} patches of known "
+        f"reflectance have them, which differ by {100 * apart:.1f} % rms"
+    )
+    return np.exp(np.mean(ratios, axis=0)), note
 
-    With `neutral` given, colours are multiplied by that instead of being made neutral.
-    """
+
+def _range_near(samples: LightSamples, view: int, place: NDArray[np.float32]) -> float | None:
+    """The range at a place of a view: the median of the samples next to it."""
+    which, side = np.nonzero(samples.views == view)
+    if not len(which):
+        return None
+    if samples.ranges is None:
+        return float("nan")
+    away = np.hypot(*(samples.places[which, side] - place).T)
+    next_to = np.argsort(away)[:_NEAREST]
+    return float(np.median(samples.ranges[which, side][next_to]))
+
+
+def _white(
+    samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
+) -> tuple[Array, str]:
+    """Factors that balance colours and light the survey without burning out, and a note."""
     if not len(samples.views):
-        return np.ones(3)
+        return np.ones(3), "colours: no overlaps; not balanced"
     level = _levels(samples, model, facts)
-    if neutral is None:
-        neutral = neutral_factors(level)
-    return neutral * brightening(level * neutral, _BRIGHT_LIGHT, _MIDDLE_LIGHT)
+    neutral = neutral_factors(level)
+    note = "colours: one factor per colour for the whole survey makes what is bright in it neutral"
+    water = model.water
+    if water is not None:
+        taken = (water.fall_off - water.fall_off[GREEN]) * water.middle_range
+        own = _WHITE_SIGMA**-2
+        weight = 1.0 / (_WHITE_SIGMA**2 + (water.to_green_sigma * water.middle_range) ** 2)
+        grey = np.log(neutral / neutral[GREEN])
+        neutral = np.exp((weight * taken + own * grey) / (weight + own))
+        neutral = neutral / neutral.mean()
+        note = (
+            "colours: white is the weighted mean of two guesses: the water took from a white lamp "
+            "over the middle range what overlaps show, and what is bright in the survey is grey"
+        )
+    return neutral * brightening(level * neutral, _BRIGHT_LIGHT, _MIDDLE_LIGHT), note

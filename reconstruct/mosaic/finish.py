@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
+from reconstruct.light.water import LEAST_LEFT
 from reconstruct.mosaic.picture_measures import encoded
 
 Float32 = NDArray[np.float32]
 
-LEAST_LEFT = np.float32(0.05)
-"""Share of the light that stays at least when the water's is taken away."""
 LEAST_RANGE, MOST_RANGE = np.float32(0.2), np.float32(5.0)
 """Factors by which light is changed at least and at most for its distance."""
 _ROOT_STEPS = np.float32(2048)
@@ -53,8 +52,9 @@ def finish_colours(
         ranges: (h, w); NaN counts as the middle one.
         nodes: (rows, columns, 6) factors, and light to take away first, BGR each, at nodes spread
             evenly over the picture.
-        law: (10,) by how much the logarithm of BGR falls for each unit of range, the middle range,
-            light that is black, BGR, and factors of the rest, BGR.
+        law: (14,) by how much the logarithm of BGR falls for each unit of range, the middle range,
+            light that is black, BGR, factors of the rest, BGR, coefficients with which the light
+            taken away grows with range, BGR, and the power of range by which light spreads.
         size: width and height of the picture as taken, px.
         factor: (H, W, 3) at the middles of cells.
         first_factor: row and column of the first pixel's centre in `factor`.
@@ -66,6 +66,11 @@ def finish_colours(
     high, wide = nodes.shape[0] - 2, nodes.shape[1] - 2
     f_high, f_wide = factor.shape[0] - 1, factor.shape[1] - 1
     weakened = law[0] != 0.0 or law[1] != 0.0 or law[2] != 0.0
+    growing = law[10] != 0.0 or law[11] != 0.0 or law[12] != 0.0
+    whole = np.ones(3, np.float32)
+    if growing:
+        for c in range(3):
+            whole[c] = math.expm1(-law[10 + c] * law[3])
     node_x, node_y = np.float32((wide + 1) / size[0]), np.float32((high + 1) / size[1])
     half = np.float32(0.5)
     top_root = np.float32(len(curve) - 1) / _ROOT_STEPS
@@ -85,9 +90,12 @@ def finish_colours(
             f_left = min(int(u2), max(f_wide - 1, 0))
             f_right = min(f_left + 1, f_wide)
             f_p = np.float32(u2 - f_left)
-            beyond = np.float32(0.0)
-            if weakened and not math.isnan(ranges[row, column]):
-                beyond = ranges[row, column] - law[3]
+            distance = ranges[row, column]
+            if math.isnan(distance):
+                distance = law[3]
+            spread = np.float32(1.0)
+            if law[13] != 0.0:
+                spread = np.float32((distance / law[3]) ** law[13])
             for c in range(3):
                 above = nodes[top, left, c] * (1 - p) + nodes[top, left + 1, c] * p
                 below = nodes[top + 1, left, c] * (1 - p) + nodes[top + 1, left + 1, c] * p
@@ -98,10 +106,12 @@ def finish_colours(
                 above = factor[f_row, f_left, c] * (1 - f_p) + factor[f_row, f_right, c] * f_p
                 below = factor[f_below, f_left, c] * (1 - f_p) + factor[f_below, f_right, c] * f_p
                 shown = light[row, column, c]
+                if growing:
+                    added *= np.float32(math.expm1(-law[10 + c] * distance)) / whole[c]
                 shown = max(shown - added, LEAST_LEFT * shown)
                 shown *= lift * (above * (1 - f_q) + below * f_q)
                 if weakened:
-                    farther = np.float32(math.exp(law[c] * beyond))
+                    farther = np.float32(math.exp(law[c] * (distance - law[3]))) * spread
                     if farther < LEAST_RANGE:
                         farther = LEAST_RANGE
                     if farther > MOST_RANGE:

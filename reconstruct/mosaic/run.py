@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from reconstruct.mosaic.paint import (
     tones_path,
 )
 from reconstruct.mosaic.picture_measures import PictureMeasures, measure_picture, outline_view
+from reconstruct.mosaic.reference import ReferencePatch, read_references
 from reconstruct.mosaic.tools import MosaicSetup
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
@@ -92,12 +93,14 @@ def run_mosaic(
     measure = partial(measure_picture, workspace, scratch)
     facts = list(executor.map(measure, model.views, label="measure pictures", task_mib=_TASK_MIB))
     grey = all(fact.grey for fact in facts)
+    references = read_references(workspace, [fact.image for fact in facts])
     sea, dispersion = _dispersion(workspace, reconstruct.dispersion, water, seafloor_depth_m, grey)
     painting = Painting(
         workspace=workspace,
         model=model,
         scratch=scratch,
         facts=facts,
+        references=references,
         water=sea,
         dispersion=dispersion,
         reconstruct=reconstruct,
@@ -127,6 +130,7 @@ class Painting:
     """In the world."""
     scratch: Path
     facts: Sequence[PictureMeasures]
+    references: Sequence[ReferencePatch]
     water: Water | None
     dispersion: dict[str, Any]
     """What `mosaic.json` says about the water."""
@@ -172,10 +176,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     views = _seen_views(model, painting.facts)
     ground = footprints(model.views, heights)
     blocks = seam_blocks(grid, ground)
-    colour = _solve(
-        model, survey, painting.facts, views, blocks, reconstruct.colour, executor,
-        label("compare light"),
-    )  # fmt: skip
+    colour = _solve(painting, model, survey, views, blocks, label("compare light"))
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
         return [
@@ -263,16 +264,15 @@ def _seen_views(model: SparseModel, facts: Sequence[PictureMeasures]) -> list[Se
 
 
 def _solve(
+    painting: Painting,
     model: SparseModel,
     survey: MosaicSetup,
-    facts: Sequence[PictureMeasures],
     views: Sequence[SeenView],
     blocks: Sequence[Block],
-    wanted: Literal["even", "water", "raw"],
-    executor: Executor,
     label: str,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
+    wanted, facts = painting.reconstruct.colour, painting.facts
     if wanted == "raw":
         return solve_colour(wanted, joined_samples([]), facts)
     width = float(np.median([view.pinhole.width_px for view in model.views]))
@@ -287,9 +287,9 @@ def _solve(
         )
         for block in blocks
     ]
-    found = executor.map(compare_block, compare, label=label, task_mib=_TASK_MIB)
+    found = painting.executor.map(compare_block, compare, label=label, task_mib=_TASK_MIB)
     parts = [part for part in found if len(part.views)]
-    return solve_colour(wanted, joined_samples(parts), facts)
+    return solve_colour(wanted, joined_samples(parts), facts, painting.references)
 
 
 def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:

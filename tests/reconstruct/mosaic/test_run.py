@@ -14,6 +14,7 @@ from alice_survey.stages import spec
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
+from reconstruct.mosaic.picture_measures import encoded, linear_table
 from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
@@ -163,6 +164,50 @@ def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
     painted = rgba[:3][:, rgba[3] > 0]
     assert np.ptp(np.percentile(painted, [0.5, 99.5])) < 8  # 60 without any correction
     assert 100 < np.median(painted) < 140
+
+
+def patches(north: np.ndarray, east: np.ndarray) -> np.ndarray:
+    """Bright and dark spots without edges, of slowly changing colour."""
+    level = 90.0 + 35.0 * np.sin(17.0 * north) * np.cos(13.0 * east)
+    return level[..., None] * np.stack([0.8 + 0.1 * np.sin(3.0 * east), 1.0 + 0.0 * east,
+                                        1.1 - 0.1 * np.cos(4.0 * north)], axis=-1)  # fmt: skip
+
+
+def test_borders_of_blocks_and_tiles_show_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One model of colours serves all blocks: many small ones paint what a single one does."""
+    scene = Scene(depth_of=terraced, paint=patches)
+    north, east = (c.ravel() for c in np.meshgrid([-0.1, 0.2, 0.5], [-0.1, 0.1]))
+    views = stereo_views(north, east, heading_deg=30.0)
+    reconstruct = CONFIG.reconstruct.model_copy(update={"colour": "water"})
+    config = CONFIG.model_copy(update={"reconstruct": reconstruct})
+    painted = {}
+    for name, block_px in (("one", 2048), ("many", 128)):
+        folder = tmp_path / name
+        make_workspace(folder, views, scene)
+        for view in views:  # a lamp ahead and a veil
+            path = folder / "images" / view.image
+            picture = linear_table()[cv2.imread(str(path))]
+            x = np.linspace(-1.0, 1.0, picture.shape[1])[:, None]
+            lit = picture * np.exp(-0.5 * x**2) * [0.6, 1.0, 0.9] + np.array([0.02, 0.015, 0.01])
+            cv2.imwrite(str(path), np.rint(encoded(lit.astype(np.float32))).astype(np.uint8))
+        monkeypatch.setattr(run, "_LABEL_PX", block_px)
+        monkeypatch.setattr(run, "_TILE_PX", block_px)
+        monkeypatch.setattr(run, "_LABEL_MARGIN_PX", 64)
+        assert spec("mosaic").make(folder, config, SERIAL)
+        painted[name], _, _ = read(folder)
+    known = (painted["one"][3] > 0) & (painted["many"][3] > 0)
+    assert known.mean() > 0.5
+    apart = np.where(known, painted["many"][:3] - painted["one"][:3], np.nan)
+    assert np.nanpercentile(np.abs(apart), 99) < 10
+    for axis in (1, 2):  # blocks of their own give slightly other samples, but no step
+        steps = np.abs(np.diff(apart, axis=axis))
+        at = np.arange(steps.shape[axis]) % 128 == 127
+        border = np.nanmean(np.compress(at, steps, axis=axis))
+        inside = np.nanmean(np.compress(~at, steps, axis=axis))
+        assert border < inside + 0.3
+        assert inside < 1.0
 
 
 def test_no_picture_over_the_surface_is_refused(tmp_path: Path):
