@@ -623,6 +623,7 @@ STAGES: tuple[StageSpec, ...] = (
             "seed": "seed",
             "feature_scale": "reconstruct.feature_scale",
             "max_features": "reconstruct.max_features",
+            "learned_features": "reconstruct.learned_features",
             "working_range_m": "reconstruct.working_range_m",
             "mapper": "reconstruct.mapper",
         },
