@@ -174,6 +174,12 @@ PARTS = (
         long=True,
     ),
     Part(
+        name="turbid",
+        module="turbid",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="mosaic",
         module="mosaic",
         arguments=lambda _, work: ("--work", str(work)),
