@@ -186,6 +186,12 @@ PARTS = (
     ),
     Part(name="facade", module="facade", arguments=_facade, long=True, needs=_need_mitsuba),
     Part(
+        name="turbid",
+        module="turbid",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="mosaic",
         module="mosaic",
         arguments=lambda _, work: ("--work", str(work)),

@@ -103,3 +103,26 @@ def vlad_slowly(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
         length = np.linalg.norm(sums[k])
         sums[k] = sums[k] / length if length > 0 else 0.0
     return sums.ravel()
+
+
+def sampled_slowly(field: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Bilinear weights of all places of a field, one place and channel at a time."""
+    rows, columns, channels = field.shape
+    found = np.zeros((len(at), channels))
+    for n, (x, y) in enumerate(at):
+        x, y = min(max(x, 0.0), columns - 1.0), min(max(y, 0.0), rows - 1.0)
+        for row in range(rows):
+            for column in range(columns):
+                weight = max(0.0, 1 - abs(x - column)) * max(0.0, 1 - abs(y - row))
+                found[n] += weight * field[row, column]
+    return found
+
+
+def false_alarms_slowly(agreeing: int, matches: int, size: tuple[int, int]) -> float:
+    """Exact binomials and powers of Moisan & Stival's count, for bands of 4 pixels on each side."""
+    from fractions import Fraction
+    from math import comb, hypot
+
+    share = Fraction(8.0 * hypot(*size)) / (size[0] * size[1])
+    power = share ** (agreeing - 7)
+    return float((matches - 7) * comb(matches, agreeing) * comb(agreeing, 7) * power)

@@ -321,6 +321,7 @@ class ReconstructConfig(Config):
 
     feature_scale: float | None = Field(None, gt=0.05, le=1)
     max_features: int = Field(8000, ge=200, le=50_000)
+    learned_features: bool = False
     working_range_m: float | None = Field(None, gt=0, le=100)
     mapper: Literal["auto", "global", "incremental"] = "auto"
     mount_sigma_deg: float = Field(0.0, ge=0, le=20)

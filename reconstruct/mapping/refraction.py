@@ -283,8 +283,11 @@ def _judge_again(
     if seen.pairs:
         scratch = new_folder(folder / "refraction")
         write_database(scratch / "database.db", seen, cam_from_rig)
+        cached = pycolmap.DatabaseCacheOptions()
+        # a picture that no larger model could use is in none, but its few matches are there
+        cached.image_names = {image.name for image in model.images.values()}
         with pycolmap.Database.open(scratch / "database.db") as database:
-            cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+            cache = pycolmap.DatabaseCache.create(database, cached)
         graph = cache.correspondence_graph
         manager = pycolmap.ObservationManager(model, graph)
         options = pycolmap.IncrementalTriangulatorOptions()

@@ -24,6 +24,7 @@ from alice_survey.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, mounted, read_rig
 from reconstruct.mapping.database import Observations, VerifiedPair
+from reconstruct.mapping.learned_ties import Taken, all_pixels, quarter_turns, with_learned
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
@@ -104,9 +105,9 @@ def _map(
     warps, distances = _warps(inputs, features, settings, executor)
     cameras, exif_focal = _cameras(inputs, warps)
     known = None if distances is None or not distances.measured else distances
-    pairs = _match_all(inputs, features, cameras, warps, known, seed, executor)
+    pairs = _match_all(inputs, features, cameras, warps, known, settings, seed, executor)
     refined = refine_tracks(
-        features,
+        all_pixels(features),
         [_grey_file(path) for path in features],
         [(i, j, pair.matches) for i, j, pair in pairs],
         executor=executor,
@@ -258,6 +259,7 @@ def _match_all(
     cameras: Mapping[str, pycolmap.Camera],
     warps: Mapping[str, PinholeWarp],
     distances: WorkingDistances | None,
+    settings: ReconstructConfig,
     seed: int,
     executor: Executor,
 ) -> list[VerifiedPair]:
@@ -294,7 +296,19 @@ def _match_all(
         )
         for i, j in pairs
     ]
-    found = executor.map(match_pair, tasks, label="matching")
+    found = list(executor.map(match_pair, tasks, label="matching"))
+    if settings.learned_features:
+        taken = [
+            Taken(
+                picture=inputs.images / record.image,
+                mask=inputs.images / record.mask if record.mask else None,
+                features=file,
+                most=settings.max_features,
+                turns=quarter_turns(record, rig),
+            )
+            for record, file in zip(inputs.records, features, strict=True)
+        ]
+        found = with_learned(taken, tasks, found, executor)
     return [
         (i, j, matches)
         for (i, j), matches in zip(pairs, found, strict=True)

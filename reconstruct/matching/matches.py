@@ -181,7 +181,7 @@ class PairMatches:
     """What COLMAP needs to know of the pair's geometry, or None where there is none."""
 
 
-def _features(path: Path) -> Features:
+def kept_features(path: Path) -> Features:
     """Features from their file; those read last are kept, as long as their file is the same."""
     stat = path.stat()
     return _kept(path, stat.st_mtime_ns, stat.st_ino)
@@ -194,7 +194,9 @@ def _kept(path: Path, _changed_ns: int, _inode: int) -> Features:
 
 def coarse_matches(task: PairTask) -> int:
     """How many of the first (largest) features of two pictures match: cheap, to choose pairs by."""
-    first, second = (_features(p).descriptors[:_COARSE_FEATURES] for p in (task.first, task.second))
+    first, second = (
+        kept_features(p).descriptors[:_COARSE_FEATURES] for p in (task.first, task.second)
+    )
     return len(match_descriptors(first, second, task.ratio))
 
 
@@ -204,7 +206,7 @@ def match_pair(task: PairTask) -> PairMatches:
     Where there are many features, the largest are matched first; the plane that their matches are
     near narrows the search. Where they are near none, all are compared with all.
     """
-    a, b = _features(task.first), _features(task.second)
+    a, b = kept_features(task.first), kept_features(task.second)
     seen = as_seen(a.pixels, task.warps[0]), as_seen(b.pixels, task.warps[1])
     probe = min(len(a.pixels), _PROBE_FEATURES) * min(len(b.pixels), _PROBE_FEATURES)
     matches = None
@@ -212,7 +214,7 @@ def match_pair(task: PairTask) -> PairMatches:
         matches = _guided(task, a, b, seen)
     if matches is None:
         matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
-    return _verified(task, seen, matches)
+    return verified(task, seen, matches)
 
 
 def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array]) -> Matches | None:
@@ -282,8 +284,8 @@ def apply_homography(homography: Array, pixels: Array) -> Array:
     return found
 
 
-def _verified(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> PairMatches:
-    """What one geometry explains of matches, pixels as the cameras of the model see them."""
+def verified(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> PairMatches:
+    """What one geometry explains of matches of features that the model's cameras see at `seen`."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = task.seed
     # A strip's overlap lies along the border and moves by one shift, as a watermark would.

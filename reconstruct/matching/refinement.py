@@ -24,7 +24,6 @@ from scipy.spatial import KDTree
 from alice_survey.base.compiled import compiled
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
-from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import Matches
 from reconstruct.views.interpolation import cubic_level, is_inside
 
@@ -68,7 +67,7 @@ class _TrackTask:
 
 
 def refine_tracks(
-    features: Sequence[Path],
+    pixels: Sequence[Array],
     greys: Sequence[Path],
     pairs: Sequence[tuple[int, int, Matches]],
     *,
@@ -80,7 +79,7 @@ def refine_tracks(
     it is if its patch does not resemble that of the reference, or would move far.
 
     Args:
-        features: files of the features of every picture.
+        pixels: features of every picture, (N, 2).
         greys: files of the evened pictures, (H, W) bytes as `numpy.save` writes them.
         pairs: indices of two pictures and (K, 2) verified matches.
         executor: where tasks run.
@@ -88,7 +87,6 @@ def refine_tracks(
     Returns:
         Pixels of all features by picture, (N, 2), moved or not.
     """
-    pixels = [load_features(path).pixels for path in features]
     starts = np.concatenate([[0], np.cumsum([len(p) for p in pixels])]).astype(np.int64)
     reference = track_references(pairs, starts)
     tasks = _tasks(pixels, starts, reference, pairs, greys)

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.base.executor import local_executor
-from reconstruct.matching.features import Features, save_features
 from reconstruct.matching.refinement import (
     affine_from_neighbours,
     align_coarser,
@@ -144,25 +143,16 @@ def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> N
         (np.eye(2), np.zeros(2)), (AFFINE, SHIFT), (np.diag([1.1, 0.9]), np.array([-8.0, 6.0]))
     ]  # fmt: skip
     rng = np.random.default_rng(6)
-    features, greys, first_guess = [], [], []
+    greys, first_guess = [], []
     for k, (affine, shift) in enumerate(views):
         guess = points @ affine.T + shift + rng.normal(0, 0.4, points.shape)
         lonely = np.array([[70.0, 60.0]])
-        features.append(tmp_path / f"{k}.npz")
         greys.append(tmp_path / f"{k}.npy")
         first_guess.append(np.concatenate([guess, lonely]))
-        save_features(
-            features[k],
-            Features(
-                pixels=first_guess[k],
-                scale_px=np.ones(51, np.float32),
-                descriptors=np.zeros((51, 128), np.uint8),
-            ),
-        )
         np.save(greys[k], texture.picture(affine, shift, noise=1.0))
     same = np.repeat(np.arange(50, dtype=np.uint32)[:, None], 2, axis=1)
     found = refine_tracks(
-        features, greys, [(0, 1, same), (1, 2, same)], executor=local_executor(threads)
+        first_guess, greys, [(0, 1, same), (1, 2, same)], executor=local_executor(threads)
     )
     assert sum((a != b).any(axis=1).sum() for a, b in zip(found, first_guess, strict=True)) >= 95
     spot = [

@@ -1,0 +1,196 @@
+"""Learned features (XFeat) and their matches: for pairs of little texture that SIFT cannot tie.
+
+The network of Potje et al., "XFeat: Accelerated Features for Lightweight Image Matching", CVPR
+2024, with the authors' weights (`xfeat/README.md`), is run by OpenCV. It gives, for every 8 x 8
+pixels, a descriptor, how reliable it is, and where among the 64 pixels a keypoint lies, if any.
+The picture's size decides all shapes, no sum depends on the number of threads: the same picture
+gives the same bytes.
+"""
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+from importlib import resources
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.frames import Array
+from reconstruct.matching.features import Features, spread
+from reconstruct.matching.matches import (
+    PairMatches,
+    PairTask,
+    as_seen,
+    kept_features,
+    match_descriptors,
+    verified,
+)
+
+RATIO = 0.85
+"""Largest distance of a match over that of the second nearest."""
+_MOST_PX = 1.5e6
+"""Pixels to which a larger picture is reduced, as for SIFT."""
+_LARGEST = 2.0
+"""Small pictures are enlarged by up to this much, as SIFT doubles them."""
+_MOST_FALSE_ALARMS = 1e-3
+"""Expected number of pairs of unrelated pictures, for each pair, that would agree as well."""
+_MAX_ERROR_PX = 4.0
+"""Distance from an epipolar line up to which a match agrees: COLMAP's."""
+_FREE = 7
+"""Matches that fix an epipolar geometry, and agree with it whatever they are."""
+_CELL = 8
+"""Pixels along the side of a cell."""
+_STEP = 32
+"""What width and height are multiples of: the coarsest layer has one value for so many pixels."""
+_LEAST_SCORE = 0.05
+"""Least probability of a keypoint times reliability. The authors ask this of the probability alone:
+in turbid water the doubtful keypoints that this adds give wrong ties, and few right ones."""
+_APART = 5
+"""Side of the window in which a keypoint is the most probable."""
+_SUPPORT_PX = 16.0
+"""How far a mask must stay away from a keypoint: what a descriptor sees most of."""
+_LEVELS = 256.0
+"""Byte steps for one unit of a descriptor; components of unit vectors beyond a half are rare."""
+_EPSILON = 1e-5
+
+Floats = NDArray[np.float32]
+
+
+def find_learned(
+    grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None, *, most: int, turns: int = 0
+) -> Features:
+    """Find learned features, evenly over a picture.
+
+    Args:
+        grey: (H, W) normalised picture.
+        mask: (H, W) where features may be, or None.
+        most: how many to keep.
+        turns: quarter turns, counter-clockwise, by which the picture is turned first: descriptors
+            of one spot resemble each other only when seen less than about 45 degrees turned.
+
+    Returns:
+        Keypoints with descriptors of 64 bytes, distances of which are those of XFeat's unit
+        vectors times a constant; `scale_px` is the side of a cell.
+    """
+    if turns % 4:
+        rest = None if mask is None else np.ascontiguousarray(np.rot90(mask))
+        turned = find_learned(
+            np.ascontiguousarray(np.rot90(grey)), rest, most=most, turns=turns - 1
+        )
+        # what has become the row was counted from the right
+        back = np.column_stack([grey.shape[1] - turned.pixels[:, 1], turned.pixels[:, 0]])
+        return replace(turned, pixels=back)
+    height, width = grey.shape
+    by = min(_LARGEST, math.sqrt(_MOST_PX / (width * height)))
+    size = [max(_STEP, round(side * by / _STEP) * _STEP) for side in (width, height)]
+    way = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
+    descriptors, likely, reliable = dense_features(cv2.resize(grey, size, interpolation=way))
+    score = likely * reliable
+    highest = cv2.dilate(score, np.ones((_APART, _APART), np.uint8))
+    rows, columns = np.nonzero((score == highest) & (score > _LEAST_SCORE))
+    steps = np.array([width / size[0], height / size[1]])
+    pixels = (np.column_stack([columns, rows]) + 0.5) * steps
+    strength = score[rows, columns].astype(np.float64)
+    if mask is not None:
+        free_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+        at = np.minimum(pixels.astype(int), [width - 1, height - 1])
+        usable = np.flatnonzero(free_px[at[:, 1], at[:, 0]] > _SUPPORT_PX * steps.mean())
+    else:
+        usable = np.arange(len(pixels))
+    sizes = np.full(len(usable), _CELL * steps.mean())
+    chosen = usable[spread(pixels[usable], sizes, strength[usable], (width, height), most)]
+    there = (np.column_stack([columns, rows])[chosen] + 0.5) / _CELL - 0.5
+    found = sampled(descriptors, there)
+    found = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), _EPSILON)
+    return Features(
+        pixels=pixels[chosen],
+        scale_px=np.full(len(chosen), _CELL * steps.mean(), np.float32),
+        descriptors=np.clip(np.rint(128.0 + _LEVELS * found), 0, 255).astype(np.uint8),
+    )
+
+
+def match_learned(task: PairTask) -> PairMatches:
+    """As `match_pair`, of learned features, with a guard against agreement by chance.
+
+    Where nothing stands out, matches are many and mostly false, and the best geometry of many false
+    matches explains enough of them to pass: `false_alarms` says how likely that is.
+    """
+    a, b = kept_features(task.first), kept_features(task.second)
+    matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
+    seen = as_seen(a.pixels, task.warps[0]), as_seen(b.pixels, task.warps[1])
+    pair = verified(task, seen, matches)
+    width, height = (task.cameras[1][side] for side in ("width", "height"))
+    if pair.geometry is not None and (
+        false_alarms(len(pair.matches), len(matches), (width, height)) > _MOST_FALSE_ALARMS
+    ):
+        return PairMatches(matches=matches[:0], geometry=None)
+    return pair
+
+
+def false_alarms(agreeing: int, matches: int, size: tuple[int, int]) -> float:
+    """How many epipolar geometries of random matches are expected to explain as many of them.
+
+    Moisan & Stival, "A probabilistic criterion to detect rigid point matches between two images",
+    IJCV 57 (2004), eq. 10: (n - 7) C(n, k) C(k, 7) p^(k - 7), where p = 2 D e / A bounds the share
+    of a picture of diagonal D and area A within e of a line.
+
+    Args:
+        agreeing: matches that one geometry explains.
+        matches: all of them.
+        size: width and height of the second picture.
+    """
+    if agreeing <= _FREE:
+        return math.inf
+    share = min(1.0, 2.0 * math.hypot(*size) * _MAX_ERROR_PX / (size[0] * size[1]))
+    logarithm = math.log(matches - _FREE) + (agreeing - _FREE) * math.log(share)
+    for n, k in ((matches, agreeing), (agreeing, _FREE)):
+        logarithm += math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+    return math.exp(min(logarithm, 700.0))
+
+
+def dense_features(grey: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
+    """Descriptors of all cells, keypoints and reliability of all pixels.
+
+    Args:
+        grey: (H, W), both multiples of 32.
+
+    Returns:
+        (H / 8, W / 8, 64) unit vectors; (H, W) probabilities that a pixel is its cell's keypoint, a
+        softmax over 64 pixels and "none"; (H, W) reliability of the descriptor there.
+    """
+    height, width = grey.shape
+    rows, columns = height // _CELL, width // _CELL
+    even = grey.astype(np.float32)
+    even = (even - even.mean()) / np.sqrt(even.var() + np.float32(_EPSILON))
+    blocks = even.reshape(rows, _CELL, columns, _CELL).transpose(1, 3, 0, 2)
+    network = _network()
+    network.setInput(even[None, None], "picture")
+    network.setInput(np.ascontiguousarray(blocks.reshape(1, -1, rows, columns)), "blocks")
+    found, logits, reliable = network.forward(["descriptors", "logits", "reliability"])
+    found = found[0].transpose(1, 2, 0)
+    found = found / np.maximum(np.linalg.norm(found, axis=2, keepdims=True), _EPSILON)
+    logits = np.exp(logits[0] - logits[0].max(axis=0))
+    likely = (logits / logits.sum(axis=0))[: _CELL * _CELL].reshape(_CELL, _CELL, rows, columns)
+    likely = likely.transpose(2, 0, 3, 1).reshape(height, width)
+    smooth = cv2.resize(reliable[0, 0], (width, height), interpolation=cv2.INTER_LINEAR)
+    return found, likely, smooth
+
+
+def sampled(field: Floats, at: Array) -> Array:
+    """Values (N, C) of a field (H, W, C) at places (N, 2), x and y, bilinear; held at its rim."""
+    last = np.array([field.shape[1] - 1, field.shape[0] - 1])
+    inside = np.clip(at, 0, last)
+    low = np.minimum(inside.astype(int), np.maximum(last - 1, 0))
+    high = np.minimum(low + 1, last)
+    x, y = (inside - low).T[..., None]
+    upper = (1 - x) * field[low[:, 1], low[:, 0]] + x * field[low[:, 1], high[:, 0]]
+    lower = (1 - x) * field[high[:, 1], low[:, 0]] + x * field[high[:, 1], high[:, 0]]
+    values: Array = (1 - y) * upper + y * lower
+    return values
+
+
+@lru_cache(maxsize=1)
+def _network() -> cv2.dnn.Net:
+    model = resources.files("reconstruct.matching").joinpath("xfeat/xfeat.onnx").read_bytes()
+    return cv2.dnn.readNetFromONNX(np.frombuffer(model, np.uint8))
