@@ -100,7 +100,7 @@ def _compared(level: Level, rendered: Path, *, learned: bool) -> Findings:
     name = f"{level.name}, {word}"
     if not cost.ok:
         print(f"{level.name:16}{word:>10}  {cost.last_line()}", flush=True)
-        if not learned:
+        if not learned or level.registered is None:
             return Findings(left_out=(f"{name}: {cost.last_line()}",))
         return Findings(failed=(f"{name}: {cost.last_line()}",))
     share, largest, misses_m = judged(workspace)

@@ -97,7 +97,7 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     """
     task, points_world = matched
     store = task.store
-    if store.has(task.index, "agreeing"):
+    if store.has(task.index, "agreeing") or store.has(task.index, "fine"):
         return
     shape = task.view.pinhole.size_px[::-1]
     depths, sigmas = [], []

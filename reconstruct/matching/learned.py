@@ -37,6 +37,8 @@ _MOST_FALSE_ALARMS = 1e-3
 """Expected number of pairs of unrelated pictures, for each pair, that would agree as well."""
 _MAX_ERROR_PX = 4.0
 """Distance from an epipolar line up to which a match agrees: COLMAP's."""
+_STILL = 0.02
+"""Share of a picture's longer side by which a match must move from picture to picture."""
 _FREE = 7
 """Matches that fix an epipolar geometry, and agree with it whatever they are."""
 _CELL = 8
@@ -111,16 +113,21 @@ def find_learned(
 
 
 def match_learned(task: PairTask) -> PairMatches:
-    """As `match_pair`, of learned features, with a guard against agreement by chance.
+    """As `match_pair`, of learned features, guarded against chance and against what stays.
 
+    Backscatter, vignette and dirt on the port are at one place in all pictures; in very turbid
+    water little else is seen. Matches that do not move are left out: of a sea floor that does not
+    move they would say nothing either.
     Where nothing stands out, matches are many and mostly false, and the best geometry of many false
     matches explains enough of them to pass: `false_alarms` says how likely that is.
     """
     a, b = kept_features(task.first), kept_features(task.second)
     matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
     seen = as_seen(a.pixels, task.warps[0]), as_seen(b.pixels, task.warps[1])
-    pair = verified(task, seen, matches)
     width, height = (task.cameras[1][side] for side in ("width", "height"))
+    way = np.linalg.norm(b.pixels[matches[:, 1]] - a.pixels[matches[:, 0]], axis=1)
+    matches = matches[way > _STILL * max(width, height)]
+    pair = verified(task, seen, matches)
     if pair.geometry is not None and (
         false_alarms(len(pair.matches), len(matches), (width, height)) > _MOST_FALSE_ALARMS
     ):

@@ -167,6 +167,17 @@ def test_a_pair_that_sift_cannot_tie_is_tied_rightly_and_a_strange_one_is_not(
     np.testing.assert_array_equal(again[0].matches, matches)
 
 
+def test_what_moves_with_the_camera_ties_nothing(tmp_path: Path) -> None:
+    """Two pictures of haze that show nothing but the pattern of light and dirt, and noise."""
+    pattern = floor(4, 3.0)[: SIZE[1], : SIZE[0]]
+    for k in range(2):
+        noise = np.random.default_rng(k).normal(size=pattern.shape)
+        grey = np.clip(110 + 20 * pattern + 5 * noise, 0, 255).astype(np.uint8)
+        save_features(tmp_path / f"{k}.npz", find_learned(grey, None, most=800))
+    assert match_pair(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).geometry is not None
+    assert match_learned(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).geometry is None
+
+
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_a_turned_picture_is_tied_once_it_is_turned_back(tmp_path: Path, turns: int) -> None:
     """Adjacent lines are flown in opposite directions."""
