@@ -48,6 +48,10 @@ PART_REACH_CELLS = 16.0
 _NEIGHBOUR_CELLS = 2.0
 _LEAST_PART = 300
 """Points of a part of the surface; smaller ones are mostly wrong."""
+_RIM_CELLS = 3.0
+"""Within this many cells of a rim a point may be of no surface: what a window of matching spans."""
+_LEAST_ASIDE = 0.25
+"""Cells by which the neighbours of a point within a surface lie to one side by chance."""
 _STEP_CELLS = 1.0
 """Points farther than this from each other's tangent planes do not hang together."""
 _LEAST_TURN = 0.3
@@ -209,10 +213,11 @@ def fuse_cells(
 
 
 def settled(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDArray[Any]:
-    """Leave out small parts of a surface, and raise sigmas by what neighbours contradict.
+    """Leave out small parts of a surface, and raise sigmas at rims and where neighbours contradict.
 
     The squared distance of neighbours from a point's tangent plane, beyond the variance of both,
-    is taken for the sum of two equal variances, the point's own and theirs.
+    is taken for the sum of two equal variances, the point's own and theirs. At a rim matching may
+    have carried the surface on by a window: a point is as unsure as its neighbours lie to one side.
 
     Args:
         surface: records of `SURFACE_POINT` of one tile and `PART_REACH_CELLS` around it.
@@ -226,7 +231,9 @@ def settled(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDAr
     normal = surface["normal"].astype(np.float64)
     variance = np.square(surface["sigma"].astype(np.float64) / cell)
     count = len(surface)
-    i, j = cKDTree(place).query_pairs(_NEIGHBOUR_CELLS, output_type="ndarray").T
+    tree = cKDTree(place)
+    aside = _aside(tree, place, normal)
+    i, j = tree.query_pairs(_NEIGHBOUR_CELLS, output_type="ndarray").T
     apart = place[j] - place[i]
     from_i, from_j = (np.einsum("nk,nk->n", apart, normal[k]) for k in (i, j))
     turn = np.einsum("nk,nk->n", normal[i], normal[j])
@@ -253,7 +260,29 @@ def settled(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDAr
     neighbours = np.bincount(i, minlength=count) + np.bincount(j, minlength=count)
     excess = 0.5 * np.maximum(beyond / np.maximum(neighbours, 1), 0.0)
     found = surface.copy()
-    found["sigma"] = cell * np.sqrt(variance + excess)
+    found["sigma"] = cell * np.sqrt(variance + excess + np.square(aside))
     found["normal"] = mean
     kept: NDArray[Any] = found[large[part]]
     return kept
+
+
+def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:
+    """(N,) how far the middle of each point's neighbours lies to one side of it, in cells.
+
+    Args:
+        tree: of the places.
+        place: (N, 3) in cells.
+        normal: (N, 3) unit vectors.
+    """
+    i, j = tree.query_pairs(_RIM_CELLS, output_type="ndarray").T
+    same = np.einsum("nk,nk->n", normal[i], normal[j]) > _LEAST_TURN
+    i, j = i[same], j[same]
+    apart = place[j] - place[i]
+    count = len(place)
+    near = np.bincount(i, minlength=count) + np.bincount(j, minlength=count) + 1
+    middle = np.stack(
+        [np.bincount(i, a, count) - np.bincount(j, a, count) for a in apart.T], axis=1
+    )
+    away = np.linalg.norm(middle, axis=1) / near
+    found: Array = np.maximum(away - _LEAST_ASIDE, 0.0)
+    return found

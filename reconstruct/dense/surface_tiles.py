@@ -21,8 +21,6 @@ from reconstruct.views.model import View, enu_from_cam
 _TILE_CELLS = 256
 _WORST_CELLS = 4.0
 """Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
-_FINDERS = 2
-"""Views that must find a point for each that sees through it: those that err do so alike."""
 _RIM_CELLS = int(PART_REACH_CELLS) + 1
 _NAME = "surface"
 
@@ -184,7 +182,7 @@ def tiles_over(tiles: Sequence[SurfaceTile], plane: Plane, grid: DemGrid) -> lis
 def _seen_through(
     setup: FuseSetup, task: FuseTask, offset: Array, surface: NDArray[Any]
 ) -> NDArray[np.bool_]:
-    """Which points of a tile too many views see through for those that find them."""
+    """Which points of a tile more views see through than find."""
     found, through = (np.zeros(len(surface), np.int64) for _ in range(2))
     points, sigmas = (np.ascontiguousarray(surface[name]) for name in ("enu", "sigma"))
     for index, view in task.views:
@@ -196,7 +194,7 @@ def _seen_through(
         )
         found += at
         through += beyond
-    return _FINDERS * through > found
+    return through > found
 
 
 def _depth_of(setup: FuseSetup, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from reconstruct.dense.points import Points
-from reconstruct.dense.surface_points import fuse_surface, settled
+from reconstruct.dense.surface_points import SURFACE_POINT, fuse_surface, settled
 from tests.oracles_dense import fused
 
 CELL_M, SIGMA_M = 0.01, 0.001
@@ -185,3 +185,26 @@ def test_tiles_agree_where_they_meet():
         return np.sort(found[found["enu"][:, 0] < 4 * CELL_M], order=("enu", "normal"))
 
     np.testing.assert_array_equal(own(part), own(whole))
+
+
+def test_rims_are_as_unsure_as_their_neighbours_lie_to_one_side() -> None:
+    cell = 0.01
+    x, y = np.meshgrid(np.arange(60) * cell, np.arange(60) * cell)
+    inside = np.ones(x.shape, bool)
+    inside[20:26, 20:26] = False  # a hole has a rim too
+    surface = np.zeros(inside.sum(), SURFACE_POINT)
+    surface["enu"] = np.stack([x[inside], y[inside], np.zeros(inside.sum())], axis=1)
+    surface["normal"] = [0.0, 0.0, 1.0]
+    surface["sigma"] = 1e-4
+    surface["views"], surface["stations"] = 4, 2
+
+    found = settled(surface, cell, np.array([-1.0, -1.0]), np.array([2.0, 2.0]))
+
+    sigma = np.full(inside.shape, np.nan)
+    sigma[inside] = found["sigma"]
+    np.testing.assert_allclose(sigma[30:50, 30:50], 1e-4, rtol=1e-4)
+    # The centroid of half a disc of three cells is 4 * 3 / (3 pi) = 1.27 cells away.
+    assert 0.7 * cell < sigma[30, 0] < 1.3 * cell
+    assert sigma[30, 0] > sigma[30, 1] > 0.2 * cell
+    assert sigma[30, 3] < 1.1e-4
+    assert 0.3 * cell < sigma[22, 19] < 1.3 * cell
