@@ -46,8 +46,8 @@ _LENGTH_IN = 4
 """The known length, and the picture in which its ends are picked."""
 _NEAR_PX = 3.0
 _SAMPLES = 10_000
-_INSTANTS = 3
-_HEADER_BYTES = 2**40
+_LEAST_PICTURES = 3
+_ALL_POINTS = 2**40
 
 
 def main() -> None:
@@ -188,10 +188,10 @@ def judge(workspace: Path, cameras: list[dict[str, Any]], names: list[str]) -> d
     ]
     pixel_m = 2.0 * 5.0 * np.tan(np.deg2rad(0.5 * scene.FOV_DEG)) / scene.SIZE_PX[0]
     dense = workspace / "dense"
-    cloud = _scene(read_ply_points(dense / "cloud.ply", _HEADER_BYTES), moved)
+    cloud = _scene(read_ply_points(dense / "cloud.ply", _ALL_POINTS), moved)
     sigma = read_header(dense / "cloud.ply").rows()["sigma"].astype(np.float64) * moved.scale
     samples, away = surface_samples()
-    seen = pictures_that_see(samples, away, cameras) >= _INSTANTS
+    seen = pictures_that_see(samples, away, cameras) >= _LEAST_PICTURES
     gap = cKDTree(cloud).query(samples[seen], distance_upper_bound=_NEAR_PX * pixel_m)[0]
     vertices, triangles = read_mesh(workspace / "mesh")
     faces = face_points(moved.apply(vertices), triangles, _SAMPLES)

@@ -48,7 +48,7 @@ PART_REACH_CELLS = 16.0
 _NEIGHBOUR_CELLS = 2.0
 _LEAST_PART = 300
 """Points of a part of the surface; smaller ones are mostly wrong."""
-_RIM_CELLS = 3.0
+_RIM_REACH_CELLS = 3.0
 """Within this many cells of a rim a point may be of no surface: what a window of matching spans."""
 _LEAST_ASIDE = 0.25
 """Cells by which the neighbours of a point within a surface lie to one side by chance."""
@@ -274,7 +274,7 @@ def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:
         place: (N, 3) in cells.
         normal: (N, 3) unit vectors.
     """
-    i, j = tree.query_pairs(_RIM_CELLS, output_type="ndarray").T
+    i, j = tree.query_pairs(_RIM_REACH_CELLS, output_type="ndarray").T
     same = np.einsum("nk,nk->n", normal[i], normal[j]) > _LEAST_TURN
     i, j = i[same], j[same]
     apart = place[j] - place[i]

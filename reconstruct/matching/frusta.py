@@ -175,12 +175,8 @@ def all_round(frusta: Frusta, overlaps: Mapping[Pair, float], sectors: int) -> s
         sectors: directions.
     """
     middles = frusta.middles
-    partners: dict[int, list[tuple[int, float]]] = {}
-    for (i, j), overlap in overlaps.items():
-        partners.setdefault(i, []).append((j, overlap))
-        partners.setdefault(j, []).append((i, overlap))
     chosen = set()
-    for i, found in sorted(partners.items()):
+    for i, found in partners_of(overlaps):
         kept: set[int] = set()
         cells: dict[tuple[int, bool], list[tuple[float, float, int]]] = {}
         here = frusta.ned_from_cam[i].rotation.inv()
@@ -196,3 +192,12 @@ def all_round(frusta: Frusta, overlaps: Mapping[Pair, float], sectors: int) -> s
             kept |= {max(members)[2], max(members, key=lambda member: member[1:])[2]}
         chosen |= {(min(i, j), max(i, j)) for j in kept}
     return chosen
+
+
+def partners_of(overlaps: Mapping[Pair, float]) -> list[tuple[int, list[tuple[int, float]]]]:
+    """Each picture with its partners and what it shares with them, in the order of pictures."""
+    partners: dict[int, list[tuple[int, float]]] = {}
+    for (i, j), overlap in overlaps.items():
+        partners.setdefault(i, []).append((j, overlap))
+        partners.setdefault(j, []).append((i, overlap))
+    return sorted(partners.items())

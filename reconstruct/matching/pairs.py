@@ -24,7 +24,15 @@ from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
-from reconstruct.matching.frusta import Frusta, Pair, all_round, frusta_of, near_pairs, shared
+from reconstruct.matching.frusta import (
+    Frusta,
+    Pair,
+    all_round,
+    frusta_of,
+    near_pairs,
+    partners_of,
+    shared,
+)
 
 SMALL_SET = 60
 """Up to this many pictures every pair gets at least a coarse look."""
@@ -96,7 +104,7 @@ def choose_pairs(
     elif datum is not None and len(records) > SMALL_SET:
         maybe |= _nearest(records, datum)
         sure |= neighbours(records, 1)
-    # A link between parts that look elsewhere may be one that no frusta of such a length show.
+    # Frusta end at the working range: views of different parts may link beyond it.
     maybe |= {(i, j) for i, j in alike if i not in level or j not in level}
     if len(placed) < len(records):
         in_order = neighbours(records, NEIGHBOURS)
@@ -313,12 +321,8 @@ def well_conditioned(
         centres: (N, 2) of the footprints.
         headings_deg: (N,).
     """
-    partners: dict[int, list[tuple[int, float]]] = {}
-    for (i, j), overlap in overlaps.items():
-        partners.setdefault(i, []).append((j, overlap))
-        partners.setdefault(j, []).append((i, overlap))
     chosen = set()
-    for i, found in sorted(partners.items()):
+    for i, found in partners_of(overlaps):
         kept = {max(found, key=lambda item: (item[1], -item[0]))[0]}
         sectors: dict[tuple[int, bool], list[tuple[float, int]]] = {}
         for j, overlap in found:
