@@ -67,8 +67,10 @@ def page(opened: tuple[Any, Heard]) -> Any:
     held.get_by_role("button", name="Show all").click()
     held.get_by_role("button", name="Reset the view").click()
     held.evaluate("document.activeElement.blur()")
-    if data(held, MAP, "zoom") != held.home:
-        settled(held, MAP, "zoom", data(held, MAP, "zoom"))
+    held.wait_for_function(
+        "([selector, home]) => Number(document.querySelector(selector).dataset.zoom) === home",
+        arg=[MAP, held.home],
+    )
     held.wait_for_function(RESTS)
     return held
 
