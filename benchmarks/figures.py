@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from benchmarks.machine import load
 
 
@@ -160,7 +162,9 @@ def _as_row(figure: Figure) -> dict[str, Any]:
 
 
 def plain(data: Any) -> Any:
-    """The same for JSON, which has no NaN: null."""
+    """The same for JSON, which has no NaN (null here) and no types of numpy."""
+    if isinstance(data, np.generic):
+        data = data.item()
     if isinstance(data, Mapping):
         return {key: plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):

@@ -338,7 +338,7 @@ class ReconstructConfig(Config):
     mesh_triangles: int | None = Field(None, ge=100, le=50_000_000)
     mesh_error_px: float = Field(0.25, ge=0.01, le=10)
     mesh_page_px: int = Field(8192, ge=512, le=16_384)
-    colour: Literal["even", "water", "raw"] = "even"
+    colour: Literal["even", "water", "raw"] = "water"
     dispersion: Literal["auto", "on", "off"] = "auto"
 
     @field_validator("planes")

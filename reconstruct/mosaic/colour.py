@@ -261,8 +261,13 @@ def _patterns(
     water, known = model.water, model.light
     added = np.zeros_like(nodes)
     if water is not None:
+        assert cleaned.ranges is not None
+        ranges = _node_ranges(cleaned, len(facts))
         added = np.stack([water.added[fact.camera] for fact in facts])
-        levels = cleaned.levels - model.weakening(np.asarray(cleaned.ranges))
+        added = added * grown(water.growth, ranges, water.middle_range)
+        weaker = np.exp(model.weakening(ranges))
+        nodes, added = nodes / weaker, added / weaker
+        levels = cleaned.levels - model.weakening(cleaned.ranges)
         cleaned = replace(cleaned, levels=levels.astype(np.float32), ranges=None)
     left = nodes - added
     with np.errstate(invalid="ignore"):
@@ -277,6 +282,21 @@ def _patterns(
     if water is None:
         return found
     return replace(known, patterns=found.patterns, gains=found.gains)
+
+
+def _node_ranges(samples: LightSamples, pictures: int) -> Array:
+    """(pictures, rows, columns) mean range around nodes; NaN where no sample is next to one."""
+    size = GRID[0] * GRID[1]
+    total, weight = np.zeros(pictures * size), np.zeros(pictures * size)
+    ranges = np.asarray(samples.ranges, np.float64)
+    for side in range(2):
+        at, share = node_weights(samples.places[:, side])
+        at = at + size * samples.views[:, side, None].astype(np.int64)
+        np.add.at(total, at, share * ranges[:, side, None])
+        np.add.at(weight, at, share)
+    with np.errstate(invalid="ignore"):
+        found: Array = (total / np.where(weight > 0, weight, np.nan)).reshape(pictures, *GRID)
+    return found
 
 
 def _black(model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
