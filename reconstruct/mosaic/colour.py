@@ -261,13 +261,12 @@ def _patterns(
     water, known = model.water, model.light
     added = np.zeros_like(nodes)
     if water is not None:
-        assert cleaned.ranges is not None
         ranges = _node_ranges(cleaned, len(facts))
         added = np.stack([water.added[fact.camera] for fact in facts])
         added = added * grown(water.growth, ranges, water.middle_range)
         weaker = np.exp(model.weakening(ranges))
         nodes, added = nodes / weaker, added / weaker
-        levels = cleaned.levels - model.weakening(cleaned.ranges)
+        levels = cleaned.levels - model.weakening(np.asarray(cleaned.ranges))
         cleaned = replace(cleaned, levels=levels.astype(np.float32), ranges=None)
     left = nodes - added
     with np.errstate(invalid="ignore"):
