@@ -10,6 +10,7 @@ from alice_survey.base.artefacts import atomic_path
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.water import CHANNELS
+from reconstruct.mosaic.bodies import hidden_by, read_bodies
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.pictures.undistorted import taken_nodes
@@ -77,7 +78,7 @@ class Ground:
     """A part of the DEM, and what each view sees of it."""
 
     def __init__(self, dem: Float32, around: DemGrid, stored: Path | None = None) -> None:
-        """`dem` holds the heights of the cells of `around`; `stored` what `store_visible` wrote."""
+        """`dem` holds the heights of the cells of `around`; `stored` what is known of the plane."""
         self.dem = dem
         self.around = around
         self._stored = stored
@@ -90,7 +91,7 @@ class Ground:
             if path is not None and path.is_file():
                 self._visible[view.image] = _load_visible(path)
             else:
-                self._visible[view.image] = visible_over(view, self.dem, self.around)
+                self._visible[view.image] = visible_over(view, self.dem, self.around, self._stored)
         return self._visible[view.image]
 
     def surface(self, grid: DemGrid) -> "GridHeights":
@@ -116,8 +117,15 @@ class GridHeights:
         return replace(self, grid=grid, height=self.height[rows, columns])
 
 
-def visible_over(view: View, dem: Float32, around: DemGrid) -> Visible:
-    """Cells of a DEM that a view sees over it."""
+def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None = None) -> Visible:
+    """Cells of a DEM that a view sees over it, and past the bodies that stand off it.
+
+    Args:
+        view: the view.
+        dem: heights.
+        around: their cells.
+        stored: folder of what is known of the plane; None for no bodies.
+    """
     known = np.isfinite(dem)
     part = (0, 0, 0, 0)
     if known.any():
@@ -131,6 +139,12 @@ def visible_over(view: View, dem: Float32, around: DemGrid) -> Visible:
         _HIDES_CELLS * around.cell,
         part,
     )
+    if stored is not None:
+        rows, columns = np.nonzero(cells)
+        points = np.column_stack([
+            around.north_of(rows + 0.5), around.east_of(columns + 0.5), -dem[rows, columns]
+        ])  # fmt: skip
+        cells[rows, columns] = ~hidden_by(read_bodies(bodies_folder(stored)), view, points)
     return Visible(cells=cells, west=around.west, north=around.north)
 
 
@@ -147,6 +161,11 @@ def _reached(
     return int(r[0]), int(r[1]), int(c[0]), int(c[1])
 
 
+def bodies_folder(stored: Path) -> Path:
+    """Folder of the bodies that stand off a plane's heights."""
+    return stored / "bodies"
+
+
 def visible_path(folder: Path, image: str) -> Path:
     """The file of the cells that a view sees."""
     return folder / f"{image}.seen.npz"
@@ -156,12 +175,12 @@ def store_visible(folder: Path, view: View, dem: Float32, around: DemGrid) -> No
     """Write the cells of a DEM that a view sees, so that no tile has to ask again.
 
     Args:
-        folder: for the file.
+        folder: for the file; the bodies of the plane are in it.
         view: the view.
         dem: all of the DEM that the view sees, and that may lie between it and that.
         around: its cells.
     """
-    visible = visible_over(view, dem, around)
+    visible = visible_over(view, dem, around, folder)
     rows, columns = np.flatnonzero(visible.cells.any(axis=1)), np.flatnonzero(visible.cells.any(0))
     if len(rows):
         top, left = int(rows[0]), int(columns[0])
