@@ -53,6 +53,8 @@ _MOST_SAMPLES = 20_000
 """Most samples that the light of the water is found from."""
 _WHITE_SIGMA = 0.2
 """Sigma of the logarithm of a colour's ratio to green, of lamp and camera, and of the sea floor."""
+_LEAST_DIRECT = 0.5
+"""Share of a view's light that comes from the spot itself, for views to be compared there."""
 _NEAREST = 8
 """Samples next to a patch that give its range."""
 _LARGEST_LIFT = 30.0
@@ -270,7 +272,7 @@ def _patterns(
         cleaned = replace(cleaned, levels=levels.astype(np.float32), ranges=None)
     left = nodes - added
     with np.errstate(invalid="ignore"):
-        usable = left > LEAST_LEFT * nodes
+        usable = left > _LEAST_DIRECT * nodes
     found = solve_patterns(
         cleaned,
         np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan),
@@ -348,7 +350,7 @@ def _without_water(
     light = np.exp(samples.levels.astype(np.float64))
     beyond = grown(model.growth, np.asarray(samples.ranges), model.light.middle_range)
     left = light - sampled(samples, model.water.added, facts) * beyond
-    kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
+    kept = (left > _LEAST_DIRECT * light).all(axis=(1, 2))
     return replace(_part(samples, kept), levels=np.log(left[kept]).astype(np.float32))
 
 
