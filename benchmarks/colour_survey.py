@@ -35,6 +35,8 @@ from alice_survey.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import Rig
 from camera_calib.water import water_optics
+from reconstruct.dense.cloud import write_cloud, write_cloud_json
+from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import WorldFrame, write_frame
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
@@ -238,6 +240,7 @@ def _write_sparse(sparse: Path, survey: ColourSurvey) -> None:
 
 
 def _write_dem(dense: Path, survey: ColourSurvey) -> None:
+    """Heights, and a cloud of the same points."""
     dense.mkdir(exist_ok=True)
     south, west = -0.8, -0.9
     rows = int((STEP_M * (survey.stations - 1) + 1.6) / CELL_M)
@@ -248,6 +251,11 @@ def _write_dem(dense: Path, survey: ColourSurvey) -> None:
     points, _ = from_above(survey.scene.terrain, *np.meshgrid(north, east, indexing="ij"))
     with tiled_raster(dense / "dem.tif", grid, FRAME, "float32", np.nan, "height") as raster:
         raster.write(-points[..., 2].astype(np.float32), 1)
+    cloud = np.zeros(points.shape[0] * points.shape[1], VERTEX)
+    for axis, values in zip("yxz", (points * [1.0, 1.0, -1.0]).reshape(-1, 3).T, strict=True):
+        cloud[axis] = values
+    write_cloud(dense / "cloud.ply", [cloud], (0.0, 0.0, 0.0), FRAME)
+    write_cloud_json(dense / "cloud.json", len(cloud), (0.0, 0.0, 0.0), CELL_M, FRAME)
     write_json(dense / "stage.json", {})
 
 

@@ -13,9 +13,11 @@ from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
+from reconstruct.dense.cloud import write_cloud, write_cloud_json
 from reconstruct.mosaic import run
 from reconstruct.mosaic.picture_measures import encoded, linear_table
 from reconstruct.mosaic.run import _dispersion
+from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.cameras import changed
@@ -54,8 +56,18 @@ def write_surface(folder: Path) -> None:
     height[100:, 90:] = np.nan
     with tiled_raster(dense / "dem.tif", grid, FRAME, "float32", np.nan, "height") as raster:
         raster.write(height.astype(np.float32), 1)
-    write_json(dense / "cloud.json", {"points": 1})
+    write_surface_cloud(dense, grid, height)
     write_json(dense / "stage.json", {})
+
+
+def write_surface_cloud(dense: Path, grid: DemGrid, height: np.ndarray) -> None:
+    """The cloud of a DEM alone: a point at every cell."""
+    rows, columns = np.nonzero(np.isfinite(height))
+    points = np.zeros(len(rows), VERTEX)
+    points["x"], points["y"] = grid.east_of(columns + 0.5), grid.north_of(rows + 0.5)
+    points["z"] = height[rows, columns]
+    write_cloud(dense / "cloud.ply", [points], (0.0, 0.0, 0.0), FRAME)
+    write_cloud_json(dense / "cloud.json", len(points), (0.0, 0.0, 0.0), grid.cell, FRAME)
 
 
 def make_workspace(folder: Path, views: list[View], scene: Scene) -> Path:
