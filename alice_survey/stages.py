@@ -394,7 +394,8 @@ def _mosaic_inputs(workspace: Path) -> list[Path]:
     planes = sorted((dense / "planes").glob("*/dem.tif"))
     about = _there(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
     about += _there(dense / "moving.csv", workspace / COLOUR_FILE)
-    return [dense / "dem.tif", *planes, *about, *_model_inputs(workspace)]
+    cloud = [dense / name for name in ("cloud.ply", "cloud.json")]
+    return [dense / "dem.tif", *planes, *cloud, *about, *_model_inputs(workspace)]
 
 
 def _mosaic_summary(folder: Path) -> Summary:
