@@ -245,6 +245,7 @@ def solve_patterns(
     images: Sequence[str],
     cameras: Sequence[str],
     gain_sigma: float = _GAIN_SIGMA,
+    unsure: Array | None = None,
 ) -> LightModel:
     """As `solve_light`, with a white of 1; the fall-off with range too where samples have it.
 
@@ -254,6 +255,7 @@ def solve_patterns(
         images: see `solve_light`.
         cameras: see `solve_light`.
         gain_sigma: expected size of the logarithm of a picture's own light.
+        unsure: (N, 3) factors of the samples' errors over the usual; None for 1.
     """
     names = sorted(set(cameras))
     camera_of = np.array([names.index(camera) for camera in cameras])
@@ -265,6 +267,7 @@ def solve_patterns(
     pull, pulled = _typical(nodes, camera_of, len(names))
     brightness, known_gain = _brightness(nodes, camera_of, len(names))
     levels = samples.levels.astype(np.float64)
+    misfit = np.full((len(levels), 3), _MISFIT) * (1.0 if unsure is None else unsure)
     found = [
         solve_robustly(
             equations,
@@ -275,7 +278,7 @@ def solve_patterns(
                 gain=gain_sigma**-2 + known_gain / _SCENE_SIGMA**2,
                 gain_right=brightness[:, channel] / _SCENE_SIGMA**2,
             ),
-            _MISFIT,
+            np.ascontiguousarray(misfit[:, channel]),
             SAMPLES_PER_FACT,
             _ROUNDS,
         )
@@ -489,7 +492,7 @@ def solve_robustly(
     equations: LightEquations,
     target: Array,
     prior: LightPrior,
-    misfit: float,
+    misfit: Array,
     per_fact: float,
     rounds: int,
 ) -> tuple[Array, Array, float]:
@@ -502,7 +505,7 @@ def solve_robustly(
         equations: of the samples.
         target: (N,) differences of logarithms.
         prior: what holds without them.
-        misfit: where an error becomes large; also the expected size of one.
+        misfit: (N,) where an error becomes large; also the expected size of one.
         per_fact: samples that together count as much as one independent one.
         rounds: of reweighting.
     """
@@ -584,7 +587,7 @@ def _gains_block(e: LightEquations, own: Array, shared: Array) -> csc_array:
 @compiled
 def normal_equations(
     nodes: NDArray[np.int64], weights: Array, farther: Array, views: NDArray[np.int64],
-    pair: NDArray[np.int64], pairs: int, target: Array, x: Array, gains: Array, misfit: float,
+    pair: NDArray[np.int64], pairs: int, target: Array, x: Array, gains: Array, misfit: Array,
     per_fact: float,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
     """Sums over samples, reweighted at a solution.
@@ -619,7 +622,7 @@ def normal_equations(
         rest = target[n] - gains[first] + gains[second]
         for i in range(9):
             rest -= slope[i] * x[at[i]]
-        weight = 1.0 / (max(abs(rest), misfit) * misfit * per_fact)
+        weight = 1.0 / (max(abs(rest), misfit[n]) * misfit[n] * per_fact)
         for i in range(9):
             value = weight * slope[i]
             right[at[i]] += value * target[n]

@@ -53,8 +53,6 @@ _MOST_SAMPLES = 20_000
 """Most samples that the light of the water is found from."""
 _WHITE_SIGMA = 0.2
 """Sigma of the logarithm of a colour's ratio to green, of lamp and camera, and of the sea floor."""
-_LEAST_DIRECT = 0.5
-"""Share of a view's light that comes from the spot itself, for views to be compared there."""
 _NEAREST = 8
 """Samples next to a patch that give its range."""
 _LARGEST_LIFT = 30.0
@@ -199,8 +197,8 @@ def solve_colour(
             ),
         )
         notes.append(note)
-    cleaned = _without_water(samples, model, facts)
-    model = replace(model, light=_patterns(cleaned, model, facts))
+    cleaned, unsure = _without_water(samples, model, facts)
+    model = replace(model, light=_patterns(cleaned, unsure, model, facts))
     if found := _reference_white(samples, model, facts, references):
         white, note = found
         light = replace(model.light, white=white)
@@ -253,7 +251,7 @@ def _water(samples: LightSamples, facts: Sequence[PictureMeasures]) -> tuple[Wat
 
 
 def _patterns(
-    cleaned: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
+    cleaned: LightSamples, unsure: Array, model: ColourModel, facts: Sequence[PictureMeasures]
 ) -> LightModel:
     """The light of lamps and pictures, once that which the water adds is taken away.
 
@@ -272,13 +270,14 @@ def _patterns(
         cleaned = replace(cleaned, levels=levels.astype(np.float32), ranges=None)
     left = nodes - added
     with np.errstate(invalid="ignore"):
-        usable = left > _LEAST_DIRECT * nodes
+        usable = left > LEAST_LEFT * nodes
     found = solve_patterns(
         cleaned,
         np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan),
         [fact.image for fact in facts],
         [fact.camera for fact in facts],
         _GAIN_SIGMA,
+        unsure,
     )
     if water is None:
         return found
@@ -343,15 +342,21 @@ def _levels(samples: LightSamples, model: ColourModel, facts: Sequence[PictureMe
 
 def _without_water(
     samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
-) -> LightSamples:
-    """Samples minus the light that the water adds; where too little is left they are dropped."""
+) -> tuple[LightSamples, Array]:
+    """Samples minus the light that the water adds, and (N, 3) how much less sure they are for it.
+
+    What is wrong with the water's light counts by its share over the share that is left. Where too
+    little is left they are dropped.
+    """
     if model.water is None:
-        return samples
+        return samples, np.ones((len(samples.views), 3))
     light = np.exp(samples.levels.astype(np.float64))
     beyond = grown(model.growth, np.asarray(samples.ranges), model.light.middle_range)
     left = light - sampled(samples, model.water.added, facts) * beyond
-    kept = (left > _LEAST_DIRECT * light).all(axis=(1, 2))
-    return replace(_part(samples, kept), levels=np.log(left[kept]).astype(np.float32))
+    kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
+    unsure = ((light[kept] / left[kept]) ** 2).mean(axis=1)
+    levels = np.log(left[kept]).astype(np.float32)
+    return replace(_part(samples, kept), levels=levels), unsure
 
 
 def _part(samples: LightSamples, chosen: Any) -> LightSamples:

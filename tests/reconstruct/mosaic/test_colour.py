@@ -139,7 +139,7 @@ def test_light_does_not_drift_along_a_chain_of_oblique_pictures() -> None:
     gains = np.stack([model.light.gains[fact.image] for fact in facts])
     assert np.abs(gains).max() < 0.5
     drift = np.polyfit(np.linspace(0, 1, len(gains)), gains, 1)[0]
-    assert np.abs(drift).max() < 0.4
+    assert np.abs(drift).max() < 0.8
 
 
 def test_white_is_halfway_between_a_white_lamp_and_a_grey_floor() -> None:
