@@ -287,16 +287,14 @@ def _patterns(
 def _node_ranges(samples: LightSamples, pictures: int) -> Array:
     """(pictures, rows, columns) mean range around nodes; NaN where no sample is next to one."""
     size = GRID[0] * GRID[1]
-    total, weight = np.zeros(pictures * size), np.zeros(pictures * size)
-    ranges = np.asarray(samples.ranges, np.float64)
-    for side in range(2):
-        at, share = node_weights(samples.places[:, side])
-        at = at + size * samples.views[:, side, None].astype(np.int64)
-        np.add.at(total, at, share * ranges[:, side, None])
-        np.add.at(weight, at, share)
+    at, share = node_weights(samples.places.reshape(-1, 2))
+    at = (at + size * samples.views.reshape(-1, 1).astype(np.int64)).ravel()
+    ranges = np.asarray(samples.ranges, np.float64).reshape(-1, 1)
+    weight = np.bincount(at, share.ravel(), pictures * size)
+    total = np.bincount(at, (share * ranges).ravel(), pictures * size)
     with np.errstate(invalid="ignore"):
-        found: Array = (total / np.where(weight > 0, weight, np.nan)).reshape(pictures, *GRID)
-    return found
+        found: Array = total / weight
+    return found.reshape(pictures, *GRID)
 
 
 def _black(model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:

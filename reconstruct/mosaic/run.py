@@ -20,7 +20,6 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
-from reconstruct.mosaic.bodies import find_bodies
 from reconstruct.mosaic.colour import ColourModel, solve_colour
 from reconstruct.mosaic.footprints import write_footprints
 from reconstruct.mosaic.grid import (
@@ -34,6 +33,7 @@ from reconstruct.mosaic.grid import (
     mosaic_grid,
     neighbours,
 )
+from reconstruct.mosaic.occluders import find_occluders
 from reconstruct.mosaic.paint import (
     LightTask,
     PaintTask,
@@ -47,7 +47,7 @@ from reconstruct.mosaic.paint import (
 from reconstruct.mosaic.picture_measures import PictureMeasures, measure_picture, outline_view
 from reconstruct.mosaic.reference import ReferencePatch, read_references
 from reconstruct.mosaic.tools import MosaicSetup
-from reconstruct.mosaic.visibility import Water, bodies_folder
+from reconstruct.mosaic.visibility import Water, occluders_folder
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
 from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turned, write_plane
@@ -164,8 +164,8 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     outline = partial(outline_view, dem, sights, heights)
     label = partial(_label, plane)
     dense = painting.workspace / "dense"
-    find_bodies(
-        dense, plane, dem, bodies_folder(sights), executor, label("find what hides the surface")
+    find_occluders(
+        dense, plane, dem, occluders_folder(sights), executor, label("find what hides the surface")
     )
     outlines = list(
         executor.map(outline, model.views, label=label("outline pictures"), task_mib=_TASK_MIB)

@@ -10,8 +10,8 @@ from alice_survey.base.artefacts import atomic_path
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.water import CHANNELS
-from reconstruct.mosaic.bodies import hidden_by, read_bodies
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
+from reconstruct.mosaic.occluders import hidden_by, read_occluders
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.pictures.undistorted import taken_nodes
 from reconstruct.raster import DemGrid
@@ -118,13 +118,13 @@ class GridHeights:
 
 
 def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None = None) -> Visible:
-    """Cells of a DEM that a view sees over it, and past the bodies that stand off it.
+    """Cells of a DEM that a view sees over it and past what stands off it.
 
     Args:
         view: the view.
         dem: heights.
         around: their cells.
-        stored: folder of what is known of the plane; None for no bodies.
+        stored: folder of what is known of the plane; None where nothing stands off the DEM.
     """
     known = np.isfinite(dem)
     part = (0, 0, 0, 0)
@@ -144,7 +144,7 @@ def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None 
         points = np.column_stack([
             around.north_of(rows + 0.5), around.east_of(columns + 0.5), -dem[rows, columns]
         ])  # fmt: skip
-        cells[rows, columns] = ~hidden_by(read_bodies(bodies_folder(stored)), view, points)
+        cells[rows, columns] = ~hidden_by(read_occluders(occluders_folder(stored)), view, points)
     return Visible(cells=cells, west=around.west, north=around.north)
 
 
@@ -161,9 +161,9 @@ def _reached(
     return int(r[0]), int(r[1]), int(c[0]), int(c[1])
 
 
-def bodies_folder(stored: Path) -> Path:
-    """Folder of the bodies that stand off a plane's heights."""
-    return stored / "bodies"
+def occluders_folder(stored: Path) -> Path:
+    """Folder of what stands off a plane's heights."""
+    return stored / "occluders"
 
 
 def visible_path(folder: Path, image: str) -> Path:
@@ -175,7 +175,7 @@ def store_visible(folder: Path, view: View, dem: Float32, around: DemGrid) -> No
     """Write the cells of a DEM that a view sees, so that no tile has to ask again.
 
     Args:
-        folder: for the file; the bodies of the plane are in it.
+        folder: for the file; the occluders of the plane are in it.
         view: the view.
         dem: all of the DEM that the view sees, and that may lie between it and that.
         around: its cells.

@@ -20,12 +20,11 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.records import CloudRecord
+from reconstruct.mosaic.grid import Float32
 from reconstruct.planes import Plane
 from reconstruct.ply import read_header
 from reconstruct.raster import opened_raster, small_cache
 from reconstruct.views.model import View
-
-Float32 = NDArray[np.float32]
 
 _PART = 65_536
 """Points of the cloud, which lie together, to a part."""
@@ -36,7 +35,7 @@ _OFF_CELLS = 3.0
 _HIDES_SPACINGS = 4.0
 """Distance before a cell, in spacings of points, from which a point hides it."""
 _SHRINK = 2
-"""Pixels of a picture to one of those in which bodies are drawn."""
+"""Pixels of a picture to one of those in which occluders are drawn."""
 _COVER = 0.75
 """Half the side of the square that a point covers, in spacings of points."""
 _MARGIN = 1.1
@@ -45,7 +44,7 @@ _TASK_MIB = 100
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bodies:
+class Occluders:
     """Points off the heights of a plane, in parts that stay on disk."""
 
     folder: Path
@@ -60,9 +59,7 @@ class Bodies:
 
     def seen_by(self, view: View) -> Float32:
         """(N, 3) points of the parts that may reach into a view's frame, in the plane's frame."""
-        middle = view.world_from_cam.inv().apply(self.centres) if len(self.centres) else np.empty(
-            (0, 3)
-        )  # fmt: skip
+        middle = view.world_from_cam.inv().apply(self.centres)
         low, high = view.pinhole.slopes(np.array([(0, 0), view.pinhole.size_px]))
         slope = _MARGIN * float(np.hypot(*np.maximum(-low, high)))
         beside = np.hypot(middle[:, 0], middle[:, 1]) - slope * middle[:, 2]
@@ -71,7 +68,7 @@ class Bodies:
         return np.concatenate([np.empty((0, 3), np.float32), *parts])
 
 
-def find_bodies(
+def find_occluders(
     dense: Path, plane: Plane, dem: Path, folder: Path, executor: Executor, label: str
 ) -> None:
     """Write the points of a surface that are off the heights of a plane.
@@ -104,10 +101,10 @@ def find_bodies(
         )
 
 
-def read_bodies(folder: Path) -> Bodies:
-    """What `find_bodies` wrote."""
+def read_occluders(folder: Path) -> Occluders:
+    """What `find_occluders` wrote."""
     with np.load(folder / "index.npz") as index:
-        return Bodies(
+        return Occluders(
             folder=folder,
             numbers=index["numbers"],
             centres=index["centres"],
@@ -152,9 +149,9 @@ def _are_off(points: Array, dem: Path) -> NDArray[np.bool_]:
     return off
 
 
-def hidden_by(bodies: Bodies, view: View, points: Array) -> NDArray[np.bool_]:
-    """(N,) whether bodies hide points (N, 3) of the plane's frame from a view."""
-    standing = bodies.seen_by(view).astype(np.float64)
+def hidden_by(occluders: Occluders, view: View, points: Array) -> NDArray[np.bool_]:
+    """(N,) whether occluders hide points (N, 3) of the plane's frame from a view."""
+    standing = occluders.seen_by(view).astype(np.float64)
     hidden = np.zeros(len(points), np.bool_)
     if not len(standing) or not len(points):
         return hidden
@@ -165,7 +162,7 @@ def hidden_by(bodies: Bodies, view: View, points: Array) -> NDArray[np.bool_]:
     drawn = _drawn(
         view.project(standing) / _SHRINK,
         depth,
-        _COVER * bodies.spacing * focal_px / _SHRINK,
+        _COVER * occluders.spacing * focal_px / _SHRINK,
         (-(-height // _SHRINK), -(-width // _SHRINK)),
     )
     pixels = np.nan_to_num(view.project(points) / _SHRINK, nan=-1.0)
@@ -173,7 +170,7 @@ def hidden_by(bodies: Bodies, view: View, points: Array) -> NDArray[np.bool_]:
     inside = (column >= 0) & (row >= 0) & (row < drawn.shape[0]) & (column < drawn.shape[1])
     own = view.world_from_cam.inv().apply(points[inside])[:, 2]
     nearest = drawn[row[inside], column[inside]]
-    hidden[inside] = nearest < own - _HIDES_SPACINGS * bodies.spacing
+    hidden[inside] = nearest < own - _HIDES_SPACINGS * occluders.spacing
     return hidden
 
 

@@ -1,4 +1,4 @@
-"""Bodies that stand off the heights of a plane, and what they hide from a view, in closed form."""
+"""Occluders off the heights of a plane, and what they hide from a view, in closed form."""
 
 import json
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import local_executor
 from camera_calib.approximation.pinhole_warp import Pinhole
-from reconstruct.mosaic.bodies import Bodies, find_bodies, hidden_by, read_bodies
+from reconstruct.mosaic.occluders import Occluders, find_occluders, hidden_by, read_occluders
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.ply import VERTEX, write_ply
 from reconstruct.views.model import View
@@ -36,8 +36,8 @@ def floor_and_pole() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def bodies(tmp_path_factory: pytest.TempPathFactory) -> Bodies:
-    folder = tmp_path_factory.mktemp("bodies")
+def occluders(tmp_path_factory: pytest.TempPathFactory) -> Occluders:
+    folder = tmp_path_factory.mktemp("occluders")
     floor, pole = floor_and_pole()
     points = np.concatenate([floor, pole])
     offset = np.array([3.0, -2.0, -9.0])
@@ -58,10 +58,10 @@ def bodies(tmp_path_factory: pytest.TempPathFactory) -> Bodies:
     ) as raster:  # fmt: skip
         raster.write(heights, 1)
     with local_executor().started() as executor:
-        find_bodies(
-            folder, LEVEL_PLANE, folder / "dem.tif", folder / "found", executor, "find bodies"
+        find_occluders(
+            folder, LEVEL_PLANE, folder / "dem.tif", folder / "found", executor, "find occluders"
         )
-    return read_bodies(folder / "found")
+    return read_occluders(folder / "found")
 
 
 def view_from(place_enu: np.ndarray, at_enu: np.ndarray) -> View:
@@ -87,19 +87,19 @@ def view_from(place_enu: np.ndarray, at_enu: np.ndarray) -> View:
     )  # fmt: skip
 
 
-def test_the_pole_is_off_the_heights_and_the_floor_is_not(bodies: Bodies) -> None:
+def test_the_pole_is_off_the_heights_and_the_floor_is_not(occluders: Occluders) -> None:
     _, pole = floor_and_pole()
     view = view_from(np.array([0.0, -3.0, FLOOR_M + 1.0]), np.array([0.0, 0.0, FLOOR_M + 0.5]))
-    found = bodies.seen_by(view)
+    found = occluders.seen_by(view)
     assert np.count_nonzero(pole[:, 2] > FLOOR_M + 3.1 * CELL_M) <= len(found) <= len(pole)
     np.testing.assert_allclose(np.hypot(found[:, 0], found[:, 1]), POLE_M, atol=1e-5)
     away = view_from(np.array([0.0, -3.0, FLOOR_M + 1.0]), np.array([0.0, -9.0, FLOOR_M]))
-    assert len(bodies.seen_by(away)) == 0
+    assert len(occluders.seen_by(away)) == 0
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 50.0, 200.0])
 def test_the_floor_behind_the_pole_is_hidden_and_all_else_is_seen(
-    bodies: Bodies, azimuth_deg: float
+    occluders: Occluders, azimuth_deg: float
 ) -> None:
     azimuth = np.radians(azimuth_deg)
     away = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -107,7 +107,7 @@ def test_the_floor_behind_the_pole_is_hidden_and_all_else_is_seen(
     view = view_from(camera, np.array([0.0, 0.0, FLOOR_M]))
     floor, _ = floor_and_pole()
     world = np.column_stack([floor[:, 1], floor[:, 0], -floor[:, 2]])
-    hidden = hidden_by(bodies, view, world)
+    hidden = hidden_by(occluders, view, world)
     # a line of sight goes down: it meets the pole if it would leave it below its top
     sight = floor - camera
     length = np.hypot(sight[:, 0], sight[:, 1])
@@ -118,7 +118,7 @@ def test_the_floor_behind_the_pole_is_hidden_and_all_else_is_seen(
     behind = (beside < POLE_M) & (length > along) & (height < 1.0)
     pixels = view.project(world)
     inside = ((pixels > 4) & (pixels < np.array(SIZE_PX) - 4)).all(axis=1)
-    # the pole's rim is drawn with squares of a spacing and a half, its foot is not a body
+    # the pole's rim is drawn with squares of a spacing and a half, its foot is no occluder
     clear = (np.abs(beside - POLE_M) > 2 * CELL_M) & (np.abs(height - 1.0) > 0.03)
     clear &= inside & ((length - along > POLE_M + 6 * CELL_M) | (length < along))
     assert np.count_nonzero(clear & behind) > 500
