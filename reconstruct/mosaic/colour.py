@@ -343,8 +343,8 @@ def _without_water(
 ) -> tuple[LightSamples, Array]:
     """Samples minus the light that the water adds, and (N, 3) how much less sure they are for it.
 
-    What is wrong with the water's light counts by its share over the share that is left. Where too
-    little is left they are dropped.
+    The usual error counts over the share of light that is left, and the loss between two ranges is
+    off by as much of itself. Where too little is left they are dropped.
     """
     if model.water is None:
         return samples, np.ones((len(samples.views), 3))
@@ -352,7 +352,8 @@ def _without_water(
     beyond = grown(model.growth, np.asarray(samples.ranges), model.light.middle_range)
     left = light - sampled(samples, model.water.added, facts) * beyond
     kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
-    unsure = ((light[kept] / left[kept]) ** 2).mean(axis=1)
+    loss = np.diff(model.weakening(np.asarray(samples.ranges)[kept]), axis=1)[:, 0]
+    unsure = np.hypot((light[kept] / left[kept]).mean(axis=1), loss)
     levels = np.log(left[kept]).astype(np.float32)
     return replace(_part(samples, kept), levels=levels), unsure
 
