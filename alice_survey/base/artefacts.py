@@ -31,7 +31,9 @@ T = TypeVar("T")
 STAGE_FILE = "stage.json"
 _SPENT_FILE = ".spent"
 """In an unfinished stage: the resources used so far."""
-_TEMPORARY = re.compile(r"\..+\.tmp\d+(\..*)?")
+_WRITER = os.urandom(6).hex()
+"""Tells the files of this process from those of others, on whatever machine."""
+_TEMPORARY = re.compile(r"\..+\.tmp[0-9a-f]+(\..*)?")
 """Names that `atomic_path` gives, and those that libraries derive from them."""
 
 
@@ -340,7 +342,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     if path.is_dir():
         raise WorkspaceError(f"{path} is a folder: give the name of a file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.tmp{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.tmp{_WRITER}{path.suffix}")
     try:
         yield temporary
         temporary.replace(path)

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
@@ -14,7 +15,7 @@ from types import TracebackType
 from typing import Any, Generic, ParamSpec, Protocol, TypeVar
 
 from alice_survey.base.errors import AliceError, Level, collected_by, note, say, warn
-from alice_survey.base.run.progress import current, step
+from alice_survey.base.run.progress import TaskSpent, current, step
 
 _PR_SET_PDEATHSIG = 1
 _MESSAGES = "messages_of_task"
@@ -27,10 +28,20 @@ Result = TypeVar("Result")
 P = ParamSpec("P")
 
 
+class Pending(Protocol):
+    """The part of `concurrent.futures.Future` that a pool must provide."""
+
+    def result(self) -> Any:
+        """Wait for the result, or raise the error of the function."""
+
+    def cancel(self) -> Any:
+        """Forget it."""
+
+
 class Pool(Protocol):
     """The part of `concurrent.futures.Executor` that an engine must provide."""
 
-    def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":
+    def submit(self, function: Callable[..., Any], /, *args: Any) -> Pending:
         """Run `function(*args)` in the background; both are picklable, and so is the result."""
 
 
@@ -83,16 +94,10 @@ class Executor:
         """
         if total is None and isinstance(items, Sized):
             total = len(items)
-        workers = self.workers
-        if self._is_local:
-            workers = min(workers, _fitting(task_mib), workers if total is None else max(1, total))
-        if workers <= 1 and self.pool is None:
-            yield from progress(map(function, items), label, total)
-            return
-        with self._running(workers) as pool:
-            is_limited = self.pool is not None and workers < self.workers
-            queued = workers if is_limited else _QUEUED * workers
-            yield from progress(_in_order(pool, function, items, queued), label, total)
+        with step(label, total) as counter:
+            for found in self._results(function, items, total, label, task_mib):
+                yield found.result
+                counter.advance(spent=found.spent)
 
     @contextlib.contextmanager
     def started(self) -> Iterator["Executor"]:
@@ -106,13 +111,28 @@ class Executor:
         with _Processes(self.workers) as pool:
             yield replace(self, pool=pool)
 
-    @contextlib.contextmanager
-    def _running(self, workers: int) -> Iterator[Pool]:
+    def _results(
+        self,
+        function: Callable[[Item], Result],
+        items: Iterable[Item],
+        total: int | None,
+        label: str,
+        task_mib: float,
+    ) -> "Iterator[TaskResult[Result]]":
+        """What tasks give, in the order of the items."""
+        del label  # for engines that show it
+        workers = self.workers
+        if self._is_local:
+            workers = min(workers, _fitting(task_mib), workers if total is None else max(1, total))
         if self.pool is not None:
-            yield self.pool
-            return
-        with _Processes(workers) as pool:
-            yield pool
+            is_limited = workers < self.workers
+            queued = workers if is_limited else _QUEUED * workers
+            yield from in_order(self.pool, function, items, lambda: queued)
+        elif workers <= 1:
+            yield from map(Task(function, collects=False), items)
+        else:
+            with _Processes(workers) as pool:
+                yield from in_order(pool, function, items, lambda: _QUEUED * workers)
 
 
 SERIAL = Executor()
@@ -138,8 +158,8 @@ def run_apart(function: Callable[[Item], Result], item: Item) -> Result:
         BrokenExecutor: they did.
     """
     with _Processes(1) as pool:
-        future: Future[_TaskResult[Result]] = pool.submit(_Task(function), item)
-        return _result(future)
+        answer: TaskResult[Result] = _result(pool.submit(Task(function), item))
+        return answer.result
 
 
 def _fitting(task_mib: float) -> int:
@@ -188,22 +208,30 @@ class _Processes(ProcessPoolExecutor):
 
 
 @dataclass(frozen=True)
-class _TaskResult(Generic[Result]):
+class TaskResult(Generic[Result]):
     """Result of a task, with its notes and warnings."""
 
     result: Result
+    spent: TaskSpent
     messages: list[tuple[Level, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class _Task(Generic[Item, Result]):
+class Task(Generic[Item, Result]):
     """A function whose notes and warnings come back with its result."""
 
     function: Callable[[Item], Result]
+    collects: bool = True
+    """Whether they do; else they are reported at once."""
     says_notes: bool = False
     """Show notes at once as well: they say why the next minute is long."""
 
-    def __call__(self, item: Item) -> _TaskResult[Result]:
+    def __call__(self, item: Item) -> TaskResult[Result]:
+        """Call the function."""
+        began_s = time.process_time()
+        if not self.collects:
+            result = self.function(item)
+            return TaskResult(result, TaskSpent(time.process_time() - began_s))
         messages: list[tuple[Level, str]] = []
 
         def collect(level: Level, text: str) -> None:
@@ -213,23 +241,36 @@ class _Task(Generic[Item, Result]):
 
         with collected_by(collect):
             try:
-                return _TaskResult(self.function(item), messages)
+                result = self.function(item)
+                spent = TaskSpent(time.process_time() - began_s)
+                return TaskResult(result, spent, messages)
             except Exception as error:  # whatever it raises takes its messages along
                 vars(error)[_MESSAGES] = messages
                 raise
 
 
-def _in_order(
-    pool: Pool, function: Callable[[Item], Result], items: Iterable[Item], queued: int
-) -> Iterator[Result]:
+def in_order(
+    pool: Pool,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    most_queued: Callable[[], int],
+) -> Iterator[TaskResult[Result]]:
+    """Run a task for each item on a pool, and yield what they give in the order of the items.
+
+    Args:
+        pool: where tasks run.
+        function: a task.
+        items: what to work on.
+        most_queued: how many may be in flight, now.
+    """
     local = isinstance(pool, _Processes)
     says_notes = local and not current().is_quiet
-    task = _Task(function, says_notes)
-    waiting: deque[Future[_TaskResult[Result]]] = deque()
+    task = Task(function, says_notes=says_notes)
+    waiting: deque[Pending] = deque()
     try:
         for item in items:
             waiting.append(pool.submit(task, item))
-            if len(waiting) >= queued:
+            while len(waiting) >= most_queued():
                 yield _result(waiting.popleft(), shown=says_notes)
         while waiting:
             yield _result(waiting.popleft(), shown=says_notes)
@@ -245,15 +286,15 @@ def _in_order(
                 future.cancel()
 
 
-def _result(future: "Future[_TaskResult[Result]]", *, shown: bool = False) -> Result:
-    """The result of a task, once its notes and warnings are reported here."""
+def _result(future: Pending, *, shown: bool = False) -> TaskResult[Any]:
+    """What a task gives, once its notes and warnings are reported here."""
     try:
-        answer = future.result()
+        answer: TaskResult[Any] = future.result()
     except Exception as error:  # any that the task raised, as above
         _report(vars(error).pop(_MESSAGES, []), shown=shown)
         raise
     _report(answer.messages, shown=shown)
-    return answer.result
+    return answer
 
 
 def _report(messages: list[tuple[Level, str]], *, shown: bool) -> None:

@@ -13,13 +13,16 @@ from alice_survey.cli.options import (
     CONTEXT,
     WORK,
     AsJson,
+    ClusterFile,
     RigCamera,
     Scale,
+    Scheduler,
     SurveyFile,
     Threads,
     Workspace,
     examples,
     executor_of,
+    executor_on,
     print_result,
     with_sessions,
 )
@@ -197,12 +200,18 @@ def fly(
     print_result(*run(["fly"], workspace, survey, flight=changes), as_json)
 
 
-@app.command(epilog=examples("image -w reef --scale 4 --threads 2"))
+@app.command(
+    epilog=examples(
+        "image -w reef --scale 4 --threads 2", "image -w reef --scheduler tcp://10.0.0.1:8786"
+    )
+)
 def image(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
     scale: Scale = None,
     threads: Threads = None,
+    scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Render the stereo pictures.
@@ -211,7 +220,9 @@ def image(
     """
     from alice_survey.survey import run
 
-    print_result(*run(["pool", "image"], workspace, survey, scale, executor_of(threads)), as_json)
+    with executor_on(workspace, threads, scheduler, cluster) as executor:
+        result = run(["pool", "image"], workspace, survey, scale, executor)
+    print_result(*result, as_json)
 
 
 @app.command(
@@ -364,12 +375,16 @@ def calibrate(
     print_result(*result, as_json)
 
 
-@app.command(name="run", epilog=examples("run -w reef --scale 4"))
+@app.command(
+    name="run", epilog=examples("run -w reef --scale 4", "run -w reef --cluster slurm.toml")
+)
 def run_all(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
     scale: Scale = None,
     threads: Threads = None,
+    scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Do the whole loop.
@@ -380,7 +395,9 @@ def run_all(
     from alice_survey.stages import names
     from alice_survey.survey import run
 
-    print_result(*run(names(), workspace, survey, scale, executor_of(threads)), as_json)
+    with executor_on(workspace, threads, scheduler, cluster) as executor:
+        result = run(names(), workspace, survey, scale, executor)
+    print_result(*result, as_json)
 
 
 @app.command(epilog=examples("demo", "demo -w demo --threads 2"))

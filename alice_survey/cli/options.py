@@ -1,10 +1,11 @@
 """Options and behaviour that all commands share."""
 
+import contextlib
 import functools
 import inspect
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -27,6 +28,14 @@ SurveyFile = Annotated[
 ]
 Threads = Annotated[
     int | None, typer.Option(min=1, max=256, help="Cores to use; all when not given.")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Run tasks on the Dask cluster of this scheduler."),
+]
+ClusterFile = Annotated[
+    Path | None,
+    typer.Option("--cluster", metavar="FILE", help="Run tasks on the Dask cluster of this file."),
 ]
 Scale = Annotated[
     int | None,
@@ -53,6 +62,24 @@ def executor_of(threads: int | None) -> "Executor":
     from alice_survey.base.executor import local_executor  # here, so that --help stays quick
 
     return local_executor(threads)
+
+
+@contextlib.contextmanager
+def executor_on(
+    workspace: Path, threads: int | None, scheduler: str | None, cluster: Path | None
+) -> "Iterator[Executor]":
+    """Within this block, where a command runs its tasks: on a cluster if one is given."""
+    if scheduler is None and cluster is None:
+        yield executor_of(threads)
+        return
+    if scheduler is not None and cluster is not None:
+        raise typer.BadParameter("give --scheduler or --cluster, not both")
+    if threads is not None:
+        raise typer.BadParameter("--threads is for this machine: a cluster has its own workers")
+    from alice_survey.base.cluster.engine import cluster_executor
+
+    with cluster_executor(workspace, scheduler, cluster) as executor:
+        yield executor
 
 
 def examples(*lines: str) -> str:

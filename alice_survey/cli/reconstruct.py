@@ -9,11 +9,14 @@ from alice_survey.cli.options import (
     CONTEXT,
     WORK,
     AsJson,
+    ClusterFile,
+    Scheduler,
     SurveyFile,
     Threads,
     Workspace,
     examples,
     executor_of,
+    executor_on,
     print_result,
 )
 
@@ -25,6 +28,7 @@ reconstruct_app = typer.Typer(
     epilog=examples(
         "reconstruct -w reef",
         "reconstruct -w reef --threads 2 --json",
+        "reconstruct -w reef --scheduler tcp://10.0.0.1:8786",
         "reconstruct -w quay --plane level --plane 'wall=facing 180'",
         "reconstruct -w reef --export undistorted",
         "reconstruct -w reef --crs EPSG:32636",
@@ -60,6 +64,8 @@ def reconstruct(
         ),
     ] = None,
     threads: Threads = None,
+    scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn pictures into a model.
@@ -71,13 +77,13 @@ def reconstruct(
         from alice_survey.survey import run
 
         stages = names("calibrate", "reconstruct")
-        executor = executor_of(threads)
-        text, values = run(stages, workspace, survey, None, executor, planes=plane)
-        if export is not None:
-            from reconstruct.export.undistorted import export_undistorted
+        with executor_on(workspace, threads, scheduler, cluster) as executor:
+            text, values = run(stages, workspace, survey, None, executor, planes=plane)
+            if export is not None:
+                from reconstruct.export.undistorted import export_undistorted
 
-            more, values[export] = export_undistorted(workspace, executor)
-            text = f"{text}\n{more}"
+                more, values[export] = export_undistorted(workspace, executor)
+                text = f"{text}\n{more}"
         if crs is not None:
             from reconstruct.export.projected import export_projected
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -27,7 +28,21 @@ _ALIVE_EVERY_S = 5.0
 _TICK_S = 1.0
 _LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
 
+_QUANTILES = 101
+"""Processor times of a step's tasks that are reported, where it has more."""
+
 Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class TaskSpent:
+    """What a task has cost."""
+
+    cpu_s: float
+    sent_bytes: int = 0
+    """Its arguments, where they went to another machine."""
+    received_bytes: int = 0
+    """Its result, from there."""
 
 
 class Step:
@@ -39,13 +54,32 @@ class Step:
         self.done = None if total is None else 0
         self.task = run.begin_task(label, total)
         self.reported_s = run.clock()
+        self._spent: list[TaskSpent] = []
 
-    def advance(self, items: int = 1) -> None:
-        """Count more items as done."""
+    def advance(self, items: int = 1, *, spent: TaskSpent | None = None) -> None:
+        """Count more items as done, one of them a task that has cost something."""
+        if spent is not None:
+            self._spent.append(spent)
         self.done = (self.done or 0) + items
         if self.total is not None and self.done > self.total:
             self.total = self.task.total = None  # more than expected: their number is open
         self._run.advance(self, items)
+
+    @property
+    def cost(self) -> dict[str, Any]:
+        """What the tasks have cost, as facts of an event; nothing where there were none."""
+        if not self._spent:
+            return {}
+        times = sorted(one.cpu_s for one in self._spent)
+        shown = min(len(times), _QUANTILES)
+        picked = [times[round(n * (len(times) - 1) / max(shown - 1, 1))] for n in range(shown)]
+        return {
+            "tasks": len(times),
+            "cpu_s": round(sum(times), 3),
+            "task_cpu_s": [round(time_s, 4) for time_s in picked],
+            "sent_bytes": sum(one.sent_bytes for one in self._spent) or None,
+            "received_bytes": sum(one.received_bytes for one in self._spent) or None,
+        }
 
     @property
     def remaining_s(self) -> float | None:
@@ -156,7 +190,7 @@ class Run:
         with self._lock:
             if step not in self._steps:
                 return
-            self._emit_step("step_finished", step, complete=complete)
+            self._emit_step("step_finished", step, complete=complete, **step.cost)
             self._steps.remove(step)
             self._end_task(step.task)
 

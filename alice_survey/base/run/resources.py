@@ -29,13 +29,23 @@ _PACKAGES = {
 """Packages that affect results, and the distributions that contain them."""
 
 
+_elsewhere_s = 0.0
+"""Processor time of tasks on other machines, since this process began."""
+
+
+def count_elsewhere(cpu_s: float) -> None:
+    """Count the processor time of a task that another machine has done for this process."""
+    global _elsewhere_s
+    _elsewhere_s += cpu_s
+
+
 @dataclass(frozen=True, kw_only=True)
 class Spent:
     """Resources used so far."""
 
     took_s: float = 0.0
     cpu_s: float = 0.0
-    """User and system time of this process and of those it has started."""
+    """User and system time of this process, of those it has started, and of tasks elsewhere."""
     peak_mib: float = 0.0
     """Largest sum of their proportional memory, seen about once a second."""
 
@@ -60,7 +70,7 @@ class Meter:
     """Meter of the resources this process and its descendants use since its creation."""
 
     def __init__(self) -> None:
-        self._started_s, self._cpu_s = time.monotonic(), sum(map(cpu_s, family()))
+        self._started_s, self._cpu_s = time.monotonic(), sum(map(cpu_s, family())) + _elsewhere_s
         self._peak_mib = 0.0
         self._lock = threading.Lock()
 
@@ -72,7 +82,7 @@ class Meter:
             self._peak_mib = max(self._peak_mib, memory)
             return Spent(
                 took_s=time.monotonic() - self._started_s,
-                cpu_s=max(0.0, sum(map(cpu_s, processes)) - self._cpu_s),
+                cpu_s=max(0.0, sum(map(cpu_s, processes)) + _elsewhere_s - self._cpu_s),
                 peak_mib=self._peak_mib,
             )
 
