@@ -14,6 +14,7 @@ import shutil
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
@@ -68,7 +69,12 @@ def cluster_executor(
             the workspace, has other code, or runs several tasks at a time.
     """
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its errors are reported here
-    with connected(scheduler, file) as connection, _store(workspace) as store:
+    with (
+        warnings.catch_warnings(),
+        connected(scheduler, file) as connection,
+        _store(workspace) as store,
+    ):
+        warnings.filterwarnings("ignore", "Sending large graph")
         site = Site(
             folder=str(Path.cwd()),
             store=store,
@@ -148,6 +154,24 @@ class Cluster:
         Raises:
             WorkspaceError: there are none, or one is unfit.
         """
+        checked: dict[str, Any] = {}
+        while not checked:
+            found = self._first_workers()
+            with progress.step("checking workers", len(found)) as counter:
+                for address, about in found.items():
+                    why_unfit = why_threads(about) or self.why_unfit(address)
+                    if why_unfit:
+                        raise WorkspaceError(f"worker {_named(address, about)}: {why_unfit}")
+                    if why_unfit is not None:
+                        checked[address] = about
+                    counter.advance()
+        with self.lost():
+            services = self.client.scheduler_info(n_workers=0)["services"]
+        shown = f"; dashboard: {self.client.dashboard_link}" if "dashboard" in services else ""
+        count = f"{len(checked)} worker{'s' if len(checked) > 1 else ''}"
+        note(f"{count} at {self.where}{shown}")
+
+    def _first_workers(self) -> dict[str, Any]:
         with progress.step("waiting for workers"):
             began_s = time.monotonic()
             while not self.workers():
@@ -157,30 +181,32 @@ class Cluster:
                         f"for each core: dask worker {self.where} --nthreads 1 --nworkers -1"
                     )
                 time.sleep(0.2)
-        found = self.workers()
-        with progress.step("checking workers", len(found)) as counter:
-            for address, about in found.items():
-                why_unfit = why_threads(about) or self._check(address)
-                if why_unfit:
-                    raise WorkspaceError(f"worker {_named(address, about)}: {why_unfit}")
-                counter.advance()
-        note(
-            f"{len(found)} worker{'s' if len(found) > 1 else ''} at {self.where}; dashboard: "
-            f"{self.client.dashboard_link}"
-        )
+        return self.workers()
 
-    def _check(self, address: str) -> str:
-        """Why a worker is unfit. Its answer waits for whatever it is doing."""
+    def why_unfit(self, address: str) -> str | None:
+        """Why a worker is unfit, empty where it is fit; None where it has ended.
+
+        Its answer waits for whatever it is doing.
+        """
         reply = f"reply{next(self.numbers)}"
-        options: dict[str, Any] = {"workers": [address], "pure": False}
         try:
-            self.client.submit(import_module, check_worker.__module__, **options).result()
-            found: str = self.client.submit(check_worker, self.site, reply, **options).result()
+            if self._asked(address, import_module, check_worker.__module__) is None:
+                return None
+            found: str | None = self._asked(address, check_worker, self.site, reply)
         except ImportError as error:
             return f"it has no alice-survey ({error}): install the same version there"
-        if not found and not (self.site.store / reply).exists():
-            found = f"{self.site.store} is another folder there"
+        if found == "" and not (self.site.store / reply).exists():
+            return f"{self.site.store} is another folder there"
         return found
+
+    def _asked(self, address: str, function: Callable[..., Any], *args: Any) -> Any:
+        """Result of a function on one worker; None where it has ended."""
+        with self.lost():
+            future = self.client.submit(function, *args, workers=[address], pure=False)
+            while address in self.workers():
+                with contextlib.suppress(TimeoutError):
+                    return future.result(timeout=_LOOK_EVERY_S)
+        return None
 
     def workers(self) -> dict[str, Any]:
         """What is known of each worker, by its address; a few seconds old at most."""
@@ -404,8 +430,5 @@ class _Submitted:
 
     def _recheck(self, address: str) -> str:
         """Why a worker whose task failed is unfit, if it is."""
-        cluster = self._tasks.cluster
-        if address not in cluster.fit():
-            return "it is gone"
-        with cluster.lost():
-            return cluster._check(address)
+        found = self._tasks.cluster.why_unfit(address)
+        return "it has ended" if found is None else found
