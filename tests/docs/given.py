@@ -223,6 +223,7 @@ def _reconstruction(folder: Path, made: Made) -> None:
 
 GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/big-survey.md": _big_survey,
+    "how-to/cluster.md": _reef,
     "how-to/colour-camera.md": _colour_camera,
     "how-to/divers.md": _divers,
     "how-to/no-navigation.md": _no_navigation,

@@ -1,6 +1,7 @@
 """Where a Dask cluster is: the address of a scheduler, or a file that describes one."""
 
 import contextlib
+import logging
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
     from distributed.security import Security
 
 _CONNECT_S = 20
+_LOOPBACK = {
+    "LocalCluster": {
+        "dashboard_address": "127.0.0.1:0",
+        "worker_dashboard_address": "127.0.0.1:0",
+    }
+}
+"""Options of classes without which their pages can be opened from other machines."""
 
 
 class TlsConfig(Config):
@@ -86,7 +94,7 @@ def connected(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
         raise WorkspaceError(
             "a cluster needs Dask: pip install 'alice-survey[cluster]', here and on the workers"
         ) from None
-
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its errors are reported here
     config = ClusterConfig(address=scheduler) if file is None else read_cluster_file(file)
     with contextlib.ExitStack() as stack:
         where: dict[str, Any]
@@ -164,7 +172,9 @@ def _started(config: ClusterConfig) -> Iterator[Any]:
             "'dask_jobqueue.SLURMCluster' (pip install dask-jobqueue) or 'distributed.LocalCluster'"
         ) from None
     security = config.security()
-    options = config.options if security is None else {**config.options, "security": security}
+    options = {**_LOOPBACK.get(name, {}), **config.options}
+    if security is not None:
+        options["security"] = security
     try:
         cluster = kind(**options)
     except (TypeError, ValueError, OSError, RuntimeError) as error:

@@ -7,7 +7,6 @@ same. Dask moves tasks of workers that it misses; the rest is here.
 
 import contextlib
 import itertools
-import logging
 import os
 import pickle
 import shutil
@@ -68,7 +67,6 @@ def cluster_executor(
         WorkspaceError: Dask is missing, no scheduler or worker answers, or a worker does not see
             the workspace, has other code, or runs several tasks at a time.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its errors are reported here
     with (
         warnings.catch_warnings(),
         connected(scheduler, file) as connection,
