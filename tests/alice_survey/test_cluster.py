@@ -259,7 +259,7 @@ def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
                 kill(machines.scheduler.pid)
                 _, said = run.communicate()
                 assert run.returncode == 1
-                assert "was lost" in said.decode().splitlines()[-1]
+                assert "was lost" in said.decode().splitlines()[-1], said.decode()
                 machines.stop()
                 machines.start()
                 run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)

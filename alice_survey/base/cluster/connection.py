@@ -53,10 +53,21 @@ class ClusterConfig(Config):
     tls: TlsConfig | None = None
 
     def security(self) -> "Security | None":
-        """How to connect; None for what Dask's own configuration says."""
+        """How to connect; None for what Dask's own configuration says.
+
+        Raises:
+            ConfigError: the address is of an encrypted connection, and no file is named.
+        """
         from distributed.security import Security
 
         if self.tls is None:
+            own = Security()  # of Dask's configuration
+            encrypted = (self.address or "").startswith("tls:")
+            if encrypted and not own.get_connection_args("client").get("ssl_context"):
+                raise ConfigError(
+                    f"{self.address}: no certificates: name them under [tls] of a cluster file "
+                    "(--cluster), or in Dask's configuration"
+                )
             return None
         return Security(
             require_encryption=True,
@@ -94,7 +105,8 @@ def connected(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
         raise WorkspaceError(
             "a cluster needs Dask: pip install 'alice-survey[cluster]', here and on the workers"
         ) from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its errors are reported here
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what ends a run is reported here
     config = ClusterConfig(address=scheduler) if file is None else read_cluster_file(file)
     with contextlib.ExitStack() as stack:
         where: dict[str, Any]
