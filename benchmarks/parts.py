@@ -153,6 +153,13 @@ PARTS = (
         long=True,
     ),
     Part(
+        name="cluster",
+        module="cluster",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+        packages=("distributed",),
+    ),
+    Part(
         name="reconstruct-peers",
         module="reconstruct",
         arguments=_reconstruct("peers"),

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 STORE = ".cluster"
 """Folder of a workspace for values that tasks share, while a run lasts."""
-_QUEUED = 4
-"""Tasks in flight for each worker."""
 _WAIT_S = 30.0
 """For the first worker of a scheduler, and before a missing worker is reported."""
 _LOOK_EVERY_S = 2.0
@@ -49,6 +47,11 @@ _PATIENCE_S, _TIMES_LONGEST = 600.0, 20.0
 _GOES_ON = "the same command goes on from here"
 _MEMORY = "MEMORY"
 """Resource of workers that Dask's documentation gives that name, in bytes."""
+
+
+def most_in_flight(workers: int) -> int:
+    """Tasks sent whose results are not taken: enough that a long one holds few others back."""
+    return 32 + 4 * workers
 
 
 @contextlib.contextmanager
@@ -301,7 +304,7 @@ class _Tasks:
 
     def most_queued(self) -> int:
         """How many tasks may be in flight."""
-        return _QUEUED * max(1, len(self.cluster.fit()))
+        return most_in_flight(len(self.cluster.fit()))
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> "_Submitted":
         """Send a task to the scheduler."""

@@ -1,0 +1,85 @@
+"""The model of a cluster against closed forms, and against events that a run writes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.base.cluster.engine import most_in_flight
+from alice_survey.base.executor import SERIAL
+from alice_survey.base.run import progress
+from alice_survey.base.run.events import EventFile
+from benchmarks.cluster_model import Network, RecordedStage, RecordedStep, makespan, recorded
+
+FREE = Network(task_s=0.0, latency_s=0.0, bytes_per_s=1e30)
+
+
+def step(times: list[float] | np.ndarray, *, bytes_each: float = 0.0) -> RecordedStep:
+    return RecordedStep(
+        label="step",
+        task_s=np.asarray(times, dtype=np.float64),
+        sent_bytes=bytes_each,
+        received_bytes=bytes_each,
+    )
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5, 16])
+def test_equal_tasks_run_in_rounds(workers: int) -> None:
+    rounds = -(-40 // workers)
+    assert makespan(step([3.0] * 40), workers, FREE) == pytest.approx(3.0 * rounds)
+
+
+@pytest.mark.parametrize("workers", [1, 3, 64])
+def test_a_step_takes_no_less_than_its_bounds_and_no_more_than_grahams(workers: int) -> None:
+    """Tasks given to whoever is free take at most 2 - 1/W times the optimum (Graham, 1969)."""
+    times = np.random.default_rng(3).lognormal(size=most_in_flight(workers))
+    least = max(times.sum() / workers, times.max())
+    found = makespan(step(times), workers, FREE)
+    assert least <= found * (1 + 1e-12)
+    assert found <= (times.sum() - times.max()) / workers + times.max() + 1e-9
+
+
+def test_sending_is_serial_and_waiting_is_not() -> None:
+    network = Network(task_s=0.01, latency_s=0.5, bytes_per_s=100.0)
+    quick = step([1e-6] * 1000, bytes_each=0.0)
+    assert makespan(quick, 10_000, network) == pytest.approx(1000 * 0.01 + 2 * 0.5, rel=1e-3)
+    heavy = step([1e-6] * 10, bytes_each=100.0)  # a second there and a second back
+    assert makespan(heavy, 10_000, network) == pytest.approx(10 * 1.01 + 1.0 + 10.0, rel=0.1)
+
+
+def test_results_that_are_taken_in_order_hold_others_back() -> None:
+    """Of two workers one is long with the first task; the other gets no more than are in flight."""
+    times = [1000.0] + [1.0] * 140
+    more = 140 - (most_in_flight(2) - 1)
+    assert makespan(step(times), 2, FREE) == pytest.approx(1000.0 + more / 2, abs=1.0)
+
+
+def test_serial_work_bounds_what_workers_gain() -> None:
+    """Amdahl's law (1967)."""
+    stage = RecordedStage(name="stage", serial_s=10.0, steps=[step([1.0] * 90)])
+    assert stage.times(1, FREE) == pytest.approx(100.0)
+    assert stage.times(90, FREE) == pytest.approx(11.0)
+    twice = stage.scaled(2.0)
+    assert twice.times(1, FREE) == pytest.approx(200.0)
+    assert twice.times(90, FREE) == pytest.approx(22.0)
+
+
+def _work(number: int) -> int:
+    return sum(range(20_000 * (1 + number % 3)))
+
+
+def test_events_of_a_run_are_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    run = progress.Run(files=[EventFile(path)], ticks=False)
+    with progress.reported_to(run), progress.stage("stage") as finish:
+        list(SERIAL.map(_work, range(240), label="work"))
+        finish(took_s=9.0, cpu_s=7.0, peak_mib=1.0)
+
+    (stage,) = recorded(path, ["stage"])
+
+    (found,) = stage.steps
+    assert (found.label, len(found.task_s)) == ("work", 240)
+    assert 0.0 < found.task_s.min() < found.task_s.max()
+    assert stage.serial_s + found.task_s.sum() == pytest.approx(7.0)
+    with pytest.raises(ValueError, match="other"):
+        recorded(path, ["other"])
