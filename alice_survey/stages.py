@@ -105,7 +105,8 @@ class StageSpec:
 
         def work(folder: Path) -> None:
             do: StageWork = getattr(import_module(module), function)
-            do(workspace, folder, executor, **taken)
+            with executor.started() as started:
+                do(workspace, folder, started, **taken)
 
         return run_stage(workspace, self.stage(workspace, config), work)
 

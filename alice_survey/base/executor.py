@@ -124,12 +124,12 @@ class Executor:
         workers = self.workers
         if self._is_local:
             workers = min(workers, _fitting(task_mib), workers if total is None else max(1, total))
-        if self.pool is not None:
+        if workers <= 1 and self._is_local:
+            yield from map(Task(function, collects=False), items)
+        elif self.pool is not None:
             is_limited = workers < self.workers
             queued = workers if is_limited else _QUEUED * workers
             yield from in_order(self.pool, function, items, lambda: queued)
-        elif workers <= 1:
-            yield from map(Task(function, collects=False), items)
         else:
             with _Processes(workers) as pool:
                 yield from in_order(pool, function, items, lambda: _QUEUED * workers)

@@ -93,13 +93,7 @@ def run_mapping(
         ImageError: there are too few pictures, or they are not those of the rig.
         ReconstructionError: the pictures give no model.
     """
-    with executor.started() as started:
-        _map(read_inputs(workspace), reconstruct, seed, started, folder)
-
-
-def _map(
-    inputs: Inputs, settings: ReconstructConfig, seed: int, executor: Executor, folder: Path
-) -> None:
+    inputs, settings = read_inputs(workspace), reconstruct
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
     features, counts = _find_all(inputs, folder / "features", settings, executor)
     warps, distances = _warps(inputs, features, settings, executor)
