@@ -5,6 +5,7 @@ maps of neighbouring views. What only one match claims and nothing confirms is l
 """
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -101,20 +102,32 @@ def without_mixed(disparity_px: Float32) -> Float32:
     return np.where(known & (high - low <= _JUMP_PX * 2), disparity_px, np.float32(np.nan))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PartnerDepth:
+    """Depth of a view from one partner."""
+
+    depth: Float32
+    """(H, W) along the view's axis, NaN where unknown."""
+    focal_baseline: float
+    """Focal length in pixels times baseline, by which disparity becomes depth."""
+
+    def sigma(self, match_sigma_px: float) -> Float32:
+        """Standard deviation (H, W) of the depth, for that of a match."""
+        return self.depth * self.depth * np.float32(match_sigma_px / self.focal_baseline)
+
+
 def pair_depth(
-    views: tuple[View, View], looks: tuple[Look, Look], points_world: Array, match_sigma_px: float
-) -> tuple[Float32, Float32] | None:
+    views: tuple[View, View], looks: tuple[Look, Look], points_world: Array
+) -> PartnerDepth | None:
     """Depth of a reference view from one partner.
 
     Args:
         views: the reference, and the partner to match it with.
         looks: what they show.
         points_world: (N, 3) points that bound the depth.
-        match_sigma_px: standard deviation of a match.
 
     Returns:
-        (H, W) depth along the reference's axis and its standard deviation, NaN where unknown; None
-        where the pair cannot be rectified.
+        None where the pair cannot be rectified.
     """
     pair = rectify(*views, points_world)
     if pair is None:
@@ -126,8 +139,7 @@ def pair_depth(
     disparity[~_valid(usable, pair.rect_from_reference, pair)] = np.nan
     _drop_outside(disparity, _valid(usable_partner, pair.rect_from_partner, pair))
     depth = depth_in_reference(*views, pair, without_mixed(disparity))
-    sigma = depth * depth * np.float32(match_sigma_px / (pair.focal_px * pair.baseline))
-    return depth, sigma
+    return PartnerDepth(depth=depth, focal_baseline=pair.focal_px * pair.baseline)
 
 
 def _valid(valid: NDArray[np.bool_], homography: Array, pair: Rectification) -> NDArray[np.bool_]:
