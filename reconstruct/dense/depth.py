@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
+from reconstruct.dense.view_store import StoredDepth
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, warped_at
 
@@ -214,8 +215,8 @@ def count_witnesses(
     sigma: Float32,
     slopes: Float32,
     other_from_ref: Array,
-    other_depth: Float32,
-    other_sigma: Float32,
+    other: StoredDepth,
+    factor: float,
     other_lens: KernelLens,
     gate: float,
 ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
@@ -226,8 +227,8 @@ def count_witnesses(
         sigma: (H, W) of it.
         slopes: (H, W, 2) ray slopes of the reference, see `range_shift.slopes_of`.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
-        other_depth: (h, w) of the other view.
-        other_sigma: (h, w) of it.
+        other: (h, w) depth of the other view.
+        factor: on its standard deviations.
         other_lens: of the other view.
         gate: largest difference in standard deviations of the difference.
 
@@ -238,9 +239,11 @@ def count_witnesses(
     height, width = depth.shape
     confirmed = np.zeros((height, width), np.int8)
     refuted = np.zeros((height, width), np.int8)
+    levels, shares, depth_of, share_of = other
+    rows, columns = levels.shape
     pinhole, field, inverse_working = other_lens
     t = other_from_ref
-    middle_x, middle_y = 0.5 * other_depth.shape[1], 0.5 * other_depth.shape[0]
+    middle_x, middle_y = 0.5 * columns, 0.5 * rows
     reach_x, reach_y = (1 + _SHIFTED) * middle_x, (1 + _SHIFTED) * middle_y
     for row in range(height):
         for column in range(width):
@@ -259,12 +262,10 @@ def count_witnesses(
                 continue
             at_x, at_y = warped_at(field, inverse_working, at_x, at_y, 1.0 / c)
             u, v = math.floor(at_x), math.floor(at_y)
-            if u < 0 or v < 0 or u >= other_depth.shape[1] or v >= other_depth.shape[0]:
+            if u < 0 or v < 0 or u >= columns or v >= rows or levels[v, u] == 0:
                 continue
-            there = other_depth[v, u]
-            if math.isnan(there):
-                continue
-            s, r = sigma[row, column], other_sigma[v, u]
+            there = depth_of[levels[v, u]]
+            s, r = sigma[row, column], factor * there * share_of[shares[v, u]]
             tolerance = gate * math.sqrt(s * s + r * r)
             if abs(there - c) <= tolerance:
                 confirmed[row, column] = 1

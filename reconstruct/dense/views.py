@@ -225,11 +225,12 @@ def disagreement(task: ViewTask) -> float:
     points = _world_points(task.view, depth, rows, columns)
     parts = []
     for number, other in task.others:
-        there, there_sigma = task.store.load_depth(number, "fine")
+        level, share, depths, shares = task.store.stored_depth(number, "fine")
         seen = in_frame(other, points)
         at = np.floor(other.project(points[seen])).astype(np.int64)
         z = other.world_from_cam.inv().apply(points[seen])[:, 2]
-        other_z, other_sigma = there[at[:, 1], at[:, 0]], there_sigma[at[:, 1], at[:, 0]]
+        other_z = depths[level[at[:, 1], at[:, 0]]]
+        other_sigma = other_z * shares[share[at[:, 1], at[:, 0]]]
         own = sigma[rows, columns][seen]
         parts.append((other_z - z) / np.hypot(own, other_sigma))
     apart = np.concatenate(parts) if parts else np.empty(0)
@@ -263,14 +264,13 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:
     slopes = slopes_of(depth, view.kernel_lens)
     for number, other in task.others:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
-        other_depth, other_sigma = store.load_depth(number, "fine")
         seen, through = count_witnesses(
             depth,
             sigma,
             slopes,
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
-            other_depth,
-            other_sigma * np.float32(sigma_factor),
+            store.stored_depth(number, "fine"),
+            sigma_factor,
             other.kernel_lens,
             GATE_SIGMAS,
         )
