@@ -19,7 +19,7 @@ from alice_survey.base.plane_settings import parse_planes
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_scale, probed
-from reconstruct.dense.moving import COMPARED, clear_moving, mask_moving, show_moving
+from reconstruct.dense.moving import COMPARED, clear_moving, keep_look, mask_moving, show_moving
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
 from reconstruct.dense.stereo_pairs import (
@@ -96,7 +96,9 @@ def run_dense(
     moving = []
     clear_moving(folder)
     if reconstruct.mask_moving:
-        mask = partial(mask_moving, workspace, folder, light)
+        keep = partial(keep_look, light)
+        _drain(executor.map(keep, tasks([()] * len(views)), label="even out light"))
+        mask = partial(mask_moving, workspace, folder)
         others = tasks(neighbours(model, COMPARED))
         moving = list(executor.map(mask, others, label="mask what moves"))
         show_moving(workspace, folder, moving)

@@ -209,8 +209,7 @@ def map_from_poses(
     write_database(database, seen, cam_from_rig)
     frames = station_frames(seen.images)
     poses = {frame: rig_from_world[s] for frame, s in frames.items() if s in rig_from_world}
-    with progress.step("put the model on its rig"):
-        model = triangulate_and_adjust(database, poses, options)
+    model = triangulate_and_adjust(database, poses, options)
     model = _grown(model, len(seen.images), scratch, options)
     model = _grown(model, len(seen.images), scratch, _undemanding(options))
     shutil.rmtree(scratch)
