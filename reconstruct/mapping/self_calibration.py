@@ -38,6 +38,12 @@ SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""
 _LEAST_STATIONS = 3
 """Stations with a camera and the first one from which its place on the rig is taken."""
+_TOLERANCE = 1e-6
+"""Relative change of the cost at which the calibration ends. Going on until the gradient vanishes
+takes half as long again and moves a focal length of 1,700 px by 0.06 px."""
+_ROUNDS = 2
+"""Times that a model is put on its rig: once its cameras suit the rig, a quarter more of the
+observations fit."""
 _CONTRADICTION = 1.05
 """EXIF's focal length goes when freeing it lowers the mean reprojection error by this factor."""
 _LARGEST_ASPECT, _LARGEST_TANGENTIAL = 0.03, 0.03
@@ -83,19 +89,15 @@ def map_self_calibrated(
             )
             warn(notes[0])
     if cam_from_rig is not None:
-        cameras = {
-            name: pycolmap.Camera(model.cameras[number].todict())
-            for number, name in enumerate(seen.cameras, 1)
-            if number in model.cameras
-        }
-        model = map_from_poses(
-            replace(seen, cameras={**seen.cameras, **cameras}),
-            cam_from_rig,
-            poses_on_rig(model, seen.images, cam_from_rig),
-            folder,
-            seed,
-            free="distortion" if known else "all",
-        )
+        for _ in range(_ROUNDS):
+            model = map_from_poses(
+                replace(seen, cameras={**seen.cameras, **_cameras_of(model, list(seen.cameras))}),
+                cam_from_rig,
+                poses_on_rig(model, seen.images, cam_from_rig),
+                folder,
+                seed,
+                free="distortion" if known else "all",
+            )
         found = [model, *found[1:]]
     model, kept = calibrate_fully(model, keep_focal=known)
     if known:
@@ -122,6 +124,15 @@ def map_self_calibrated(
         rig_factor=factor,
         notes=(*notes, *report_left_out(found)),
     )
+
+
+def _cameras_of(model: pycolmap.Reconstruction, names: Sequence[str]) -> dict[str, pycolmap.Camera]:
+    """The cameras of a model by name, as they are calibrated so far."""
+    return {
+        name: pycolmap.Camera(model.cameras[number].todict())
+        for number, name in enumerate(names, 1)
+        if number in model.cameras
+    }
 
 
 def self_calibrated_warp(camera: pycolmap.Camera) -> PinholeWarp:
@@ -248,6 +259,7 @@ def _adjust(model: pycolmap.Reconstruction, *, focal: bool) -> None:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = direct_solver(pycolmap.BundleAdjustmentOptions())
     options.refine_focal_length = focal
+    options.ceres.solver_options.function_tolerance = _TOLERANCE
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
 
