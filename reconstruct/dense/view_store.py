@@ -148,13 +148,14 @@ def _codes(
 
 @lru_cache(maxsize=16)
 def _depths(least: float, step: float) -> NDArray[np.float32]:
-    depths = np.exp(least + (np.arange(_DEPTH_CODES + 1) - 1) * step).astype(np.float32)
+    codes = np.arange(_DEPTH_CODES + 1)
+    depths = np.asarray(np.exp(least + (codes - 1) * step), np.float32)
     depths[0] = np.nan
     return depths
 
 
 @lru_cache(maxsize=1)
 def _shares() -> NDArray[np.float32]:
-    shares = (_SIGMA_LEAST * np.exp((np.arange(256) - 1) * _SIGMA_STEP)).astype(np.float32)
+    shares = np.asarray(_SIGMA_LEAST * np.exp((np.arange(256) - 1) * _SIGMA_STEP), np.float32)
     shares[0] = np.nan
     return shares
