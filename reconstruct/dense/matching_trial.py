@@ -71,7 +71,7 @@ def find_scale(
         for number in chosen
     ]
     largest = min(matching_scale(views[number]) for number in chosen)
-    scales = [largest / 2**n for n in range(_SCALES)]
+    scales = [largest * 0.5**n for n in range(_SCALES)]
     shares: list[float] = []
     for tried in (scales[:2], scales[2:]):  # the third is asked only where the second is better
         found = executor.map(partial(probe, workspace, tried), tasks, label="try matching")

@@ -21,10 +21,10 @@ _ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
 @compiled(error_model="numpy", fastmath=FAST)
 def _across(picture: Any, left: int, row: int, a: float, b: float, c: float, d: float) -> float:
     """Four pixels of a row, weighted."""
-    return (
-        a * picture[row, left] + b * picture[row, left + _NEXT]
-        + c * picture[row, left + _NEXT + _NEXT] + d * picture[row, left + _NEXT + _NEXT + _NEXT]
-    )  # fmt: skip
+    level: float = a * picture[row, left] + b * picture[row, left + _NEXT]
+    left += _NEXT + _NEXT
+    level += c * picture[row, left] + d * picture[row, left + _NEXT]
+    return level
 
 
 @compiled(error_model="numpy", fastmath=FAST)
