@@ -19,7 +19,7 @@ _ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _across(picture: Any, left: int, row: int, a: float, b: float, c: float, d: float) -> float:
+def _across(picture: Any, left: Any, row: Any, a: float, b: float, c: float, d: float) -> float:
     """Four pixels of a row, weighted."""
     level: float = a * picture[row, left] + b * picture[row, left + _NEXT]
     left += _NEXT + _NEXT
