@@ -1,6 +1,7 @@
 """The command line: each command parses, calls and prints; the work is elsewhere."""
 
 import gc
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -444,6 +445,9 @@ def main() -> None:
     # Modules leave many objects that stay: looking through them again and again for garbage while
     # they are loaded takes a tenth of a command's start.
     gc.set_threshold(100_000)
+    # Before numpy is loaded. Its threads wait for each other by spinning: products of small
+    # matrices then cost several times the work, and rounding would depend on the number of cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
     except Exception as error:  # libraries raise known faults as all kinds; bugs are raised again

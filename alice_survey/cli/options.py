@@ -61,6 +61,10 @@ def executor_of(threads: int | None) -> "Executor":
     """Where a command runs its tasks, by its option `--threads`."""
     from alice_survey.base.executor import local_executor  # here, so that --help stays quick
 
+    if threads is not None:
+        import cv2
+
+        cv2.setNumThreads(threads)
     return local_executor(threads)
 
 

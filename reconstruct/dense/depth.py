@@ -5,6 +5,7 @@ maps of neighbouring views. What only one match claims and nothing confirms is l
 """
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
+from reconstruct.dense.view_store import StoredDepth
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, warped_at
 
@@ -101,20 +103,32 @@ def without_mixed(disparity_px: Float32) -> Float32:
     return np.where(known & (high - low <= _JUMP_PX * 2), disparity_px, np.float32(np.nan))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PartnerDepth:
+    """Depth of a view from one partner."""
+
+    depth: Float32
+    """(H, W) along the view's axis, NaN where unknown."""
+    focal_baseline: float
+    """Focal length in pixels times baseline, by which disparity becomes depth."""
+
+    def sigma(self, match_sigma_px: float) -> Float32:
+        """Standard deviation (H, W) of the depth, for that of a match."""
+        return self.depth * self.depth * np.float32(match_sigma_px / self.focal_baseline)
+
+
 def pair_depth(
-    views: tuple[View, View], looks: tuple[Look, Look], points_world: Array, match_sigma_px: float
-) -> tuple[Float32, Float32] | None:
+    views: tuple[View, View], looks: tuple[Look, Look], points_world: Array
+) -> PartnerDepth | None:
     """Depth of a reference view from one partner.
 
     Args:
         views: the reference, and the partner to match it with.
         looks: what they show.
         points_world: (N, 3) points that bound the depth.
-        match_sigma_px: standard deviation of a match.
 
     Returns:
-        (H, W) depth along the reference's axis and its standard deviation, NaN where unknown; None
-        where the pair cannot be rectified.
+        None where the pair cannot be rectified.
     """
     pair = rectify(*views, points_world)
     if pair is None:
@@ -126,8 +140,7 @@ def pair_depth(
     disparity[~_valid(usable, pair.rect_from_reference, pair)] = np.nan
     _drop_outside(disparity, _valid(usable_partner, pair.rect_from_partner, pair))
     depth = depth_in_reference(*views, pair, without_mixed(disparity))
-    sigma = depth * depth * np.float32(match_sigma_px / (pair.focal_px * pair.baseline))
-    return depth, sigma
+    return PartnerDepth(depth=depth, focal_baseline=pair.focal_px * pair.baseline)
 
 
 def _valid(valid: NDArray[np.bool_], homography: Array, pair: Rectification) -> NDArray[np.bool_]:
@@ -202,8 +215,8 @@ def count_witnesses(
     sigma: Float32,
     slopes: Float32,
     other_from_ref: Array,
-    other_depth: Float32,
-    other_sigma: Float32,
+    other: StoredDepth,
+    factor: float,
     other_lens: KernelLens,
     gate: float,
 ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
@@ -214,8 +227,8 @@ def count_witnesses(
         sigma: (H, W) of it.
         slopes: (H, W, 2) ray slopes of the reference, see `range_shift.slopes_of`.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
-        other_depth: (h, w) of the other view.
-        other_sigma: (h, w) of it.
+        other: (h, w) depth of the other view.
+        factor: on its standard deviations.
         other_lens: of the other view.
         gate: largest difference in standard deviations of the difference.
 
@@ -226,9 +239,11 @@ def count_witnesses(
     height, width = depth.shape
     confirmed = np.zeros((height, width), np.int8)
     refuted = np.zeros((height, width), np.int8)
+    levels, shares, depth_of, share_of = other
+    rows, columns = levels.shape
     pinhole, field, inverse_working = other_lens
     t = other_from_ref
-    middle_x, middle_y = 0.5 * other_depth.shape[1], 0.5 * other_depth.shape[0]
+    middle_x, middle_y = 0.5 * columns, 0.5 * rows
     reach_x, reach_y = (1 + _SHIFTED) * middle_x, (1 + _SHIFTED) * middle_y
     for row in range(height):
         for column in range(width):
@@ -247,12 +262,10 @@ def count_witnesses(
                 continue
             at_x, at_y = warped_at(field, inverse_working, at_x, at_y, 1.0 / c)
             u, v = math.floor(at_x), math.floor(at_y)
-            if u < 0 or v < 0 or u >= other_depth.shape[1] or v >= other_depth.shape[0]:
+            if u < 0 or v < 0 or u >= columns or v >= rows or levels[v, u] == 0:
                 continue
-            there = other_depth[v, u]
-            if math.isnan(there):
-                continue
-            s, r = sigma[row, column], other_sigma[v, u]
+            there = depth_of[levels[v, u]]
+            s, r = sigma[row, column], factor * there * share_of[shares[v, u]]
             tolerance = gate * math.sqrt(s * s + r * r)
             if abs(there - c) <= tolerance:
                 confirmed[row, column] = 1

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from reconstruct.dense.view_store import StoredDepth
 from reconstruct.views.range_shift import FAST, KernelLens, warped_at
 
 Float32 = NDArray[np.float32]
@@ -29,8 +30,8 @@ def look_at_points(
     points: Float32,
     sigmas: Float32,
     cam_from_enu: Array,
-    depth: Float32,
-    sigma: Float32,
+    depth: StoredDepth,
+    factor: float,
     lens: KernelLens,
     cell: float,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -43,15 +44,16 @@ def look_at_points(
         points: (N, 3) east, north, up from an offset.
         sigmas: (N,) of the points.
         cam_from_enu: (3, 4) transform of such points into the view's camera.
-        depth: (H, W) of the view, NaN where unknown.
-        sigma: (H, W) of it.
+        depth: (H, W) of the view.
+        factor: on its standard deviations.
         lens: of the view.
         cell: distance between neighbouring points of the surface.
 
     Returns:
         (N,) 1 where the view finds the point, and (N,) 1 where it sees through it.
     """
-    height, width = depth.shape
+    levels, shares, depth_of, share_of = depth
+    height, width = levels.shape
     found = np.zeros(points.shape[0], np.uint8)
     through = np.zeros(points.shape[0], np.uint8)
     pinhole, field, inverse_working = lens
@@ -72,11 +74,12 @@ def look_at_points(
         known, beyond, here = 0, 0, False
         for i in range(row - 1, row + 2):
             for j in range(column - 1, column + 2):
-                there = depth[i, j]
-                if math.isnan(there):
+                if levels[i, j] == 0:
                     continue
                 known += 1
-                tolerance = cell + _GATE * math.sqrt(sigmas[n] ** 2 + sigma[i, j] ** 2)
+                there = depth_of[levels[i, j]]
+                sigma = factor * there * share_of[shares[i, j]]
+                tolerance = cell + _GATE * math.sqrt(sigmas[n] ** 2 + sigma**2)
                 if abs(there - z) <= tolerance:
                     here = True
                 elif there > z:

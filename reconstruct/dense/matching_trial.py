@@ -1,12 +1,10 @@
-"""A look at a few pairs before the work: at which scale to match, and how well matches agree.
+"""A look at a few views before the work: at which scale to match, and how well matches agree.
 
 In dim or turbid water the finest detail of a picture is noise: half the resolution then finds more
-matches, and better ones. How far depths from different partners differ, in units of what a match of
-`MATCH_SIGMA_PX` would give, shows the true precision: noise, calibration and poses together.
+matches, and better ones.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -18,7 +16,8 @@ from numpy.typing import NDArray
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense.depth import MATCH_SIGMA_PX, Look, pair_depth
+from reconstruct.dense.depth import MATCH_SIGMA_PX, Look, PartnerDepth, pair_depth
+from reconstruct.dense.rectify import rectify
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View, scaled_view
@@ -31,17 +30,9 @@ _WORTH = 1.15
 """Half the resolution is taken where it finds this many times the depths."""
 _LEAST_COMMON = 500
 """Pixels that two partners must share for their difference to count."""
+_COMPARED = 3
+"""Partners of a view whose depths are compared."""
 _SIGMA_LIMITS_PX = (0.15, 1.5)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """How to match the pictures of a survey."""
-
-    scale: float
-    """Factor by which pictures are shrunk for matching."""
-    match_sigma_px: float
-    """Standard deviation of a match in pixels of the shrunk pictures."""
 
 
 def matching_scale(view: View) -> float:
@@ -52,44 +43,52 @@ def matching_scale(view: View) -> float:
     return scale
 
 
-def find_conditions(
+def probed(partners: Sequence[Sequence[int]]) -> list[int]:
+    """A few views with partners, spread over the survey."""
+    able = [number for number, found in enumerate(partners) if found]
+    return able[:: max(1, len(able) // _PROBES)][:_PROBES]
+
+
+def find_scale(
     workspace: Path,
     views: Sequence[View],
     partners: Sequence[Sequence[int]],
     points: Sequence[Array],
-    scale: float | None,
     executor: Executor,
-) -> Conditions:
-    """Try a few views spread over the survey.
+) -> float:
+    """Factor by which pictures are shrunk for matching, from a few views.
 
     Args:
         workspace: with the pictures.
         views: of the model.
         partners: of every view, best first.
         points: (N, 3) for every view, that bound its depth.
-        scale: of matching, or None to choose it.
         executor: where tasks run.
     """
-    able = [number for number, found in enumerate(partners) if found]
-    chosen = able[:: max(1, len(able) // _PROBES)][:_PROBES]
-    largest = min(matching_scale(views[number]) for number in chosen)
-    scales = tuple(largest / 2**n for n in range(_SCALES)) if scale is None else (scale,)
+    chosen = probed(partners)
     tasks = [
-        ((views[number], *(views[n] for n in partners[number][:3])), points[number])
+        ((views[number], *(views[n] for n in partners[number])), points[number])
         for number in chosen
     ]
-    found = executor.map(partial(probe, workspace, scales), tasks, label="try matching")
-    known, spreads = np.moveaxis(np.array(list(found)), -1, 0)
-    share = known.mean(axis=0)
-    best = 0
-    while best + 1 < len(scales) and share[best + 1] > _WORTH * share[best]:
-        best += 1
-    spread = spreads[:, best][np.isfinite(spreads[:, best])]
-    sigma = MATCH_SIGMA_PX * (float(np.median(spread)) if len(spread) else 1.0)
-    return Conditions(
-        scale=scales[best],
-        match_sigma_px=round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3),
-    )
+    largest = min(matching_scale(views[number]) for number in chosen)
+    scales = [largest * 0.5**n for n in range(_SCALES)]
+    shares: list[float] = []
+    for tried in (scales[:2], scales[2:]):  # the third is asked only where the second is better
+        found = executor.map(partial(probe, workspace, tried), tasks, label="try matching")
+        shares.extend(np.mean(list(found), axis=0).tolist())
+        best = 0
+        while best + 1 < len(shares) and shares[best + 1] > _WORTH * shares[best]:
+            best += 1
+        if best + 1 < len(shares):
+            break
+    return scales[best]
+
+
+def match_sigma(spreads: Sequence[float]) -> float:
+    """Standard deviation of a match in pixels as matched, from the `spread` of some views."""
+    known = [one for one in spreads if np.isfinite(one)]
+    sigma = MATCH_SIGMA_PX * (float(np.median(known)) if known else 1.0)
+    return round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3)
 
 
 def shrunk(
@@ -110,8 +109,8 @@ def _resized(
 
 def probe(
     workspace: Path, scales: Sequence[float], task: tuple[tuple[View, ...], Array]
-) -> list[tuple[float, float]]:
-    """Match a view with its partners at every scale.
+) -> list[float]:
+    """Match a view with its best partner at every scale.
 
     Args:
         workspace: with the pictures.
@@ -119,21 +118,19 @@ def probe(
         task: the view and its partners, and points (N, 3) that bound its depth.
 
     Returns:
-        For each scale the share of the view's pixels with depth from its first partner, and the
-        scatter of the difference between two partners, in its expected standard deviations.
+        For each scale the share of the view's pixels with depth.
     """
-    views, points_world = task
-    looks = [_looks(workspace, view, scales) for view in views]
+    (view, *partners), points_world = task
+    able = (other for other in partners if rectify(view, other, points_world) is not None)
+    partner = next(able, None)
+    if partner is None:
+        return [0.0] * len(scales)
+    looks = [_looks(workspace, one, scales) for one in (view, partner)]
     found = []
     for n, scale in enumerate(scales):
-        small = [scaled_view(view, scale) for view in views]
-        shown = [look[n] for look in looks]
-        pairs = (
-            pair_depth((small[0], other), (shown[0], look), points_world, MATCH_SIGMA_PX)
-            for other, look in zip(small[1:], shown[1:], strict=True)
-        )
-        maps = [pair for pair in pairs if pair is not None]
-        found.append((float(np.isfinite(maps[0][0]).mean()) if maps else 0.0, _spread(maps)))
+        pair = scaled_view(view, scale), scaled_view(partner, scale)
+        depth = pair_depth(pair, (looks[0][n], looks[1][n]), points_world)
+        found.append(0.0 if depth is None else float(np.isfinite(depth.depth).mean()))
     return found
 
 
@@ -149,12 +146,17 @@ def _looks(workspace: Path, view: View, scales: Sequence[float]) -> list[Look]:
     return found
 
 
-def _spread(maps: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> float:
-    """Median over pairs of partners of the normalised scatter of their difference; NaN if none."""
+def spread(depths: Sequence[PartnerDepth]) -> float:
+    """How far the depths of a view by different partners differ, in standard deviations as assumed.
+
+    The median, over pairs of partners, of the normalised scatter of their difference; NaN if none.
+    """
     spreads = []
-    for (z, s), (y, t) in combinations(maps, 2):
-        both = np.isfinite(z) & np.isfinite(y)
+    for one, other in combinations(depths[:_COMPARED], 2):
+        both = np.isfinite(one.depth) & np.isfinite(other.depth)
         if both.sum() >= _LEAST_COMMON:
-            difference = (z[both] - y[both]) / np.hypot(s[both], t[both])
+            z, y = one.depth[both], other.depth[both]
+            s, t = z * z / one.focal_baseline, y * y / other.focal_baseline
+            difference = (z - y) / (np.float32(MATCH_SIGMA_PX) * np.hypot(s, t))
             spreads.append(MAD_TO_SIGMA * float(np.median(np.abs(difference))))
     return float(np.median(spreads)) if spreads else float("nan")

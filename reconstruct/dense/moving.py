@@ -27,6 +27,7 @@ from reconstruct.dense.views import ViewTask
 from reconstruct.light.solve import LightModel
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
 from reconstruct.views.model import View
+from reconstruct.views.range_shift import FAST, KernelLens, line_of, shown_at
 
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -57,6 +58,8 @@ _LARGEST_SHARE = 0.5
 _SHOWN, _SHOWN_ACROSS, _SHOWN_PX = 6, 3, 480
 """Pictures on the sheet, across it, and their width."""
 _ABOUT = ("moving.csv", "moving.png")
+_LOGARITHMS = np.log(np.maximum(np.arange(256, dtype=np.float32), np.float32(_DARKEST)))
+"""Of grey levels."""
 _OUTLINE_BGR = (60, 60, 255)
 
 
@@ -91,19 +94,18 @@ class Look:
         return self.depth.shape[0], self.depth.shape[1]
 
 
-def mask_moving(workspace: Path, folder: Path, light: LightModel, task: ViewTask) -> MovingShare:
+def mask_moving(workspace: Path, folder: Path, task: ViewTask) -> MovingShare:
     """Find what moves in a view; write its mask where anything does.
 
     Args:
         workspace: with the pictures.
         folder: of the stage; `moving/` in it holds the masks, as taken, 0 = leave out.
-        light: of the survey.
-        task: the view and its neighbours, whose depths have been checked.
+        task: the view and its neighbours; `keep_look` has kept the looks of all.
     """
     store, view = task.store, task.view
-    look = load_look(store, task.index, view, light)
+    look = load_look(store, task.index, view)
     others = [
-        load_look(store, number, other, light)
+        load_look(store, number, other)
         for number, other in task.others
         if other.station != view.station
     ]
@@ -175,27 +177,44 @@ def _lattice_as_taken(warp: PinholeWarp) -> Array:
     return warp.to_pinhole(taken) / warp.pinhole.size_px
 
 
-def load_look(store: ViewStore, index: int, view: View, light: LightModel) -> Look:
-    """Read a view whose depth has been checked."""
+def keep_look(light: LightModel, task: ViewTask) -> None:
+    """Keep what a view shows on its lattice, for all views that are compared with it.
+
+    Args:
+        light: of the survey.
+        task: a view whose depth has been checked.
+    """
+    store, index, view = task.store, task.index, task.view
     width, height = view.pinhole.size_px
-    step = max(1, round(width / LATTICE_PX))
+    step = _step(view)
     h, w = height // step, width // step
-    colour = store.load_colour(index).astype(np.float32)
+    colour = store.load_colour(index)
     factors = cv2.resize(light.factors(view.camera, view.image), (width, height))
-    evened = np.log(np.maximum(colour, _DARKEST)) + np.log(factors)
     valid = store.load_mask(index, "valid", width) & (colour.max(axis=2) > _DARKEST)
     depth, _ = store.load_depth(index, "fine")
     depth[~store.load_mask(index, "kept", width)] = np.nan
     part = slice(0, h * step), slice(0, w * step)
     middle = slice(step // 2, h * step, step), slice(step // 2, w * step, step)
-    size = (w, h)
+    shown = cv2.resize(_LOGARITHMS[colour[part]], (w, h), interpolation=cv2.INTER_AREA)
+    usable = cv2.resize(valid[part].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA) > 0
+    store.save(index, "look.light", shown + np.log(factors[middle]))
+    store.save(index, "look.usable", usable)
+    store.save(index, "look.depth", np.ascontiguousarray(depth[middle]))
+
+
+def load_look(store: ViewStore, index: int, view: View) -> Look:
+    """What `keep_look` kept."""
     return Look(
         view=view,
-        step=step,
-        light=cv2.resize(evened[part], size, interpolation=cv2.INTER_AREA),
-        usable=cv2.resize(valid[part].astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0,
-        depth=np.ascontiguousarray(depth[middle]),
+        step=_step(view),
+        light=np.asarray(store.load(index, "look.light")),
+        usable=np.asarray(store.load(index, "look.usable")),
+        depth=np.asarray(store.load(index, "look.depth")),
     )
+
+
+def _step(view: View) -> int:
+    return max(1, round(view.pinhole.width_px / LATTICE_PX))
 
 
 def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
@@ -254,28 +273,61 @@ def still_depth(look: Look, others: Sequence[Look]) -> Float32:
     """Depth (h, w) of the surface on which two or more other stations agree; NaN where none."""
     stack = np.full((len(others), *look.shape), np.nan, np.float32)
     for k, other in enumerate(others):
-        rows, columns = np.nonzero(np.isfinite(other.depth))
-        pixels: Array = np.column_stack([columns, rows]).astype(np.float64)
-        pixels = (pixels + 0.5) * other.step
-        points = other.view.at_depth(pixels, other.depth[rows, columns].astype(np.float64))
-        z = look.view.world_from_cam.inv().apply(points)[:, 2]
-        at = look.view.project(points) / look.step
-        ahead = (z > 0) & np.isfinite(at).all(axis=1)
-        splat(at[ahead], z[ahead].astype(np.float32), stack[k])
+        move = look.view.world_from_cam.inv() * other.view.world_from_cam
+        draw(
+            other.depth,
+            (other.view.kernel_lens, float(other.step)),
+            np.ascontiguousarray(move.as_matrix()[:3]),
+            (look.view.kernel_lens, float(look.step)),
+            stack[k],
+        )
     stations = np.array([other.view.station for other in others], np.int64)
     return agreed(stack, stations, _SAME_DEPTH)
 
 
-@compiled
-def splat(at: Array, z: Float32, depth: Float32) -> None:
-    """Draw points at columns and rows (N, 2) into the four cells around them, the nearest last."""
-    height, width = depth.shape
-    for n in range(len(z)):
-        left, top = math.floor(at[n, 0] - 0.5), math.floor(at[n, 1] - 0.5)
-        for row in range(max(top, 0), min(top + 2, height)):
-            for column in range(max(left, 0), min(left + 2, width)):
-                if not depth[row, column] <= z[n]:
-                    depth[row, column] = z[n]
+@compiled(error_model="numpy", fastmath=FAST)
+def draw(
+    depth: Float32,
+    lattice: tuple[KernelLens, float],
+    onto_from_cam: Array,
+    onto_lattice: tuple[KernelLens, float],
+    onto: Float32,
+) -> None:
+    """Draw the surface of a view into another, each cell into the four around it, the nearest last.
+
+    Args:
+        depth: (h, w) of the view's cells, NaN where unknown.
+        lattice: lens of the view, and pixels to a cell.
+        onto_from_cam: (3, 4) transform of points to the other's camera.
+        onto_lattice: as `lattice`, of the other.
+        onto: (h, w) depth of the other's cells, changed in place; NaN where nothing is drawn yet.
+    """
+    (pinhole, field, inverse_working), step = lattice
+    onto_lens, onto_step = onto_lattice
+    height, width = onto.shape
+    t = onto_from_cam
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            z = depth[i, j]
+            if math.isnan(z):
+                continue
+            x, y, by_x, by_y = line_of(
+                pinhole, field, inverse_working, (j + 0.5) * step, (i + 0.5) * step
+            )
+            a, b = x * z + by_x, y * z + by_y
+            deep = t[2, 0] * a + t[2, 1] * b + t[2, 2] * z + t[2, 3]
+            if deep <= 0.0:
+                continue
+            a, b = (
+                t[0, 0] * a + t[0, 1] * b + t[0, 2] * z + t[0, 3],
+                t[1, 0] * a + t[1, 1] * b + t[1, 2] * z + t[1, 3],
+            )
+            u, v = shown_at(onto_lens, a, b, deep)
+            left, top = math.floor(u / onto_step - 0.5), math.floor(v / onto_step - 0.5)
+            for row in range(max(top, 0), min(top + 2, height)):
+                for column in range(max(left, 0), min(left + 2, width)):
+                    if not onto[row, column] <= deep:
+                        onto[row, column] = deep
 
 
 @compiled
@@ -309,20 +361,51 @@ def agreed(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Flo
 
 def _shown_at(look: Look, points: Array) -> tuple[Float32, Float32]:
     """What a view shows of points (N, 3): light (N, 3, 3) with bounds around, and depth; or NaN."""
-    pixels = look.view.project(points)
-    z = look.view.world_from_cam.inv().apply(points)[:, 2].astype(np.float32)
-    at = np.floor(pixels / look.step)
-    height, width = look.shape
-    with np.errstate(invalid="ignore"):
-        inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height) & (z > 0)
-    columns, rows = np.where(inside[:, None], at, 0).astype(np.int64).T
-    with np.errstate(invalid="ignore"):
-        seen = inside & look.usable[rows, columns]
-        seen &= np.abs(look.depth[rows, columns] - z) <= _SAME_DEPTH * z
+    cells, ranges = cells_at(
+        points,
+        np.ascontiguousarray(look.view.world_from_cam.inv().as_matrix()[:3]),
+        look.view.kernel_lens,
+        float(look.step),
+        look.depth,
+        look.usable,
+    )
     low, high = _box(look.light)
-    shown = np.stack([one[rows, columns] for one in (look.light, low, high)], axis=1)
-    shown[~seen] = np.nan
-    return shown, np.where(seen, z, np.float32(1.0))
+    shown = np.stack([one.reshape(-1, 3)[cells] for one in (look.light, low, high)], axis=1)
+    shown[cells < 0] = np.nan
+    return shown, ranges
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def cells_at(
+    points: Array,
+    cam_from_world: Array,
+    lens: KernelLens,
+    step: float,
+    depth: Float32,
+    usable: Mask,
+) -> tuple[NDArray[np.int64], Float32]:
+    """Cells (N,) of a view that show points (N, 3), counted by rows; -1 where none shows one.
+
+    Also (N,) the depth of the points; 1 where no cell shows them.
+    """
+    height, width = depth.shape
+    cells = np.full(len(points), -1, np.int64)
+    ranges = np.ones(len(points), np.float32)
+    t = cam_from_world
+    for n in range(len(points)):
+        e, m, d = points[n, 0], points[n, 1], points[n, 2]
+        z = t[2, 0] * e + t[2, 1] * m + t[2, 2] * d + t[2, 3]
+        if z <= 0.0:
+            continue
+        a = t[0, 0] * e + t[0, 1] * m + t[0, 2] * d + t[0, 3]
+        b = t[1, 0] * e + t[1, 1] * m + t[1, 2] * d + t[1, 3]
+        u, v = shown_at(lens, a, b, z)
+        column, row = math.floor(u / step), math.floor(v / step)
+        if column < 0 or row < 0 or column >= width or row >= height or not usable[row, column]:
+            continue
+        if abs(depth[row, column] - z) <= _SAME_DEPTH * z:
+            cells[n], ranges[n] = row * width + column, z
+    return cells, ranges
 
 
 def _box(light: Float32) -> tuple[Float32, Float32]:

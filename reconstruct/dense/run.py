@@ -18,8 +18,8 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.plane_settings import parse_planes
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.dem import FILL_CELLS
-from reconstruct.dense.matching_trial import find_conditions
-from reconstruct.dense.moving import COMPARED, clear_moving, mask_moving, show_moving
+from reconstruct.dense.matching_trial import find_scale, probed
+from reconstruct.dense.moving import COMPARED, clear_moving, keep_look, mask_moving, show_moving
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
 from reconstruct.dense.stereo_pairs import (
@@ -33,6 +33,7 @@ from reconstruct.dense.views import (
     LOOKS,
     ViewTask,
     check_view,
+    find_match_sigma,
     find_sigma_factor,
     looked_at,
     prepare_view,
@@ -62,10 +63,10 @@ def run_dense(
     store.folder.mkdir(parents=True, exist_ok=True)
     partners = choose_partners(model, reconstruct.dense_partners)
     points = points_in_sight(model)
-    conditions = find_conditions(
-        workspace, model.views, partners, points, reconstruct.dense_scale, executor
-    )
-    views = [scaled_view(view, conditions.scale) for view in model.views]
+    scale = reconstruct.dense_scale
+    if scale is None:
+        scale = find_scale(workspace, model.views, partners, points, executor)
+    views = [scaled_view(view, scale) for view in model.views]
 
     def tasks(others: Sequence[Sequence[int]]) -> list[ViewTask]:
         return [
@@ -75,8 +76,9 @@ def run_dense(
 
     prepare = partial(prepare_view, workspace)
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
-    match = partial(view_depth, conditions.match_sigma_px)
     matched = list(zip(tasks(partners), points, strict=True))
+    match_sigma_px = find_match_sigma(matched, probed(partners), executor)
+    match = partial(view_depth, match_sigma_px)
     _drain(executor.map(match, matched, label="match"))
     looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
     _drain(executor.map(refine_view, tasks(looks), label="refine"))
@@ -94,7 +96,9 @@ def run_dense(
     moving = []
     clear_moving(folder)
     if reconstruct.mask_moving:
-        mask = partial(mask_moving, workspace, folder, light)
+        keep = partial(keep_look, light)
+        _drain(executor.map(keep, tasks([()] * len(views)), label="even out light"))
+        mask = partial(mask_moving, workspace, folder)
         others = tasks(neighbours(model, COMPARED))
         moving = list(executor.map(mask, others, label="mask what moves"))
         show_moving(workspace, folder, moving)
@@ -118,8 +122,8 @@ def run_dense(
         {
             "format": "alice-survey surface",
             "version": 1,
-            "matching_scale": conditions.scale,
-            "match_sigma_px": conditions.match_sigma_px,
+            "matching_scale": scale,
+            "match_sigma_px": match_sigma_px,
             "refined_with": LOOKS,
             "sigma_factor": round(sigma_factor, 3),
             "pose_sigma": made[0].pose_sigma,

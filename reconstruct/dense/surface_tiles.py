@@ -186,11 +186,11 @@ def _seen_through(
     found, through = (np.zeros(len(surface), np.int64) for _ in range(2))
     points, sigmas = (np.ascontiguousarray(surface[name]) for name in ("enu", "sigma"))
     for index, view in task.views:
-        depth, sigma = _depth_of(setup, index)
+        depth = setup.store.stored_depth(index, "fine")
         to_enu = np.vstack([enu_from_cam(view, offset), [0.0, 0.0, 0.0, 1.0]])
         to_cam = np.ascontiguousarray(np.linalg.inv(to_enu)[:3])
         at, beyond = look_at_points(
-            points, sigmas, to_cam, depth, sigma, view.kernel_lens, task.grid.cell
+            points, sigmas, to_cam, depth, setup.sigma_factor, view.kernel_lens, task.grid.cell
         )
         found += at
         through += beyond

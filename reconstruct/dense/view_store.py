@@ -6,6 +6,7 @@ half the resolution of brightness. A picture takes 5 bytes a pixel until its til
 
 import uuid
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,11 @@ _MOST_RATIO = 16.0
 _SIGMA_STEP = 0.05
 _SIGMA_LEAST = 1e-6
 """Relative to the depth; 254 steps of 5 % reach a third of the depth."""
+
+
+StoredDepth = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
+"""(H, W) codes of depth, (H, W) codes of its relative deviation, and what the codes of either mean:
+NaN for 0. Kernels that look at few pixels take it as it is."""
 
 
 @dataclass(frozen=True)
@@ -60,28 +66,20 @@ class ViewStore:
         self, view: int, name: str, depth: NDArray[np.float32], sigma: NDArray[np.float32]
     ) -> None:
         """Keep depth (H, W) and its standard deviation, rounded; NaN where unknown."""
-        known = np.isfinite(depth) & np.isfinite(sigma)
-        middle = float(np.median(depth[known])) if known.any() else 1.0
-        known &= (depth > middle / _MOST_RATIO) & (depth < middle * _MOST_RATIO)
-        ends = np.array([depth[known].min(), depth[known].max()] if known.any() else [1.0, 1.0])
-        least, most = np.log(ends.astype(np.float64))
-        step = max(_DEPTH_STEP, float(most - least) / (_DEPTH_CODES - 1))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            level = np.rint((np.log(depth) - np.float32(least)) / np.float32(step)) + 1
-            share = np.rint(np.log(sigma / depth / _SIGMA_LEAST) / _SIGMA_STEP) + 1
-        self.save(view, f"{name}.scale", np.array([least, step]))
-        self.save(view, f"{name}.sigma", _code(np.clip(share, 1, 255), known, np.uint8))
-        self.save(view, name, _code(np.clip(level, 1, _DEPTH_CODES), known, np.uint16))
+        level, share, ends = _codes(depth, sigma)
+        self.save(view, f"{name}.scale", ends)
+        self.save(view, f"{name}.sigma", share)
+        self.save(view, name, level)
+
+    def stored_depth(self, view: int, name: str) -> StoredDepth:
+        """Depth (H, W) and its standard deviation as they are stored, read only where touched."""
+        least, step = self.load(view, f"{name}.scale").tolist()
+        level, share = self.load(view, name), self.load(view, f"{name}.sigma")
+        return np.asarray(level), np.asarray(share), _depths(least, step), _shares()
 
     def load_depth(self, view: int, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth (H, W) and its standard deviation, NaN where unknown."""
-        level, share = self.load(view, name), self.load(view, f"{name}.sigma")
-        least, step = self.load(view, f"{name}.scale")
-        depths = np.exp(least + (np.arange(_DEPTH_CODES + 1) - 1) * step).astype(np.float32)
-        shares = (_SIGMA_LEAST * np.exp((np.arange(256) - 1) * _SIGMA_STEP)).astype(np.float32)
-        depths[0], shares[0] = np.nan, np.nan
-        depth = depths[level]
-        return depth, depth * shares[share]
+        return decoded(self.stored_depth(view, name))
 
     def save_colour(self, view: int, colour: NDArray[np.uint8]) -> None:
         """Keep a picture (H, W, 3) BGR: brightness in full, colour at half the resolution."""
@@ -115,7 +113,49 @@ class ViewStore:
         return np.unpackbits(self.load(view, name), axis=1, count=width).astype(np.bool_)
 
 
-def _code(
-    values: NDArray[Any], known: NDArray[np.bool_], dtype: type[np.uint8] | type[np.uint16]
-) -> NDArray[Any]:
-    return np.where(known, values, 0).astype(dtype)
+def stored(depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> StoredDepth:
+    """Depth (H, W) and its standard deviation as a store keeps them."""
+    level, share, (least, step) = _codes(depth, sigma)
+    return level, share, _depths(float(least), float(step)), _shares()
+
+
+def decoded(depth: StoredDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth (H, W) and its standard deviation, NaN where unknown."""
+    level, share, depths, shares = depth
+    found = depths[level]
+    return found, found * shares[share]
+
+
+def _codes(
+    depth: NDArray[np.float32], sigma: NDArray[np.float32]
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float64]]:
+    """Codes of depth and deviation, 0 where unknown; logarithm of the first depth, and its step."""
+    known = np.isfinite(depth) & np.isfinite(sigma)
+    middle = float(np.median(depth[known])) if known.any() else 1.0
+    known &= (depth > middle / _MOST_RATIO) & (depth < middle * _MOST_RATIO)
+    ends = np.array([depth[known].min(), depth[known].max()] if known.any() else [1.0, 1.0])
+    least, most = np.log(ends.astype(np.float64))
+    step = max(_DEPTH_STEP, float(most - least) / (_DEPTH_CODES - 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = np.rint((np.log(depth) - np.float32(least)) / np.float32(step)) + 1
+        share = np.rint(np.log(sigma / depth / _SIGMA_LEAST) / _SIGMA_STEP) + 1
+    return (
+        np.where(known, np.clip(level, 1, _DEPTH_CODES), 0).astype(np.uint16),
+        np.where(known, np.clip(share, 1, 255), 0).astype(np.uint8),
+        np.array([least, step]),
+    )
+
+
+@lru_cache(maxsize=16)
+def _depths(least: float, step: float) -> NDArray[np.float32]:
+    codes = np.arange(_DEPTH_CODES + 1)
+    depths = np.asarray(np.exp(least + (codes - 1) * step), np.float32)
+    depths[0] = np.nan
+    return depths
+
+
+@lru_cache(maxsize=1)
+def _shares() -> NDArray[np.float32]:
+    shares = np.asarray(_SIGMA_LEAST * np.exp((np.arange(256) - 1) * _SIGMA_STEP), np.float32)
+    shares[0] = np.nan
+    return shares

@@ -16,8 +16,14 @@ from numpy.typing import NDArray
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense.depth import GATE_SIGMAS, count_witnesses, merge_depths, pair_depth
-from reconstruct.dense.matching_trial import shrunk
+from reconstruct.dense.depth import (
+    GATE_SIGMAS,
+    PartnerDepth,
+    count_witnesses,
+    merge_depths,
+    pair_depth,
+)
+from reconstruct.dense.matching_trial import match_sigma, shrunk, spread
 from reconstruct.dense.points import block_bounds
 from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import in_frame
@@ -88,6 +94,54 @@ def _look(store: ViewStore, index: int, width: int) -> tuple[NDArray[Any], ...]:
     return prepared(store.load_bright(index), store.load_mask(index, "valid", width))
 
 
+def find_match_sigma(
+    matched: Sequence[tuple[ViewTask, Array]], chosen: Sequence[int], executor: Executor
+) -> float:
+    """Standard deviation of a match in pixels as matched.
+
+    How far depths from different partners differ, in units of what a match of `MATCH_SIGMA_PX`
+    would give, shows the true precision: noise, calibration and poses together.
+
+    Args:
+        matched: views with their partners, and points (N, 3) that bound their depth.
+        chosen: which of them to compare partners in; what they find stays for `view_depth`.
+        executor: where tasks run.
+    """
+    tasks = [matched[n] for n in chosen]
+    return match_sigma(list(executor.map(match_apart, tasks, label="compare partners")))
+
+
+def match_apart(matched: tuple[ViewTask, Array]) -> float:
+    """Match a view with its partners and keep what each finds; return the `spread` of that.
+
+    Args:
+        matched: the view with its partners, and points (N, 3) that bound its depth.
+    """
+    task, points_world = matched
+    depths = _pair_depths(task, points_world)
+    shape = (0, *task.view.pinhole.size_px[::-1])
+    task.store.save(task.index, "apart", np.array([d.depth for d in depths] or np.empty(shape)))
+    scales = np.array([d.focal_baseline for d in depths])
+    task.store.save(task.index, "apart.scales", scales)
+    return spread(depths)
+
+
+def _pair_depths(task: ViewTask, points_world: Array) -> list[PartnerDepth]:
+    """Depth of a view from each partner with which it can be rectified."""
+    store, width = task.store, task.view.pinhole.width_px
+    if store.has(task.index, "apart.scales"):
+        scales = store.load(task.index, "apart.scales").tolist()
+        kept = zip(store.load(task.index, "apart"), scales, strict=True)
+        return [PartnerDepth(depth=depth, focal_baseline=scale) for depth, scale in kept]
+    look = _evened(store, task.index), store.load_mask(task.index, "valid", width)
+    found = []
+    for number, partner in task.others:
+        valid = store.load_mask(number, "valid", partner.pinhole.width_px)
+        looks = look, (_evened(store, number), valid)
+        found.append(pair_depth((task.view, partner), looks, points_world))
+    return [depth for depth in found if depth is not None]
+
+
 def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     """Match a view with its partners and merge what they find.
 
@@ -99,24 +153,21 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     store = task.store
     if store.has(task.index, "agreeing") or store.has(task.index, "fine"):
         return
-    shape = task.view.pinhole.size_px[::-1]
-    depths, sigmas = [], []
-    for number, partner in task.others:
-        looks = (
-            (_evened(store, task.index), store.load_mask(task.index, "valid", shape[1])),
-            (_evened(store, number), store.load_mask(number, "valid", partner.pinhole.width_px)),
-        )
-        found = pair_depth((task.view, partner), looks, points_world, match_sigma_px)
-        if found is not None:
-            depths.append(found[0])
-            sigmas.append(found[1])
+    depths = _pair_depths(task, points_world)
     if depths:
-        depth, sigma, agreeing = merge_depths(np.stack(depths), np.stack(sigmas), GATE_SIGMAS)
+        depth, sigma, agreeing = merge_depths(
+            np.stack([one.depth for one in depths]),
+            np.stack([one.sigma(match_sigma_px) for one in depths]),
+            GATE_SIGMAS,
+        )
     else:
+        shape = task.view.pinhole.size_px[::-1]
         depth = np.full(shape, np.nan, np.float32)
         sigma, agreeing = depth, np.zeros(shape, np.uint8)
     store.save_depth(task.index, "depth", depth, sigma)
     store.save(task.index, "agreeing", agreeing)
+    store.drop(task.index, "apart")
+    store.drop(task.index, "apart.scales")
 
 
 def refine_view(task: ViewTask) -> None:
@@ -174,11 +225,12 @@ def disagreement(task: ViewTask) -> float:
     points = _world_points(task.view, depth, rows, columns)
     parts = []
     for number, other in task.others:
-        there, there_sigma = task.store.load_depth(number, "fine")
+        level, share, depths, shares = task.store.stored_depth(number, "fine")
         seen = in_frame(other, points)
         at = np.floor(other.project(points[seen])).astype(np.int64)
         z = other.world_from_cam.inv().apply(points[seen])[:, 2]
-        other_z, other_sigma = there[at[:, 1], at[:, 0]], there_sigma[at[:, 1], at[:, 0]]
+        other_z = depths[level[at[:, 1], at[:, 0]]]
+        other_sigma = other_z * shares[share[at[:, 1], at[:, 0]]]
         own = sigma[rows, columns][seen]
         parts.append((other_z - z) / np.hypot(own, other_sigma))
     apart = np.concatenate(parts) if parts else np.empty(0)
@@ -212,14 +264,13 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:
     slopes = slopes_of(depth, view.kernel_lens)
     for number, other in task.others:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
-        other_depth, other_sigma = store.load_depth(number, "fine")
         seen, through = count_witnesses(
             depth,
             sigma,
             slopes,
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
-            other_depth,
-            other_sigma * np.float32(sigma_factor),
+            store.stored_depth(number, "fine"),
+            sigma_factor,
             other.kernel_lens,
             GATE_SIGMAS,
         )

@@ -24,13 +24,16 @@ from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import observed
-from reconstruct.mapping.database import Observations, new_folder, write_database
+from reconstruct.mapping.database import Observations, new_folder, station_frames, write_database
 from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
 from reconstruct.pictures.files import named
 from reconstruct.views.model_files import as_transform, rigid3d
 
 Method = Literal["auto", "global", "incremental"]
 """How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""
+
+Free = Literal["nothing", "distortion", "all"]
+"""What of the cameras is refined: `all` is distortion and focal length."""
 
 _FEW_MATCHES = 12
 """Matches that suffice in a second try, when the first one lost pictures (COLMAP: 15 to 100)."""
@@ -171,16 +174,64 @@ def _globally(
     database = scratch / "database.db"
     write_database(database, seen, cam_from_rig)
     found = _sorted(map_globally(database, seen, cam_from_rig, options, seed, executor))
-    if found and found[0].num_reg_images() < len(seen.images) and not unsound(found[0]):
-        options.multiple_models = False
-        grown = [pycolmap.Reconstruction(more) for more in _continued(found[0], scratch, options)]
-        if grown and _sorted(grown)[0].num_reg_images() > found[0].num_reg_images():
-            found[0] = _sorted(grown)[0]
-            adjust(found[0], options, tolerance=1e-7)
-            found[0].update_point_3d_errors()
-            found = merge_models(_sorted(found), database, options)
+    if found and not unsound(found[0]):
+        grown = _grown(found[0], len(seen.images), scratch, options)
+        if grown is not found[0]:
+            found = merge_models(_sorted([grown, *found[1:]]), database, options)
     shutil.rmtree(scratch)
     return _sorted(found)
+
+
+def map_from_poses(
+    seen: Observations,
+    cam_from_rig: Mapping[str, RigidTransform],
+    rig_from_world: Mapping[int, RigidTransform],
+    folder: Path,
+    seed: int,
+    *,
+    free: Free,
+) -> pycolmap.Reconstruction:
+    """A model on a rig that is held constant, from poses that are nearly right.
+
+    Pictures without a pose are then registered one by one, at last with lower demands.
+
+    Args:
+        seen: cameras, keypoints, matches.
+        cam_from_rig: poses of the cameras on the rig, the first camera's the identity.
+        rig_from_world: pose by station.
+        folder: for scratch files.
+        seed: of the mapper.
+        free: what of the cameras is refined in addition to their poses.
+    """
+    options = _options(cam_from_rig, seed, free)
+    scratch = new_folder(folder / "mapper")
+    database = scratch / "database.db"
+    write_database(database, seen, cam_from_rig)
+    frames = station_frames(seen.images)
+    poses = {frame: rig_from_world[s] for frame, s in frames.items() if s in rig_from_world}
+    model = triangulate_and_adjust(database, poses, options)
+    model = _grown(model, len(seen.images), scratch, options)
+    model = _grown(model, len(seen.images), scratch, _undemanding(options))
+    shutil.rmtree(scratch)
+    return model
+
+
+def _grown(
+    model: pycolmap.Reconstruction,
+    total: int,
+    scratch: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.Reconstruction:
+    """A model to which pictures that it lacks are added one by one; itself where none can be."""
+    if model.num_reg_images() == total:
+        return model
+    options.multiple_models = False
+    grown = _sorted([pycolmap.Reconstruction(more) for more in _continued(model, scratch, options)])
+    if not grown or grown[0].num_reg_images() <= model.num_reg_images():
+        return model
+    adjust(grown[0], options, tolerance=1e-7)
+    grown[0].update_point_3d_errors()
+    return grown[0]
 
 
 def faults_of(found: Sequence[pycolmap.Reconstruction], total: int) -> list[str]:
@@ -241,7 +292,7 @@ def run_mapper(
     folder: Path,
     seed: int,
     *,
-    free: Literal["nothing", "distortion", "all"],
+    free: Free,
 ) -> list[pycolmap.Reconstruction]:
     """Map incrementally; with lower demands once more if that loses pictures.
 
@@ -258,11 +309,7 @@ def run_mapper(
     """
     found = _map_once(seen, cam_from_rig, folder, _options(cam_from_rig, seed, free), free)
     if not found or found[0].num_reg_images() < len(seen.images):
-        options = _options(cam_from_rig, seed, free)
-        options.min_num_matches = _FEW_MATCHES
-        options.mapper.abs_pose_min_num_inliers = _FEW_MATCHES
-        options.mapper.init_min_num_inliers = 3 * _FEW_MATCHES
-        options.triangulation.ignore_two_view_tracks = False
+        options = _undemanding(_options(cam_from_rig, seed, free))
         again = _map_once(seen, cam_from_rig, folder, options, free)
         if again and (not found or again[0].num_reg_images() > found[0].num_reg_images()):
             return again
@@ -272,7 +319,7 @@ def run_mapper(
 def _options(
     cam_from_rig: Mapping[str, RigidTransform] | None,
     seed: int,
-    free: Literal["nothing", "distortion", "all"],
+    free: Free,
 ) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -299,12 +346,23 @@ def _options(
     return options
 
 
+def _undemanding(
+    options: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.IncrementalPipelineOptions:
+    """Lower the demands on matches, in place, and return the options."""
+    options.min_num_matches = _FEW_MATCHES
+    options.mapper.abs_pose_min_num_inliers = _FEW_MATCHES
+    options.mapper.init_min_num_inliers = 3 * _FEW_MATCHES
+    options.triangulation.ignore_two_view_tracks = False
+    return options
+
+
 def _map_once(
     seen: Observations,
     cam_from_rig: Mapping[str, RigidTransform] | None,
     folder: Path,
     options: pycolmap.IncrementalPipelineOptions,
-    free: Literal["nothing", "distortion", "all"],
+    free: Free,
 ) -> list[pycolmap.Reconstruction]:
     scratch = new_folder(folder / "mapper")
     write_database(scratch / "database.db", seen, cam_from_rig)

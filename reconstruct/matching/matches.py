@@ -129,12 +129,15 @@ def match_near(
     second = np.full(len(a.pixels), np.inf, np.float32)
     best_b = np.full(len(b.pixels), -1, np.int64)
     nearest_b = np.full(len(b.pixels), np.inf, np.float32)
+    across = np.argsort(b.pixels[:, 0], kind="stable")
+    x, y = b.pixels[across].T
     cells = (a.pixels // cell_px).astype(np.int64)
     number = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
     order = np.argsort(number, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
         low, high = predicted[rows].min(axis=0) - radius_px, predicted[rows].max(axis=0) + radius_px
-        near = np.flatnonzero(((b.pixels >= low) & (b.pixels <= high)).all(axis=1))
+        strip = slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right"))
+        near = np.sort(across[strip][(y[strip] >= low[1]) & (y[strip] <= high[1])])
         if not len(near):
             continue
         left = a.descriptors[rows].astype(np.float32)

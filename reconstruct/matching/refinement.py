@@ -26,6 +26,7 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.matching.matches import Matches
 from reconstruct.views.interpolation import cubic_level, is_inside
+from reconstruct.views.range_shift import FAST
 
 _RADIUS = 7
 """Radius of a patch, pixels."""
@@ -241,10 +242,8 @@ def align_patches(
     return found
 
 
-@compiled
-def _template(
-    picture: Any, x: float, y: float, patch: Any, weights: Any, levels: Any, slopes: Any
-) -> None:
+@compiled(error_model="numpy", fastmath=FAST)
+def _template(picture: Any, x: float, y: float, patch: Any, levels: Any, slopes: Any) -> None:
     """Grey levels of the reference's patch, and how they change with the unknowns."""
     side = 2 * _RADIUS + 3
     for i in range(side):
@@ -257,74 +256,97 @@ def _template(
             gx = 0.5 * (patch[i, j + 1] - patch[i, j - 1])
             gy = 0.5 * (patch[i + 1, j] - patch[i - 1, j])
             levels[k] = patch[i, j]
-            weights[k] = math.exp(-0.5 * (u * u + v * v) / (_SIGMA * _SIGMA))
-            slopes[k, 0], slopes[k, 1] = gx, gy
-            slopes[k, 2], slopes[k, 3] = gx * u, gx * v
-            slopes[k, 4], slopes[k, 5] = gy * u, gy * v
-            slopes[k, 6], slopes[k, 7] = patch[i, j], 1.0
-            slopes[k, 8], slopes[k, 9] = patch[i, j] * u, patch[i, j] * v
+            slopes[0, k], slopes[1, k] = gx, gy
+            slopes[2, k], slopes[3, k] = gx * u, gx * v
+            slopes[4, k], slopes[5, k] = gy * u, gy * v
+            slopes[6, k], slopes[7, k] = patch[i, j], 1.0
+            slopes[8, k], slopes[9, k] = patch[i, j] * u, patch[i, j] * v
             k += 1
 
 
-@compiled
+@compiled(error_model="numpy", fastmath=FAST)
+def _weighted(weights: Any, slopes: Any, weighted: Any, square: Any) -> None:
+    """Fill the weighted slopes, and the matrix of the normal equations."""
+    count = len(weights)
+    for n in range(_UNKNOWNS):
+        for k in range(count):
+            weighted[n, k] = weights[k] * slopes[n, k]
+        for o in range(n + 1):
+            total = 0.0
+            for k in range(count):
+                total += weighted[n, k] * slopes[o, k]
+            square[n, o] = square[o, n] = total
+    for n in range(_UNKNOWNS):
+        # a patch without texture must not divide by zero; 1e-9 moves nothing else
+        square[n, n] += 1e-9 * square[n, n] + 1e-9
+
+
+@compiled(error_model="numpy", fastmath=FAST)
 def _compare(
-    picture: Any, x: float, y: float, m: Any, weights: Any, levels: Any, slopes: Any, right: Any
-) -> float:
-    """Fill the right-hand side; the weighted correlation of the patches, -2 beyond the picture."""
-    right[:] = 0.0
-    total = sum_a = sum_b = sum_aa = sum_bb = sum_ab = 0.0
+    picture: Any, x: float, y: float, m: Any, weights: Any, levels: Any, weighted: Any, seen: Any,
+    right: Any,
+) -> float:  # fmt: skip
+    """Fill the right-hand side; the weighted correlation of the patches, -2 beyond the picture.
+
+    Loops over the patch are one for each sum, so that they become vector instructions.
+    """
+    reach_x = _RADIUS * (abs(m[0, 0]) + abs(m[0, 1]))
+    reach_y = _RADIUS * (abs(m[1, 0]) + abs(m[1, 1]))
+    if not (
+        is_inside(picture, x - reach_x, y - reach_y, 2.0)
+        and is_inside(picture, x + reach_x, y + reach_y, 2.0)
+    ):
+        return -2.0
     k = 0
     for i in range(-_RADIUS, _RADIUS + 1):
         for j in range(-_RADIUS, _RADIUS + 1):
             at_x = x + m[0, 0] * j + m[0, 1] * i
             at_y = y + m[1, 0] * j + m[1, 1] * i
-            if not is_inside(picture, at_x, at_y, 2.0):
-                return -2.0
-            level, weight = cubic_level(picture, at_x, at_y), weights[k]
-            miss = weight * (level - levels[k])
-            for n in range(_UNKNOWNS):
-                right[n] += slopes[k, n] * miss
-            total += weight
-            sum_a += weight * levels[k]
-            sum_b += weight * level
-            sum_aa += weight * levels[k] * levels[k]
-            sum_bb += weight * level * level
-            sum_ab += weight * levels[k] * level
+            seen[k] = cubic_level(picture, at_x, at_y)
             k += 1
+    for n in range(_UNKNOWNS):
+        total = 0.0
+        for k in range(len(seen)):
+            total += weighted[n, k] * (seen[k] - levels[k])
+        right[n] = total
+    total = sum_a = sum_b = sum_aa = sum_bb = sum_ab = 0.0
+    for k in range(len(seen)):
+        weight, a, b = weights[k], levels[k], seen[k]
+        total += weight
+        sum_a += weight * a
+        sum_b += weight * b
+        sum_aa += weight * a * a
+        sum_bb += weight * b * b
+        sum_ab += weight * a * b
     spread = (sum_aa - sum_a * sum_a / total) * (sum_bb - sum_b * sum_b / total)
     return float((sum_ab - sum_a * sum_b / total) / math.sqrt(max(spread, 1e-9)))
 
 
 @compiled
 def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) -> Any:
-    count = (2 * _RADIUS + 1) ** 2
-    patch = np.empty((2 * _RADIUS + 3, 2 * _RADIUS + 3))
-    weights, levels = np.empty(count), np.empty(count)
-    slopes = np.empty((count, _UNKNOWNS))
+    side = 2 * _RADIUS + 1
+    count = side * side
+    patch = np.empty((side + 2, side + 2))
+    weights, levels, seen = np.empty(count), np.empty(count), np.empty(count)
+    for k in range(count):
+        u, v = k % side - _RADIUS, k // side - _RADIUS
+        weights[k] = math.exp(-0.5 * (u * u + v * v) / (_SIGMA * _SIGMA))
+    slopes, weighted = np.empty((_UNKNOWNS, count)), np.empty((_UNKNOWNS, count))
     square, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    turn, m = np.empty((2, 2)), np.empty((2, 2))
+    m = np.empty((2, 2))
     found = np.full(pixels.shape, np.nan)
     for point in range(len(pixels)):
         x, y = reference[point, 0] - 0.5, reference[point, 1] - 0.5
         if not is_inside(first, x, y, _RADIUS + 3.0):
             continue
-        _template(first, x, y, patch, weights, levels, slopes)
-        square[:] = 0.0
-        for k in range(count):
-            for n in range(_UNKNOWNS):
-                for o in range(n + 1):
-                    square[n, o] += weights[k] * slopes[k, n] * slopes[k, o]
-        for n in range(_UNKNOWNS):
-            for o in range(n):
-                square[o, n] = square[n, o]
-            # a patch without texture must not divide by zero; 1e-9 moves nothing else
-            square[n, n] += 1e-9 * square[n, n] + 1e-9
+        _template(first, x, y, patch, levels, slopes)
+        _weighted(weights, slopes, weighted, square)
         inverse = np.linalg.inv(square)
         x, y = pixels[point, 0] - 0.5, pixels[point, 1] - 0.5
         m[:] = affine[point]
         settled = False
         for _ in range(_STEPS):
-            correlation = _compare(second, x, y, m, weights, levels, slopes, right)
+            correlation = _compare(second, x, y, m, weights, levels, weighted, seen, right)
             if correlation < -1.5:
                 break
             step = inverse @ right
@@ -337,9 +359,9 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
             area = a * d - b * c
             if not area > 0.2:
                 break
-            turn[0, 0], turn[0, 1] = d / area, -b / area
-            turn[1, 0], turn[1, 1] = -c / area, a / area
-            m[:] = m @ turn
+            for axis in range(2):
+                e, f = m[axis, 0] / area, m[axis, 1] / area
+                m[axis, 0], m[axis, 1] = e * d - f * c, f * a - e * b
             go_x = m[0, 0] * step[0] + m[0, 1] * step[1]
             go_y = m[1, 0] * step[0] + m[1, 1] * step[1]
             x, y = x - go_x, y - go_y

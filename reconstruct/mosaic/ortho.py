@@ -15,7 +15,7 @@ _TAPS = 8
 _FRACTIONS = 1024
 
 
-@compiled
+@compiled(error_model="numpy", fastmath=FAST)
 def visible_cells(
     height: Float32,
     camera_enu: Array,
@@ -62,10 +62,11 @@ def visible_cells(
             hidden = False
             if steps >= 1.0:
                 rise = (camera_enu[2] - h) / steps
+                right, down = right / steps, down / steps
                 last = min(steps, (top - h) / rise)
                 for n in range(1, math.floor(last) + 1):
-                    r = round(row + down * n / steps)
-                    c = round(column + right * n / steps)
+                    r = math.floor(row + down * n + 0.5)
+                    c = math.floor(column + right * n + 0.5)
                     if r < 0 or c < 0 or r >= rows or c >= columns:
                         break
                     if height[r, c] > h + rise * n + tolerance:

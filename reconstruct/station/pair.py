@@ -253,14 +253,14 @@ def dense_pair(
         looks.append((normalise(colour), valid))
     maps = []
     for a, b in ((0, 1), (1, 0)):
-        found = pair_depth((views[a], views[b]), (looks[a], looks[b]), points, MATCH_SIGMA_PX)
+        found = pair_depth((views[a], views[b]), (looks[a], looks[b]), points)
         if found is None:
             angle = np.rad2deg(optics.rig.second_from_first.rotation.magnitude())
             raise ReconstructionError(
                 "the cameras of the rig share too little of their view for dense matching: their "
                 f"axes are {angle:.0f} degrees apart"
             )
-        maps.append(found)
+        maps.append((found.depth, found.sigma(MATCH_SIGMA_PX)))
     depth = _agreeing(views[0], views[1], maps)
     samplers = pair_samplers(optics, pictures, (views[0], views[1]))
     match_sigma, factor = _match_sigma((views[0], views[1]), samplers, depth, maps[0][1])

@@ -14,10 +14,20 @@ from alice_survey.base.compiled import compiled
 from reconstruct.views.range_shift import FAST
 
 _SIXTH, _HALF, _TWO_THIRDS = np.float32(1 / 6), np.float32(0.5), np.float32(2 / 3)
+_NEXT = np.uint64(1)
 _ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
 
 
-@compiled
+@compiled(error_model="numpy", fastmath=FAST)
+def _across(picture: Any, left: Any, row: Any, a: float, b: float, c: float, d: float) -> float:
+    """Four pixels of a row, weighted."""
+    level: float = a * picture[row, left] + b * picture[row, left + _NEXT]
+    left += _NEXT + _NEXT
+    level += c * picture[row, left] + d * picture[row, left + _NEXT]
+    return level
+
+
+@compiled(error_model="numpy", fastmath=FAST)
 def cubic_level(picture: Any, x: float, y: float) -> float:
     """Grey level by cubic convolution (Keys 1981); the first pixel's centre is 0, 0."""
     column, row = math.floor(x), math.floor(y)
@@ -26,19 +36,12 @@ def cubic_level(picture: Any, x: float, y: float) -> float:
     b = (1.5 * p - 2.5) * p * p + 1.0
     c = ((-1.5 * p + 2.0) * p + 0.5) * p
     d = (0.5 * p - 0.5) * p * p
-    rows = (
-        ((-0.5 * q + 1.0) * q - 0.5) * q,
-        (1.5 * q - 2.5) * q * q + 1.0,
-        ((-1.5 * q + 2.0) * q + 0.5) * q,
-        (0.5 * q - 0.5) * q * q,
-    )
-    level = 0.0
-    for k in range(4):
-        r = row - 1 + k
-        level += rows[k] * (
-            a * picture[r, column - 1] + b * picture[r, column]
-            + c * picture[r, column + 1] + d * picture[r, column + 2]
-        )  # fmt: skip
+    left, top = np.uint64(column - 1), np.uint64(row - 1)  # unsigned: never counted from the end
+    level = (((-0.5 * q + 1.0) * q - 0.5) * q) * _across(picture, left, top, a, b, c, d)
+    level += ((1.5 * q - 2.5) * q * q + 1.0) * _across(picture, left, top + _NEXT, a, b, c, d)
+    top += _NEXT + _NEXT
+    level += (((-1.5 * q + 2.0) * q + 0.5) * q) * _across(picture, left, top, a, b, c, d)
+    level += ((0.5 * q - 0.5) * q * q) * _across(picture, left, top + _NEXT, a, b, c, d)
     return level
 
 

@@ -1,6 +1,7 @@
 """The command line: quick, with examples everywhere, one line for a known fault."""
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -270,3 +271,26 @@ def test_half_of_a_stereo_rig_is_refused(
 ) -> None:
     arguments = ["import-images", f"--{side}", str(tmp_path), "-w", str(tmp_path / "w")]
     assert "--camera NAME=FOLDER" in fails(arguments, capsys, monkeypatch)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in /proc")
+def test_products_of_matrices_are_computed_on_one_core() -> None:
+    """Else their rounding, and much time spent on waiting, would depend on the number of cores."""
+    code = """
+import os
+from alice_survey.cli import main as cli
+
+def app():
+    import numpy as np
+
+    matrix = np.ones((600, 600))
+    print((matrix @ matrix)[0, 0], len(os.listdir("/proc/self/task")))
+
+cli.app = app
+cli.main()
+"""
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["600.0", "1"]

@@ -89,7 +89,8 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
     place = rng.uniform(-0.3, 0.9, (200, 2))
     points = np.column_stack([place, sloped_with_step(*place.T)])
 
-    depth, sigma = pair_depth((one, other), looks, points, 0.3)
+    found = pair_depth((one, other), looks, points)
+    depth, sigma = found.depth, found.sigma(0.3)
 
     true = one.world_from_cam.inv().apply(hits(one, scene).reshape(-1, 3))[:, 2]
     error = depth - true.reshape(depth.shape)
@@ -108,7 +109,7 @@ def test_masked_pixels_get_no_depth():
     masked[:, :200] = False
     points = np.array([[0.1, 0.1, DEPTH_M + 0.05], [0.0, 0.2, DEPTH_M - 0.05]] * 3)
     here, there, free = (
-        pair_depth((one, other), tuple(zip(greys, usable, strict=True)), points, 0.3)[0]
+        pair_depth((one, other), tuple(zip(greys, usable, strict=True)), points).depth
         for usable in ((masked, EVERYWHERE), (EVERYWHERE, masked), (EVERYWHERE, EVERYWHERE))
     )
     assert np.isfinite(free[:, :200]).any()

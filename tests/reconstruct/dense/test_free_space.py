@@ -3,6 +3,7 @@
 import numpy as np
 
 from reconstruct.dense.free_space import look_at_points
+from reconstruct.dense.view_store import stored
 from reconstruct.views.model import View, enu_from_cam
 from tests.oracles_dense import Scene, hits, sloped_with_step, speckle, stereo_views
 
@@ -20,8 +21,8 @@ def looks(view: View, world: np.ndarray, sigma_m: float = 1e-4) -> tuple[np.ndar
     enu = (world[:, [1, 0, 2]] * [1, 1, -1] - OFFSET).astype(np.float32)
     to_cam = np.linalg.inv(np.vstack([enu_from_cam(view, OFFSET), [0, 0, 0, 1]]))[:3]
     return look_at_points(
-        enu, np.full(len(enu), sigma_m, np.float32), np.ascontiguousarray(to_cam), depth,
-        np.full(shape, sigma_m, np.float32), view.kernel_lens, CELL_M,
+        enu, np.full(len(enu), sigma_m, np.float32), np.ascontiguousarray(to_cam),
+        stored(depth, np.full(shape, sigma_m, np.float32)), 1.0, view.kernel_lens, CELL_M,
     )  # fmt: skip
 
 

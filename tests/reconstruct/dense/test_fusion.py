@@ -7,6 +7,7 @@ from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.depth import count_witnesses, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
+from reconstruct.dense.view_store import decoded, stored
 from reconstruct.views.range_shift import KernelLens, no_shift, slopes_of
 from tests.oracles_dense import merged, plane_depth, port_view
 
@@ -53,7 +54,7 @@ def witness(shift_m: float) -> tuple[np.ndarray, np.ndarray]:
     there = np.full_like(depth, 2.0 + shift_m)
     return count_witnesses(
         depth, sigma, slopes_of(depth, LENS), np.ascontiguousarray(other_from_ref),
-        there, sigma, LENS, 3.0,
+        stored(there, sigma), 1.0, LENS, 3.0,
     )  # fmt: skip
 
 
@@ -82,6 +83,8 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
     there = plane_depth(other, 1.2)
     there += rng.normal(0, 0.05, there.shape).astype(np.float32)
     sigma = np.full(depth.shape, 0.01, np.float32)
+    factor, other_depth = 2.0, stored(there, 0.5 * sigma)
+    there, there_sigma = decoded(other_depth)
     move = other.world_from_cam.inv() * one.world_from_cam
     rows, columns = np.mgrid[: one.pinhole.height_px, : one.pinhole.width_px]
     pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
@@ -90,12 +93,12 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
     at = np.floor(other.project(points)).astype(int).reshape(*depth.shape, 2)
     z = other.world_from_cam.inv().apply(points)[:, 2].reshape(depth.shape)
     apart = there[at[seen][:, 1], at[seen][:, 0]] - z[seen]
-    reach = 3 * np.hypot(0.01, 0.01)
+    reach = 3 * np.hypot(0.01, factor * there_sigma[at[seen][:, 1], at[seen][:, 0]])
 
     def right(first: KernelLens, second: KernelLens) -> float:
         confirmed, refuted = count_witnesses(
             depth, sigma, slopes_of(depth, first), np.ascontiguousarray(move.as_matrix()[:3]),
-            there, sigma, second, 3.0,
+            other_depth, factor, second, 3.0,
         )  # fmt: skip
         assert not (confirmed & refuted).any()
         agree = (confirmed[seen] == (np.abs(apart) <= reach)) & (refuted[seen] == (apart > reach))

@@ -11,7 +11,7 @@ from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
-from reconstruct.dense.moving import agreed, odd_ones, splat
+from reconstruct.dense.moving import agreed, cells_at, draw, odd_ones
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 from tests.oracles_dense import (
@@ -20,6 +20,8 @@ from tests.oracles_dense import (
     HEIGHT,
     WIDTH,
     Scene,
+    plane_depth,
+    port_view,
     sloped_with_step,
     sparse_model,
     speckle,
@@ -186,12 +188,65 @@ def test_the_nearest_depth_that_two_stations_share():
     assert np.isnan(found[3])
 
 
-def test_the_nearest_of_points_is_drawn_into_the_cells_around_them():
-    depth = np.full((3, 4), np.nan, np.float32)
-    splat(np.array([[1.5, 1.0], [1.9, 1.0], [9.0, 9.0]]), np.float32([2.0, 1.5, 1.0]), depth)
-    expected = np.full((3, 4), np.nan)
-    expected[0:2, 1:3] = 1.5
-    np.testing.assert_array_equal(depth, expected)
+def drawn(depth: np.ndarray, one: View, other: View, step: float) -> np.ndarray:
+    """Slow twin of `draw`."""
+    rows, columns = np.nonzero(np.isfinite(depth))
+    pixels = (np.column_stack([columns, rows]) + 0.5) * step
+    points = one.at_depth(pixels, depth[rows, columns].astype(float))
+    corners = np.floor(other.project(points) / step - 0.5).astype(int)
+    found = np.full(depth.shape, np.nan)
+    for (left, top), z in zip(corners, other.world_from_cam.inv().apply(points)[:, 2], strict=True):
+        for row in range(max(top, 0), min(top + 2, depth.shape[0])):
+            for column in range(max(left, 0), min(left + 2, depth.shape[1])):
+                found[row, column] = np.fmin(found[row, column], z)
+    return found
+
+
+def port_views() -> tuple[View, View, np.ndarray, int]:
+    """Two views through a tilted port, the depth of the first on a lattice, and its step."""
+    one, other = port_view([0, 0, 0], [1.0, -2.0, 30.0]), port_view([0.2, 0.1, 0], [-1, 1, 28])
+    step = 4
+    depth = np.ascontiguousarray(plane_depth(one, 1.2)[2::step, 2::step])
+    rng = np.random.default_rng(2)
+    depth *= rng.uniform(0.97, 1.03, depth.shape).astype(np.float32)
+    depth[:3] = np.nan
+    return one, other, depth, step
+
+
+def test_a_surface_is_drawn_into_another_view_as_its_slow_twin_does():
+    one, other, depth, step = port_views()
+    found = np.full_like(depth, np.nan)
+    move = (other.world_from_cam.inv() * one.world_from_cam).as_matrix()[:3]
+    lattices = [(view.kernel_lens, float(step)) for view in (one, other)]
+    draw(depth, lattices[0], np.ascontiguousarray(move), lattices[1], found)
+    expected = drawn(depth, one, other, step)
+    assert 0.3 < np.isfinite(expected).mean() < 1.0
+    alike = np.isclose(found, expected, rtol=1e-5, equal_nan=True)
+    assert alike.mean() > 0.999  # places at the edge of a cell may be rounded either way
+
+
+def test_cells_show_points_that_lie_at_their_depth():
+    one, _, depth, step = port_views()
+    usable = np.ones(depth.shape, bool)
+    usable[:, :5] = False
+    rng = np.random.default_rng(3)
+    width, height = one.pinhole.size_px
+    pixels = rng.uniform([-20, -20], [width + 20, height + 20], (4000, 2))
+    z = rng.uniform(1.1, 1.3, len(pixels))
+    points = one.at_depth(pixels, z)
+    to_cam = np.ascontiguousarray(one.world_from_cam.inv().as_matrix()[:3])
+    cells, ranges = cells_at(points, to_cam, one.kernel_lens, float(step), depth, usable)
+
+    columns, rows = np.floor(pixels / step).astype(int).T
+    inside = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0])
+    at = rows[inside], columns[inside]
+    inside[inside] = usable[at] & (np.abs(depth[at] - z[inside]) <= 0.02 * z[inside])
+    expected = np.where(inside, rows * depth.shape[1] + columns, -1)
+    assert 0.1 < inside.mean() < 0.5
+    assert (cells == expected).mean() > 0.998
+    shown = (cells == expected) & inside
+    np.testing.assert_allclose(ranges[shown], z[shown], rtol=1e-6)
+    assert (ranges[cells < 0] == 1).all()
 
 
 def test_a_cell_is_odd_where_others_agree_on_something_else():

@@ -18,6 +18,7 @@ from reconstruct.mapping.mapper import (
     _options,
     collapsed_frames,
     map_calibrated,
+    map_from_poses,
     merge_models,
     model_baseline,
     report_left_out,
@@ -358,3 +359,23 @@ def test_models_that_share_stations_become_one(
     assert "6 pictures" in notes[0] and "left/000006.png" in notes[0]
     assert notes[0] in capsys.readouterr().err
     assert report_left_out([first]) == report_left_out([]) == []
+
+
+def test_a_station_without_a_pose_is_added_to_a_model_from_poses(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=6, points=4000, noise_px=0.1)
+    seen = seen_by_pinholes(scene)
+    on_rig = {n: seen.warps[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+    reference = on_rig["left"].inv()
+    poses = {
+        record.station: seen.warps["left"].pinhole_from_cam * pose.inv()
+        for record, pose in zip(scene.records, scene.ned_from_cam, strict=True)
+        if record.camera == "left" and record.station != 3
+    }
+    cam_from_left = {name: pose * reference for name, pose in on_rig.items()}
+    model = map_from_poses(seen, cam_from_left, poses, tmp_path, 1, free="nothing")
+
+    assert model.num_reg_images() == len(scene.records)
+    mapped = Mapped(
+        model=model, warps=seen.warps, models=(12,), scaled=True, baseline=0.1, rig_factor=1.0
+    )
+    assert 0.01e-3 < camera_rms(mapped, scene) < 2e-3
