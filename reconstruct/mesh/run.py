@@ -15,7 +15,7 @@ from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts
-from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
+from reconstruct.mesh.surface import MOST_TRIANGLES, TRIM_STEPS, TriangleMesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.topology import face_areas
 from reconstruct.mesh.visibility import find_candidates
@@ -24,8 +24,6 @@ from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
 from reconstruct.views.model import WorldFrame, read_model
 
-MOST_TRIANGLES = 4_000_000
-"""Most triangles where the settings name no number."""
 _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
@@ -47,15 +45,16 @@ def run_mesh(
     pixel = mean_pixel(model)
     views = [view for view in model.views if view.image in light.gains]
     cloud = open_cloud(dense / "cloud.ply")
-    mesh = mesh_cloud(
+    scratch = folder / "scratch"
+    scratch.mkdir()
+    mesh, levels = mesh_cloud(
         cloud,
         step,
         reconstruct.mesh_error_px * pixel,
         reconstruct.mesh_triangles or MOST_TRIANGLES,
+        scratch,
         executor,
     )
-    scratch = folder / "scratch"
-    scratch.mkdir(exist_ok=True)
     np.savez(scratch / "mesh.npz", vertices=mesh.vertices, triangles=mesh.triangles, offset=offset)
     candidates = find_candidates(
         scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, executor
