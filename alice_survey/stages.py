@@ -719,7 +719,9 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.mesh.run:run_mesh",
         takes=("reconstruct",),
         needs=("image", "placing", "dense"),
-        settings=only("reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px"),
+        settings=only(
+            "reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px", "mesh_tiles"
+        ),
         inputs=_mesh_inputs,
         summary=_mesh_summary,
         products={"mesh.glb": "textured mesh"},

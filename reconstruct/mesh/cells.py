@@ -52,7 +52,14 @@ class CellMesh:
             cut=self.cut,
             distance=self.distance,
         )
-        return Cell(path=path, triangles=len(self.triangles), distance=self.distance)
+        low, high = self.vertices.min(axis=0).tolist(), self.vertices.max(axis=0).tolist()
+        return Cell(
+            path=path,
+            triangles=len(self.triangles),
+            low=tuple(low),
+            high=tuple(high),
+            distance=self.distance,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +68,9 @@ class Cell:
 
     path: Path
     triangles: int
+    low: tuple[float, ...]
+    """Least x, y and z of its vertices."""
+    high: tuple[float, ...]
     distance: float
 
     def mesh(self) -> CellMesh:
@@ -171,7 +181,8 @@ def without_pairs(triangles: Triangles) -> Triangles:
     _, group, count = np.unique(
         np.sort(triangles, axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    return triangles[count[group.reshape(-1)] == 1]
+    single: Triangles = triangles[count[group.reshape(-1)] == 1]
+    return single
 
 
 def farthest(points: Array, vertices: Array, triangles: Triangles) -> float:

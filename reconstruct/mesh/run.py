@@ -15,8 +15,15 @@ from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts
-from reconstruct.mesh.surface import MOST_TRIANGLES, TRIM_STEPS, TriangleMesh, mesh_cloud
+from reconstruct.mesh.surface import (
+    MOST_TRIANGLES,
+    TRIM_STEPS,
+    TriangleMesh,
+    coarser_level,
+    mesh_cloud,
+)
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
+from reconstruct.mesh.tiles import TileSetup, write_tiles
 from reconstruct.mesh.topology import face_areas
 from reconstruct.mesh.visibility import find_candidates
 from reconstruct.mosaic.grid import mean_pixel
@@ -75,8 +82,24 @@ def run_mesh(
         page_px=reconstruct.mesh_page_px,
         executor=executor,
     )
-    shutil.rmtree(scratch)
     facts = mesh_facts(mesh, textured, offset, step, model.frame)
+    thinned = len(levels) > 1 or textured.scale < 1.0
+    if reconstruct.mesh_tiles == "on" or (reconstruct.mesh_tiles == "auto" and thinned):
+        while len(levels[-1].cells) > 1:
+            levels.append(coarser_level(levels, step, scratch, executor))
+        setup = TileSetup(
+            folder=folder / "tiles",
+            scratch=scratch / "tiles",
+            workspace=workspace,
+            cloud=cloud,
+            offset=offset,
+            step=step,
+            lift=_LIFT_STEPS * step,
+            pixel=pixel,
+            page_px=reconstruct.mesh_page_px,
+        )
+        facts["tiles"] = write_tiles(setup, levels, model.frame, views, light, executor)
+    shutil.rmtree(scratch)
     if facts["textured_share"] < 0.5:
         warn(
             f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "
