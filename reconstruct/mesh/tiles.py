@@ -17,7 +17,7 @@ Specification: OGC 22-025r4, https://docs.ogc.org/cs/22-025r4/22-025r4.html.
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -179,15 +179,14 @@ def _around(key: Key, ring: int, ratio: int = 1) -> list[Key]:
 
 def region_tasks(
     setup: TileSetup, levels: Sequence[Level], views: Sequence[View], light: LightModel
-) -> list[RegionTask]:
-    """Regions, each with the views that may see it."""
+) -> Iterator[RegionTask]:
+    """Regions, each with the views that may see it, one by one as they are asked for."""
     fine, coarse = levels[0], levels[min(REGION_LEVEL, len(levels) - 1)]
     ratio = round(coarse.side / fine.side)
     eyes = np.array([view.world_from_cam.translation for view in views]).reshape(-1, 3)
     regions: dict[Key, list[Key]] = {}
     for x, y in sorted(fine.cells):
         regions.setdefault((x // ratio, y // ratio), []).append((x, y))
-    tasks = []
     for number, mine in regions.items():
         tiles = {key: fine.cells[key] for key in mine}
         low = np.min([tile.low for tile in tiles.values()], axis=0)
@@ -209,18 +208,15 @@ def region_tasks(
         names = {view.image for view in seeing}
         corner = np.array(fine.origin) + np.array(number) * coarse.side
         margin = _RING * fine.side
-        tasks.append(
-            RegionTask(
-                number=number,
-                tiles={**tiles, **{key: fine.cells[key] for key in ring}},
-                count=len(tiles),
-                box=(*(corner - margin).tolist(), *(corner + coarse.side + margin).tolist()),
-                occluders=tuple(_between(hiding, low, high, seeing, setup.offset)),
-                views=seeing,
-                light=replace(light, gains={n: g for n, g in light.gains.items() if n in names}),
-            )
+        yield RegionTask(
+            number=number,
+            tiles={**tiles, **{key: fine.cells[key] for key in ring}},
+            count=len(tiles),
+            box=(*(corner - margin).tolist(), *(corner + coarse.side + margin).tolist()),
+            occluders=tuple(_between(hiding, low, high, seeing, setup.offset)),
+            views=seeing,
+            light=replace(light, gains={n: g for n, g in light.gains.items() if n in names}),
         )
-    return tasks
 
 
 def _between(
