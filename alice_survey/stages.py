@@ -716,14 +716,19 @@ STAGES: tuple[StageSpec, ...] = (
         folder="mesh",
         command="reconstruct",
         about="the textured mesh",
-        version=2,
+        version=3,
         work="reconstruct.mesh.run:run_mesh",
         takes=("reconstruct",),
         needs=("image", "placing", "dense"),
-        settings=only("reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px"),
+        settings=only(
+            "reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px", "mesh_tiles"
+        ),
         inputs=_mesh_inputs,
         summary=_mesh_summary,
-        products={"mesh.glb": "textured mesh"},
+        products={
+            "mesh.glb": "textured mesh",
+            "tiles/tileset.json": "the same in full detail as 3D Tiles, where it is large",
+        },
         picture="mesh.png",
         reported=("mesh.glb",),
     ),

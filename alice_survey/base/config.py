@@ -337,6 +337,7 @@ class ReconstructConfig(Config):
     mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
     mesh_triangles: int | None = Field(None, ge=100, le=50_000_000)
     mesh_error_px: float = Field(0.25, ge=0.01, le=10)
+    mesh_tiles: Literal["auto", "on", "off"] = "auto"
     mesh_page_px: int = Field(8192, ge=512, le=16_384)
     colour: Literal["even", "water", "raw"] = "water"
     dispersion: Literal["auto", "on", "off"] = "auto"

@@ -60,10 +60,15 @@ class Datum:
         ned: Array = self._ned_from_ecef.apply(np.stack(ecef, axis=1) - self._origin_ecef)
         return ned
 
+    def ecef_from_ned(self, points_ned: Array) -> Array:
+        """Take (N, 3) NED metres to geocentric coordinates (EPSG:4978), metres."""
+        points = np.asarray(points_ned, dtype=np.float64).reshape(-1, 3)
+        ecef: Array = self._ned_from_ecef.inv().apply(points) + self._origin_ecef
+        return ecef
+
     def geodetic_from_ned(self, points_ned: Array) -> Array:
         """Take (N, 3) NED metres to rows of latitude and longitude (degrees) and depth (m)."""
-        points = np.asarray(points_ned, dtype=np.float64).reshape(-1, 3)
-        ecef = self._ned_from_ecef.inv().apply(points) + self._origin_ecef
+        ecef = self.ecef_from_ned(points_ned)
         lon, lat, height = self._ecef.transform(*ecef.T, direction="INVERSE")
         return np.stack([lat, lon, self.height_m - height], axis=1)
 

@@ -1,5 +1,6 @@
 """Where every patch of a mesh lies in the pages of its texture."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,9 +81,7 @@ def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pag
         page_px: side of a page.
         most_pages: the texture is made coarser until it needs no more.
     """
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, wedges.chart, pixels)
-    np.maximum.at(high, wedges.chart, pixels)
+    low, high = _bounds(pixels, wedges, count)
     widest = float((high - low).max(initial=1.0))
     scale = min(1.0, (page_px - 2 * PADDING_PX - 2) / widest)
     while True:
@@ -108,6 +107,47 @@ def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pag
         used = int((corner[mine, 1] + box[mine, 1]).max(initial=1))
         sizes.append((page_px, -(-used // 4) * 4))
     return Atlas(sizes=tuple(sizes), page=page, corner=corner, source=source, box=box, scale=scale)
+
+
+def make_pages(pixels: Array, wedges: Wedges, page: NDArray[np.int32], page_px: int) -> Atlas:
+    """Pack the boxes of patches into the pages that they are to have, each as small as it goes.
+
+    Args:
+        pixels: (W, 2) of every wedge in its picture.
+        wedges: of the mesh.
+        page: (C,) of every patch; those of -1 are in none.
+        page_px: largest side of a page; the texture is made coarser until all fit.
+    """
+    low, high = _bounds(pixels, wedges, len(page))
+    corner, scale = np.zeros((len(page), 2), np.int64), 1.0
+    while True:
+        source = np.floor(low * scale).astype(np.int64) - PADDING_PX
+        box = np.ceil(high * scale).astype(np.int64) + PADDING_PX - source
+        sizes = []
+        for number in range(int(page.max(initial=-1)) + 1):
+            mine = np.flatnonzero(page == number)
+            side = max(int(box[mine].max(initial=4)), math.isqrt(int(box[mine].prod(1).sum())))
+            while True:
+                side = -(-side // 4) * 4
+                at, corner[mine] = pack(box[mine], side)
+                if at.max(initial=0) == 0:
+                    break
+                side = math.ceil(1.05 * side)
+            used = int((corner[mine, 1] + box[mine, 1]).max(initial=4))
+            sizes.append((side, -(-used // 4) * 4))
+        widest = max((side for side, _ in sizes), default=0)
+        if widest <= page_px:
+            break
+        scale *= 0.95 * page_px / widest
+    return Atlas(sizes=tuple(sizes), page=page, corner=corner, source=source, box=box, scale=scale)
+
+
+def _bounds(pixels: Array, wedges: Wedges, count: int) -> tuple[Array, Array]:
+    """Least and greatest pixels (C, 2) of every patch."""
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, wedges.chart, pixels)
+    np.maximum.at(high, wedges.chart, pixels)
+    return low, high
 
 
 def pack(boxes: NDArray[np.int64], side: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:

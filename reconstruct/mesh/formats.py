@@ -44,12 +44,12 @@ def write_mesh(
         extras: JSON values for the GLB.
         comments: lines for the headers of the others.
     """
-    _write_glb(folder / "mesh.glb", mesh, extras)
+    write_glb(folder / "mesh.glb", mesh, extras)
     _write_obj(folder / "mesh.obj", mesh, comments)
     _write_ply(folder / "mesh.ply", mesh, comments)
 
 
-def _write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
+def write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
     """Write binary glTF: one mesh and one material a page; pages as JPEG inside."""
     import trimesh
     from PIL import Image

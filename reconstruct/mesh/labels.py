@@ -25,6 +25,8 @@ _SWEEPS = 30
 _SMALL_FACES = 60
 """Patches of fewer faces are given away if they can be."""
 _MERGES = 6
+_LEAST_AXIS_COSINE = 0.3
+"""Least cosine between the normal of a face and the axis along which its texture lies."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,10 +66,37 @@ def choose_views(
     return label
 
 
+def choose_axes(vertices: Array, triangles: Triangles) -> NDArray[np.int32]:
+    """The axis along which to see every face, (T,): -1 to -6, in patches as large as they can be.
+
+    Axes are chosen as views are, with the cosine to the face's normal for quality.
+    """
+    normal = face_normals(vertices, triangles)
+    cosine = np.stack([-normal, normal], axis=2).reshape(-1, 6)
+    best = np.argsort(-cosine, axis=1, kind="stable")[:, :3]
+    quality = np.take_along_axis(cosine, best, axis=1)
+    seen = quality > _LEAST_AXIS_COSINE
+    axes = Candidates(
+        views=np.where(seen, best, -1).astype(np.int32),
+        quality=np.where(seen, quality, 0.0).astype(np.float32),
+    )
+    chosen = choose_views(vertices, triangles, axes)
+    return np.where(chosen < 0, chosen, -1 - chosen)
+
+
 @progress.step("cut patches")
-def make_charts(vertices: Array, triangles: Triangles, label: NDArray[np.int32]) -> Charts:
-    """The connected patches of faces of one label."""
-    chart = connected_charts(face_neighbours(vertices, triangles)[0], label)
+def make_charts(
+    vertices: Array,
+    triangles: Triangles,
+    label: NDArray[np.int32],
+    tile: NDArray[np.int32] | None = None,
+) -> Charts:
+    """The connected patches of faces of one label, and of one tile (T,) where these are given."""
+    group = label
+    if tile is not None:
+        both = np.stack([label, tile])
+        group = np.unique(both, axis=1, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    chart = connected_charts(face_neighbours(vertices, triangles)[0], group)
     views = np.empty(int(chart.max(initial=-1)) + 1, np.int32)
     views[chart] = label
     return Charts(label=label, chart=chart, views=views)

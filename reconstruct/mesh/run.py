@@ -15,8 +15,15 @@ from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts
-from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
+from reconstruct.mesh.surface import (
+    MOST_TRIANGLES,
+    TRIM_STEPS,
+    TriangleMesh,
+    coarser_level,
+    mesh_cloud,
+)
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
+from reconstruct.mesh.tiles import TileSetup, write_tiles
 from reconstruct.mesh.topology import face_areas
 from reconstruct.mesh.visibility import find_candidates
 from reconstruct.mosaic.grid import mean_pixel
@@ -24,8 +31,6 @@ from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
 from reconstruct.views.model import WorldFrame, read_model
 
-MOST_TRIANGLES = 4_000_000
-"""Most triangles where the settings name no number."""
 _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
@@ -47,15 +52,16 @@ def run_mesh(
     pixel = mean_pixel(model)
     views = [view for view in model.views if view.image in light.gains]
     cloud = open_cloud(dense / "cloud.ply")
-    mesh = mesh_cloud(
+    scratch = folder / "scratch"
+    scratch.mkdir()
+    mesh, levels = mesh_cloud(
         cloud,
         step,
         reconstruct.mesh_error_px * pixel,
         reconstruct.mesh_triangles or MOST_TRIANGLES,
+        scratch,
         executor,
     )
-    scratch = folder / "scratch"
-    scratch.mkdir(exist_ok=True)
     np.savez(scratch / "mesh.npz", vertices=mesh.vertices, triangles=mesh.triangles, offset=offset)
     candidates = find_candidates(
         scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, executor
@@ -76,8 +82,24 @@ def run_mesh(
         page_px=reconstruct.mesh_page_px,
         executor=executor,
     )
-    shutil.rmtree(scratch)
     facts = mesh_facts(mesh, textured, offset, step, model.frame)
+    thinned = len(levels) > 1 or textured.scale < 1.0
+    if reconstruct.mesh_tiles == "on" or (reconstruct.mesh_tiles == "auto" and thinned):
+        while len(levels[-1].cells) > 1:
+            levels.append(coarser_level(levels, step, scratch, executor))
+        setup = TileSetup(
+            folder=folder / "tiles",
+            scratch=scratch / "tiles",
+            workspace=workspace,
+            cloud=cloud,
+            offset=offset,
+            step=step,
+            lift=_LIFT_STEPS * step,
+            pixel=pixel,
+            page_px=reconstruct.mesh_page_px,
+        )
+        facts["tiles"] = write_tiles(setup, levels, model.frame, views, light, executor)
+    shutil.rmtree(scratch)
     if facts["textured_share"] < 0.5:
         warn(
             f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "

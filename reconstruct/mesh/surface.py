@@ -1,4 +1,4 @@
-"""The surface through a point cloud: meshed tile by tile, welded, cleaned and decimated.
+"""The surface through a point cloud: meshed tile by tile, joined, cleaned and decimated.
 
 The surface is the zero of an implicit function on a lattice: the weighted mean height over the
 tangent planes of the points around (implicit moving least squares, Kolluri 2008, "Provably good
@@ -15,14 +15,25 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import Executor, progress
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
+from reconstruct.mesh.cells import (
+    GROWTH,
+    Cell,
+    CellMesh,
+    Level,
+    coarser,
+    decimated,
+    part_of,
+    without_pairs,
+)
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.topology import (
     Triangles,
@@ -30,6 +41,7 @@ from reconstruct.mesh.topology import (
     component_areas,
     split_fans,
     triangulated,
+    unfolded,
     without_folds,
 )
 from reconstruct.ply import CloudFile
@@ -48,25 +60,13 @@ _LEAST_PART_STEPS2 = 400.0
 """Parts with an area of fewer lattice squares are taken for strays."""
 _MOST_WEIGHT = 4.0
 """Largest weight of a point that is better known than the median."""
-_KEY_BITS = 21
-_DENSE_ROUNDS = 12
-_GROWTH = 1.3
-"""Factor by which the error grows until the triangles are few enough."""
+MOST_TRIANGLES = 4_000_000
+"""Most triangles of a mesh that is held at once, where the settings name no number."""
 KERNEL_STEPS = 0.8
 """Standard deviation of the points' Gaussian weight, lattice steps."""
 REACH_STEPS = 2.5
 """Distance from a node at which points stop to count, lattice steps."""
 _NEWTON_STEPS = 3
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Piece:
-    """The mesh of a tile."""
-
-    vertices: Array
-    triangles: Triangles
-    keys: NDArray[np.int64]
-    """(V,) the same for a vertex that two tiles share."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,8 +81,13 @@ class TriangleMesh:
 
 
 def mesh_cloud(
-    cloud: CloudFile, step: float, error: float, most_triangles: int, executor: Executor
-) -> TriangleMesh:
+    cloud: CloudFile,
+    step: float,
+    error: float,
+    most_triangles: int,
+    folder: Path,
+    executor: Executor,
+) -> tuple[TriangleMesh, list[Level]]:
     """Mesh a cloud.
 
     Args:
@@ -90,28 +95,59 @@ def mesh_cloud(
         step: of the lattice: the spacing of the points.
         error: that decimation may make, in the unit of the points.
         most_triangles: the error is raised until there are no more.
+        folder: for files.
         executor: where tasks run.
+
+    Returns:
+        The mesh; and the same in cells, the first level with the error as given, and coarser ones
+        down to the mesh where the first has too many triangles to be held at once.
 
     Raises:
         ReconstructionError: no surface is left.
     """
-    sample = cloud.sample(200_000)
-    sigma = float(np.median(sample["sigma"])) if "sigma" in (sample.dtype.names or ()) else 1.0
-    mesh = partial(mesh_tile, cloud, step, sigma, error)
-    pieces = executor.map(mesh, surface_tiles(cloud, step), label="mesh")
-    vertices, triangles = weld([p for p in pieces if len(p.triangles)])
-    triangles = without_folds(vertices, triangles)
+    levels = [finest_level(cloud, step, error, folder, executor)]
+    while levels[-1].triangles > max(most_triangles, MOST_TRIANGLES) and len(levels[-1].cells) > 1:
+        levels.append(coarser_level(levels, step, folder, executor))
+    whole, error = levels[-1].whole(), levels[-1].error
+    vertices = whole.vertices
+    triangles = without_folds(vertices, without_pairs(whole.triangles))
     part, area = component_areas(vertices, triangles)
     large = area[part] >= min(_LEAST_PART_STEPS2 * step * step, area.max(initial=0.0))
-    vertices, triangles, _ = split_fans(vertices, triangles[large])
-    if not len(triangles):
+    if not large.any():
         raise ReconstructionError(
             f"{cloud.header.path}: its {cloud.header.count} points, {step:.3g} apart, lie too "
             "thinly to carry a surface; the pictures need more overlap or sharper texture"
         )
-    vertices, triangles, error = _to_count(vertices, triangles, step, error, most_triangles)
-    vertices, triangles, _ = clean(vertices, triangles)
-    return TriangleMesh(vertices=vertices, triangles=triangles, error=error)
+    vertices, triangles, _ = split_fans(vertices, triangles[large])
+    vertices, triangles, error = _to_count(vertices, triangles, error, most_triangles)
+    return TriangleMesh(vertices=vertices, triangles=triangles, error=error), levels
+
+
+def finest_level(
+    cloud: CloudFile, step: float, error: float, folder: Path, executor: Executor
+) -> Level:
+    """The mesh of a cloud in cells of 2 x 2 tiles; arguments as `mesh_cloud` takes them."""
+    sample = cloud.sample(200_000)
+    sigma = float(np.median(sample["sigma"])) if "sigma" in (sample.dtype.names or ()) else 1.0
+    tiles = surface_tiles(cloud, step)
+    (x, y), (side, _) = tiles[0]
+    (folder / "lattice").mkdir(parents=True)
+    mesh = partial(mesh_tile, cloud, step, sigma, error, folder / "lattice")
+    made = zip(tiles, executor.map(mesh, tiles, label="mesh"), strict=True)
+    lattice = Level(
+        origin=(x * step, y * step),
+        side=side * step,
+        error=error,
+        cells={((i - x) // side, (j - y) // side): c for ((i, j), _), c in made if c is not None},
+    )
+    least = _LEAST_PART_STEPS2 * step * step
+    return coarser(lattice, folder / "0", error, least, executor, most=0)
+
+
+def coarser_level(levels: Sequence[Level], step: float, folder: Path, executor: Executor) -> Level:
+    """The level after the last, with twice its error; arguments as `mesh_cloud` takes them."""
+    least, into = _LEAST_PART_STEPS2 * step * step, folder / str(len(levels))
+    return coarser(levels[-1], into, 2.0 * levels[-1].error, least, executor)
 
 
 def surface_tiles(cloud: CloudFile, step: float) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -132,29 +168,31 @@ def mesh_tile(
     step: float,
     sigma: float,
     error: float,
+    folder: Path,
     tile: tuple[tuple[int, int], tuple[int, int]],
-) -> Piece:
+) -> Cell | None:
     """Mesh the cells of a tile and decimate what it does not share with its neighbours.
+
+    The lattice reaches a cell beyond the tile, which shows where the surface goes on.
 
     Args:
         cloud: oriented points.
         step: of the lattice.
         sigma: of a point of weight 1.
         error: that decimation may make.
+        folder: to write into.
         tile: number of its first cell along x and y, and how many cells it has.
+
+    Returns:
+        The mesh; None where there is none.
     """
     from scipy.spatial import cKDTree
 
-    nothing = Piece(
-        vertices=np.empty((0, 3)),
-        triangles=np.empty((0, 3), np.int32),
-        keys=np.empty(0, np.int64),
-    )
     (x, y), (nx, ny) = tile
     west, south = (x - _RIM_STEPS) * step, (y - _RIM_STEPS) * step
     records = cloud.inside(west, (x + nx + _RIM_STEPS) * step, south, (y + ny + _RIM_STEPS) * step)
     if len(records) < _NEIGHBOURS:
-        return nothing
+        return None
     points = np.column_stack([records[axis].astype(np.float64) for axis in "xyz"]) / step
     normals = np.column_stack([records[f"n{axis}"].astype(np.float64) for axis in "xyz"])
     weights = np.ones(len(points))
@@ -164,106 +202,46 @@ def mesh_tile(
     sound = np.isfinite(normals).all(axis=1) & np.isfinite(weights) & (weights > 0)
     points, normals, weights = points[sound], normals[sound], weights[sound]
     if len(points) < _NEIGHBOURS:
-        return nothing
+        return None
     bottom = math.floor(points[:, 2].min()) - 3
     height = math.ceil(points[:, 2].max()) + 3 - bottom
-    first = (x - 1, y - 1, bottom)
-    values = splat(points, normals, weights, first, (nx + 2, ny + 2, height + 1))
-    local, cells, quads = zero_mesh(values)
+    first = (x - 2, y - 2, bottom)
+    values = splat(points, normals, weights, first, (nx + 4, ny + 4, height + 1))
+    vertices, cells, quads = zero_mesh(values, first)
     del values
     if not len(quads):
-        return nothing
-    vertices = local + np.array(first)
+        return None
     near = np.asarray(cKDTree(points).query(vertices, k=_NEIGHBOURS)[0])
     kept = (near[:, 0] <= TRIM_STEPS) & (near[:, -1] <= _NEIGHBOURHOOD_STEPS)
-    triangles = triangulated(vertices, quads[kept[quads].all(axis=1)])
-    shared = (cells[:, 0] == 0) | (cells[:, 0] == nx) | (cells[:, 1] == 0) | (cells[:, 1] == ny)
-    vertices, triangles, source = clean(vertices, triangles)
-    keys = _keys(cells[source].astype(np.int64) + np.array(first), shared[source])
-    fewer = decimate(vertices, triangles, shared[source], error / step)
-    return Piece(vertices=fewer.vertices * step, triangles=fewer.triangles, keys=keys[fewer.source])
-
-
-def _keys(cells: NDArray[np.int64], shared: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """A number for the cell of each shared vertex, -1 for others."""
-    wrapped = cells & ((1 << _KEY_BITS) - 1)
-    key = (wrapped[:, 0] << (2 * _KEY_BITS)) | (wrapped[:, 1] << _KEY_BITS) | wrapped[:, 2]
-    return np.where(shared, key, np.int64(-1))
-
-
-def weld(pieces: Sequence[Piece]) -> tuple[Array, Triangles]:
-    """Join pieces at the vertices they share; the first piece's copy stays."""
-    if not pieces:
-        return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    starts = np.cumsum([0, *(len(p.vertices) for p in pieces)])
-    vertices = np.concatenate([p.vertices for p in pieces])
-    keys = np.concatenate([p.keys for p in pieces])
-    triangles = np.concatenate(
-        [p.triangles.astype(np.int64) + start for p, start in zip(pieces, starts, strict=False)]
+    quads = quads[kept[quads].all(axis=1)]
+    start = cells[quads, :2].max(axis=1)  # the cell at whose edge a quadrilateral is
+    own = np.repeat(((start >= 2) & (start < np.array([nx, ny]) + 2)).all(axis=1), 2)
+    triangles = triangulated(vertices, quads)
+    sound = unfolded(vertices, triangles)
+    around = CellMesh(
+        vertices=vertices * step, triangles=triangles[sound], cut=np.empty((0, 2), np.int32)
     )
-    target = np.arange(len(vertices))
-    shared = np.flatnonzero(keys >= 0)
-    _, first, group = np.unique(keys[shared], return_index=True, return_inverse=True)
-    target[shared] = shared[first[group.reshape(-1)]]
-    used = np.zeros(len(vertices), np.bool_)
-    used[target[triangles]] = True
-    number = np.cumsum(used) - 1
-    return vertices[used], number[target[triangles]].astype(np.int32)
+    if not own[sound].any():
+        return None
+    (i, j), mesh = tile[0], decimated(part_of(around, own[sound]), error)
+    return mesh.save(folder / f"{i}_{j}.npz")
 
 
 def _to_count(
-    vertices: Array, triangles: Triangles, step: float, error: float, most: int
+    vertices: Array, triangles: Triangles, error: float, most: int
 ) -> tuple[Array, Triangles, float]:
-    """Decimate across the seams of the tiles, and with a growing error until few are left.
-
-    The whole is cut into blocks by shifted squares of the plane, each decimated by itself with
-    what it shares locked, so that the memory of a round stays that of one block.
-    """
-    for number in range(_DENSE_ROUNDS * 8):
-        shift = (0.5, 0.0)[number % 2]
-        before = len(triangles)
-        vertices, triangles = _decimate_blocks(vertices, triangles, step, error, shift)
-        if number == 0:
-            continue
-        if len(triangles) <= most:
-            return vertices, triangles, error
-        if len(triangles) > 0.97 * before:
-            error *= _GROWTH
-    raise ReconstructionError(
-        f"the surface keeps {len(triangles)} triangles where mesh_triangles asks for {most}: "
-        "raise it"
-    )
-
-
-def _decimate_blocks(
-    vertices: Array, triangles: Triangles, step: float, error: float, shift: float
-) -> tuple[Array, Triangles]:
-    side = _TILE_STEPS[1] * step
-    middle = vertices[triangles].mean(axis=1)
-    low = vertices.min(axis=0)
-    at = np.floor((middle[:, :2] - low[:2]) / side + shift).astype(np.int64)
-    block = at[:, 1] * (at[:, 0].max(initial=0) + 1) + at[:, 0]
-    order = np.argsort(block, kind="stable")
-    cuts = np.flatnonzero(np.diff(block[order])) + 1
-    owner = np.full(len(vertices), -1, np.int64)
-    owner[triangles] = block[:, None]
-    locked = np.zeros(len(vertices), np.bool_)
-    foreign = owner[triangles] != block[:, None]
-    locked[triangles[foreign]] = True
-    pieces = []
-    for group in progress(np.split(order, cuts), "decimate"):
-        used, flat = np.unique(triangles[group], return_inverse=True)
-        held = locked[used]
-        fewer = decimate(vertices[used], flat.reshape(-1, 3).astype(np.int32), held, error)
-        old = used[fewer.source]
-        pieces.append(
-            Piece(
-                vertices=fewer.vertices,
-                triangles=fewer.triangles,
-                keys=np.where(locked[old], old, -1),
+    """Decimate with a growing error until few triangles are left."""
+    while len(triangles) > most:
+        before, error = len(triangles), GROWTH * error
+        free = np.zeros(len(vertices), np.bool_)
+        fewer = decimate(vertices, triangles, free, error)
+        vertices, triangles, _ = clean(fewer.vertices, fewer.triangles)
+        if len(triangles) == before and error > np.ptp(vertices, axis=0).max():
+            raise ReconstructionError(
+                f"the surface keeps {before} triangles where mesh_triangles asks for {most}: "
+                "raise it"
             )
-        )
-    return weld(pieces)
+    return vertices, triangles, error
 
 
 @compiled
@@ -320,7 +298,9 @@ def splat(
 
 
 @compiled
-def zero_mesh(values: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
+def zero_mesh(
+    values: Array, first: tuple[int, int, int]
+) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
     """Mesh the zero of a function on a lattice.
 
     Quadrilaterals around edges that start in the first cells along any axis are left to the block
@@ -328,9 +308,11 @@ def zero_mesh(values: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32
 
     Args:
         values: (X, Y, Z) at the nodes; NaN where unknown (such a cell holds no surface).
+        first: number of the block's first node along x, y, z.
 
     Returns:
-        Vertices, (V, 3) in steps from the block's first node; their cells, (V, 3); and
+        Vertices, (V, 3) in steps from the lattice's origin, the same to the bit in every block;
+        their cells in the block, (V, 3); and
         quadrilaterals, (Q, 4), counter-clockwise seen from where the function is positive.
     """
     nx, ny, nz = values.shape
@@ -360,9 +342,9 @@ def zero_mesh(values: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32
                     n = number[x, y, z]
                     cells[n, 0], cells[n, 1], cells[n, 2] = x, y, z
                     _place(values[x : x + 2, y : y + 2, z : z + 2], vertices[n])
-                    vertices[n, 0] += x
-                    vertices[n, 1] += y
-                    vertices[n, 2] += z
+                    vertices[n, 0] += x + first[0]
+                    vertices[n, 1] += y + first[1]
+                    vertices[n, 2] += z + first[2]
     quads = np.empty((3 * count, 4), np.int32)
     made = 0
     around = np.empty(4, np.int32)

@@ -24,7 +24,7 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.light.solve import LightModel
-from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_wedges
+from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_pages, make_wedges
 from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles, edges_of
 from reconstruct.mesh.visibility import to_world
@@ -95,6 +95,7 @@ def paint(
     plain_pixel: float,
     page_px: int,
     executor: Executor,
+    page: NDArray[np.int32] | None = None,
 ) -> Textured:
     """Make the texture of a mesh.
 
@@ -111,10 +112,15 @@ def paint(
         plain_pixel: side of a texture's pixel there.
         page_px: largest side of a page.
         executor: where tasks run.
+        page: (C,) of every patch, -1 for those that only help to level the colours; None where
+            patches go onto as few pages as they can.
     """
     wedges = make_wedges(triangles, charts)
     pixels = wedge_pixels(vertices, wedges, charts, views, offset_enu, plain_pixel)
-    atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MOST_PAGES)
+    if page is None:
+        atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MOST_PAGES)
+    else:
+        atlas = make_pages(pixels, wedges, page, page_px)
     corrections = _corrections(pixels, wedges, charts, views, workspace, light, executor)
     unseen = charts.views[wedges.chart] < 0
     corrections[unseen] = cloud_colours[wedges.vertex[unseen]][:, ::-1]
@@ -129,14 +135,14 @@ def paint(
     pages, colours = [], np.zeros((len(vertices), 3))
     weight = np.zeros(len(vertices))
     for number, (path, size) in enumerate(zip(scratch, atlas.sizes, strict=True)):
-        page = np.array(np.memmap(path, np.uint8, "r", shape=(size[1], size[0], 3)))
+        picture = np.array(np.memmap(path, np.uint8, "r", shape=(size[1], size[0], 3)))
         mine = np.flatnonzero(atlas.page[wedges.chart] == number)
         at = np.floor(on_page[mine]).astype(np.intp)
-        smooth = cv2.blur(page, (3, 3))[at[:, 1], at[:, 0], ::-1].astype(np.float64)
+        smooth = cv2.blur(picture, (3, 3))[at[:, 1], at[:, 0], ::-1].astype(np.float64)
         np.add.at(colours, wedges.vertex[mine], smooth)
         np.add.at(weight, wedges.vertex[mine], 1.0)
         pages.append(folder / f"texture_{number}.jpg")
-        write_jpeg(pages[-1], page)
+        write_jpeg(pages[-1], picture)
         path.unlink()
     return Textured(
         vertices=vertices,
@@ -332,8 +338,8 @@ def _paint_tasks(
     face_starts = np.searchsorted(charts.chart[face_order], np.arange(count + 1))
     tasks = []
     shown = np.maximum(charts.views, -1)
-    for number in np.unique(shown):
-        mine = np.flatnonzero(shown == number)
+    for number in np.unique(shown[atlas.page >= 0]):
+        mine = np.flatnonzero((shown == number) & (atlas.page >= 0))
         members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
             PagePaintTask(
@@ -396,7 +402,7 @@ def paint_view(
         correction, covered = spread_corners(
             corners - atlas.source[i], triangles, values, (int(height), int(width))
         )
-        nearest = _nearest(covered)
+        nearest = nearest_covered(covered)
         patch = crop + correction[nearest]
         beyond = ~covered & ~usable
         patch[beyond] = patch[nearest][beyond]
@@ -408,7 +414,7 @@ def paint_view(
         page.flush()
 
 
-def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def nearest_covered(covered: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Row and column of the covered pixel next to every pixel (itself where covered)."""
     if not covered.any():
         every = np.indices(covered.shape)

@@ -42,19 +42,21 @@ def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
 
 
 def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
-    """Triangles without those that have no area and those at edges that more than two share."""
+    """Triangles without those that `unfolded` leaves out."""
+    return triangles[unfolded(vertices, triangles)]
+
+
+def unfolded(vertices: Array, triangles: Triangles) -> NDArray[np.bool_]:
+    """Triangles (T,) that have an area and are at no edge that more than two share."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     longest = np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c))
     sound = _square(normal) > (1e-6 * longest) ** 2
-    triangles = triangles[sound & (np.ptp(np.sort(triangles, 1), axis=1) > 0)]
-    while True:
-        edges, edge = edges_of(triangles)
-        crowded = np.bincount(edge, minlength=len(edges)) > 2
-        bad = crowded[edge].reshape(-1, 3).any(axis=1)
-        if not bad.any():
-            return triangles
-        triangles = triangles[~bad]
+    sound &= np.ptp(np.sort(triangles, 1), axis=1) > 0
+    edges, edge = edges_of(triangles[sound])
+    crowded = np.bincount(edge, minlength=len(edges)) > 2
+    sound[sound] = ~crowded[edge].reshape(-1, 3).any(axis=1)
+    return np.asarray(sound)
 
 
 def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:

@@ -52,7 +52,8 @@ def find_candidates(
     """The best views of every face.
 
     Args:
-        mesh: file of its vertices and triangles, and of the offset of its coordinates.
+        mesh: file of its vertices and triangles, of the offset of its coordinates, and of vertices
+            and triangles that only hide others (`occluder_vertices`, `occluder_triangles`).
         faces: how many it has.
         workspace: with the pictures.
         views: to choose from.
@@ -88,6 +89,8 @@ def see_faces(
     """
     vertices, triangles, offset, scene, spheres = _geometry(mesh, mesh.stat().st_mtime_ns)
     near = vertices_near(view, vertices, spheres, offset)
+    if not len(near):
+        return np.empty(0, np.int32), np.empty(0, np.float32)
     valid = Pictures.still(workspace).valid(view.image)
     pixels = np.full((len(vertices), 2), np.nan)
     pixels[near] = view.project(to_world(vertices[near], offset))
@@ -180,7 +183,10 @@ def _geometry(
 ) -> tuple[Array, Triangles, Array, Any, tuple[Array, Array]]:
     with np.load(path) as data:
         vertices, triangles, offset = data["vertices"], data["triangles"], data["offset"]
-    return vertices, triangles, offset, ray_scene(vertices, triangles), block_spheres(vertices)
+        scene = ray_scene(vertices, triangles)
+        if "occluder_triangles" in data and len(data["occluder_triangles"]):
+            _add(scene, data["occluder_vertices"], data["occluder_triangles"])
+    return vertices, triangles, offset, scene, block_spheres(vertices)
 
 
 def ray_scene(vertices: Array, triangles: Triangles) -> Any:
@@ -188,8 +194,14 @@ def ray_scene(vertices: Array, triangles: Triangles) -> Any:
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    _add(scene, vertices, triangles)
+    return scene
+
+
+def _add(scene: Any, vertices: Array, triangles: Triangles) -> None:
+    import open3d as o3d
+
     scene.add_triangles(
         o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
         o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
     )
-    return scene
