@@ -13,13 +13,7 @@ from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
-from reconstruct.dense.cloud import (
-    laz_writer,
-    vertices_of,
-    voxel_edge,
-    write_cloud,
-    write_cloud_json,
-)
+from reconstruct.dense.cloud import write_clouds
 from reconstruct.dense.dem import (
     FILL_CELLS,
     STRAY_CELLS,
@@ -49,7 +43,6 @@ from reconstruct.views.model import SparseModel, WorldFrame
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
 _MOST_CELLS = 4_000_000_000
-_MOST_POINTS = 40_000_000
 _TILE_CELLS = 256
 _RIM = FILL_CELLS + STRAY_CELLS
 
@@ -119,7 +112,12 @@ def fuse_planes(
     )
     tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
     tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))
-    _write_cloud(folder, tiles, setup, model.frame, cell)
+    count = sum(tile.count for tile in tiles)
+    if count == 0:
+        raise no_depth(len(model.views))
+    surface = (tile.points(setup.store) for tile in tiles)
+    spool = setup.store.folder / "copc"
+    write_clouds(folder, surface, count, setup.offset_enu, model.frame, cell, spool)
     if (folder / PLANES).exists():  # of a run that was interrupted
         shutil.rmtree(folder / PLANES)
     made: list[Fused] = []
@@ -199,23 +197,6 @@ def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, flo
     east = float(grid.east_of(grid.columns / 2))
     north = float(grid.north_of(grid.rows / 2))
     return (float(np.round(east)), float(np.round(north)), float(np.round(up)))
-
-
-def _write_cloud(
-    folder: Path,
-    tiles: Sequence[SurfaceTile],
-    setup: FuseSetup,
-    frame: WorldFrame,
-    cell: float,
-) -> None:
-    offset = setup.offset_enu
-    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MOST_POINTS)
-    parts = (vertices_of(tile.points(setup.store), cell, edge) for tile in tiles)
-    with laz_writer(folder / "cloud.laz", offset, frame) as write_laz:
-        count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, frame)
-    if count == 0:
-        raise no_depth(len(setup.stations))
-    write_cloud_json(folder / "cloud.json", count, offset, edge, frame)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
