@@ -112,7 +112,7 @@ def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
 def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
     """Copy a GeoTIFF with overviews in the layout of a COG.
 
-    It takes some 16 s of computing a gigapixel where nothing is seen, most of it for overviews.
+    GDAL works through what is empty too, for overviews mostly.
     """
     rasterio.shutil.copy(
         rough,
