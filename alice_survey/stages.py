@@ -680,7 +680,7 @@ STAGES: tuple[StageSpec, ...] = (
             "dem.tif": "elevation model (GeoTIFF)",
             "sigma.tif": "sigma of its heights",
             "planes": "the same over further planes",
-            "cloud.laz": "point cloud with colour, normal, sigma",
+            "cloud.copc.laz": "point cloud (COPC) with colour, normal, sigma",
             "moving": "masks of what moves",
         },
         picture="dem.png",

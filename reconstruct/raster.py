@@ -131,7 +131,7 @@ def tiled_raster(
     text: str,
     unit: str = "",
 ) -> Iterator[Any]:
-    """A one-band tiled GeoTIFF to write to, window by window.
+    """A one-band tiled GeoTIFF to write to, window by window; others are unknown and take no room.
 
     Args:
         path: of the file.
@@ -157,6 +157,7 @@ def tiled_raster(
         "compress": "deflate",
         "predictor": 3 if dtype.startswith("float") else 2,
         "bigtiff": "if_safer",
+        "sparse_ok": True,
         "num_threads": 1,
     }
     with rasterio.open(path, "w", **profile) as raster:
@@ -205,6 +206,36 @@ def tiles_of_shape(rows: int, columns: int, size: int) -> list[Window]:
         Window(column, row, min(size, columns - column), min(size, rows - row))
         for row in range(0, rows, size)
         for column in range(0, columns, size)
+    ]
+
+
+def tiles_reached(
+    grid: DemGrid, size: int, boxes: Array, margin: float
+) -> list[tuple[Window, list[int]]]:
+    """Windows of `tiles_of` that boxes reach, row by row, each with the numbers of its boxes.
+
+    Args:
+        grid: of the tiles.
+        size: of a tile, in cells.
+        boxes: (B, 4) west, south, east, north; a row of NaN reaches nothing.
+        margin: around the boxes.
+    """
+    side = size * grid.cell
+    edges = np.stack([boxes[:, 0], -boxes[:, 3], boxes[:, 2], -boxes[:, 1]], axis=1)
+    edges += np.array([-1.0, -1.0, 1.0, 1.0]) * margin - np.array([grid.west, -grid.north] * 2)
+    most = np.array([-(-grid.columns // size), -(-grid.rows // size)] * 2) - 1
+    spans = np.floor(edges / side)
+    known = np.isfinite(spans).all(axis=1) & (spans[:, 2:] >= 0).all(axis=1)
+    known &= (spans[:, :2] <= most[:2]).all(axis=1)
+    reached: dict[tuple[int, int], list[int]] = {}
+    for number in np.flatnonzero(known).tolist():
+        left, top, right, bottom = np.clip(spans[number], 0, most).astype(int).tolist()
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                reached.setdefault((row * size, column * size), []).append(number)
+    return [
+        (Window(column, row, min(size, grid.columns - column), min(size, grid.rows - row)), numbers)
+        for (row, column), numbers in sorted(reached.items())
     ]
 
 

@@ -432,6 +432,8 @@ class SurfaceRecord(JsonRecord):
     path: ClassVar = "dense/surface.json"
     match_sigma_px: float
     pose_sigma: float | None = None
+    cell: float
+    """Side of a cell, in the unit."""
     vertical_datum: str
     moving: MovingMasks | None = None
 

@@ -30,7 +30,7 @@ _LINKS = (
     ("report/report.html", "The report", "what was mapped, how well, what to do next"),
     ("mosaic/mosaic.tif", "The mosaic", "cloud-optimised GeoTIFF"),
     ("dense/dem.tif", "The elevation model", "GeoTIFF"),
-    ("dense/cloud.laz", "The point cloud", "LAZ"),
+    ("dense/cloud.copc.laz", "The point cloud", "COPC, a LAZ with levels of detail"),
     (_MESH, "The mesh", "glTF"),
     ("sparse/track.csv", "The cameras' track", "CSV"),
     ("plan/plan.html", "The plan", "an interactive map"),

@@ -1,25 +1,31 @@
-"""The coloured point cloud: the points of the surface, as PLY and LAZ."""
+"""The coloured point cloud: the points of the surface, thinned for PLY, all of them for LAS."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.records import CloudRecord
+from reconstruct.copc import copc_writer
 from reconstruct.ply import VERTEX as MESH_VERTEX
 from reconstruct.ply import write_ply
 from reconstruct.raster import crs_of
 from reconstruct.views.model import WorldFrame
 
+if TYPE_CHECKING:
+    import laspy
+
 VERTEX = np.dtype([*MESH_VERTEX.descr, ("sigma", "<f4")])
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
-_LAZ_STEP = 1e-4
-_LAZ_EXTRA = {
+_MOST_OVERVIEW_POINTS = 40_000_000
+"""That programs without levels of detail hold at once."""
+_LAS_STEP = 1e-4
+_LAS_EXTRA = {
     "nx": "normal, east",
     "ny": "normal, north",
     "nz": "normal, up",
@@ -77,51 +83,81 @@ def write_cloud(
     return write_ply(path, parts, comments)
 
 
-@contextmanager
-def laz_writer(
-    path: Path, offset_enu: Sequence[float], frame: WorldFrame
-) -> Iterator[Callable[[Iterable[NDArray[Any]]], Iterator[NDArray[Any]]]]:
-    """A LAZ file (1.4, point format 7) that takes parts of `VERTEX` records as they pass.
+def write_clouds(
+    folder: Path,
+    surface: Iterable[NDArray[Any]],
+    count: int,
+    offset_enu: Sequence[float],
+    frame: WorldFrame,
+    cell: float,
+    scratch: Path,
+) -> None:
+    """Write all points of a surface as COPC, and an overview that fits in memory as PLY.
 
-    Coordinates are east, north and up in steps of 1/10000 of the unit, from the offset that the
-    header gives; colours are 16-bit; normals and sigma are extra dimensions. The projection is that
-    of the rasters where there is one.
+    Args:
+        folder: for `cloud.copc.laz`, `cloud.ply` and `cloud.json`.
+        surface: parts of it, records of `SURFACE_POINT` from the offset.
+        count: of all its points, one or more.
+        offset_enu: near the points.
+        frame: that the offset is in.
+        cell: of the surface.
+        scratch: a folder for points that wait.
+    """
+    edge = voxel_edge(cell, count, _MOST_OVERVIEW_POINTS)
+    header = las_header(offset_enu, frame)
+    if scratch.exists():  # of a run that was interrupted
+        shutil.rmtree(scratch)
+    with copc_writer(folder / "cloud.copc.laz", header, cell, scratch) as add:
 
-    Yields:
-        A function that passes parts on and writes each to the file.
+        def overview() -> Iterator[NDArray[Any]]:
+            for part in surface:
+                add(las_points(vertices_of(part, cell, cell), header))
+                yield vertices_of(part, cell, edge)
+
+        points = write_cloud(folder / "cloud.ply", overview(), offset_enu, frame)
+    write_cloud_json(folder / "cloud.json", points, offset_enu, edge, frame)
+
+
+def las_header(offset_enu: Sequence[float], frame: WorldFrame) -> "laspy.LasHeader":
+    """The header of a LAS 1.4 file of `VERTEX` records (point format 7).
+
+    Coordinates are east, north and up in steps of 1/10000 of the unit, from the offset; colours are
+    16-bit; normals and sigma are extra dimensions. The projection is that of the rasters where
+    there is one.
     """
     import laspy
     import pyproj
 
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.offsets = np.asarray(offset_enu, dtype=np.float64)
-    header.scales = np.full(3, _LAZ_STEP)
+    header.scales = np.full(3, _LAS_STEP)
     header.creation_date = _NO_DATE
     header.add_extra_dims(
         [
             laspy.ExtraBytesParams(name=name, type="f4", description=text)
-            for name, text in _LAZ_EXTRA.items()
+            for name, text in _LAS_EXTRA.items()
         ]
     )
     crs = crs_of(frame)
     if crs is not None:
         header.add_crs(pyproj.CRS.from_wkt(crs.to_wkt()))
-    with laspy.open(path, mode="w", header=header) as file:
+    return header
 
-        def passed(parts: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-            for part in parts:
-                if len(part):
-                    points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
-                    for axis, name in enumerate("xyz"):
-                        points[name] = part[name].astype(np.float64) + offset_enu[axis]
-                    for name in ("red", "green", "blue"):
-                        points[name] = part[name].astype(np.uint16) * 257
-                    for name in _LAZ_EXTRA:
-                        points[name] = part[name]
-                    file.write_points(points)
-                yield part
 
-        yield passed
+def las_points(vertices: NDArray[Any], header: "laspy.LasHeader") -> "laspy.ScaleAwarePointRecord":
+    """Points with a header of `las_header` of `VERTEX` records (N,)."""
+    import laspy
+
+    points = laspy.ScaleAwarePointRecord.zeros(len(vertices), header=header)
+    for axis, name in enumerate("xyz"):
+        points[name] = vertices[name].astype(np.float64) + header.offsets[axis]
+    for name in ("return_number", "number_of_returns"):
+        points[name] = np.ones(len(vertices), np.uint8)
+    for name in ("red", "green", "blue"):
+        points[name] = vertices[name].astype(np.uint16) * 257
+    for name in _LAS_EXTRA:
+        points[name] = vertices[name]
+    return points
 
 
 def write_cloud_json(

@@ -13,13 +13,7 @@ from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
-from reconstruct.dense.cloud import (
-    laz_writer,
-    vertices_of,
-    voxel_edge,
-    write_cloud,
-    write_cloud_json,
-)
+from reconstruct.dense.cloud import write_clouds
 from reconstruct.dense.dem import (
     FILL_CELLS,
     STRAY_CELLS,
@@ -33,23 +27,28 @@ from reconstruct.dense.surface_tiles import (
     FuseSetup,
     SurfaceTile,
     ViewSummary,
+    boxes_on,
     fuse_tasks,
     fuse_tile,
     on_plane,
-    tiles_over,
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask, lay_out_view
 from reconstruct.light.solve import LightModel
 from reconstruct.planes import PLANES, Plane, plane_frame, write_plane
 from reconstruct.qgis import write_style
-from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster, tiles_of
+from reconstruct.raster import (
+    DemGrid,
+    grid_over,
+    preview_dem,
+    round_cell,
+    tiled_raster,
+    tiles_reached,
+)
 from reconstruct.views.model import SparseModel, WorldFrame
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
-_MOST_CELLS = 4_000_000_000
-_MOST_POINTS = 40_000_000
 _TILE_CELLS = 256
 _RIM = FILL_CELLS + STRAY_CELLS
 
@@ -98,8 +97,7 @@ def fuse_planes(
         The planes on which something is seen, one or more; a warning names the others.
 
     Raises:
-        ReconstructionError: no depth was confirmed, nothing is seen on any plane, or a grid would
-            be too large.
+        ReconstructionError: no depth was confirmed, or nothing is seen on any plane.
     """
     model = confirmed.model
     summaries = _lay_out(confirmed)
@@ -107,7 +105,7 @@ def fuse_planes(
     if not bounds:
         raise no_depth(len(model.views))
     cell = surface_cell(summaries, cell_m, model.frame)
-    grid = _grid(bounds, cell, model.frame, "level")
+    grid = grid_over(bounds, cell)
     setup = FuseSetup(
         store=confirmed.store,
         light=confirmed.light,
@@ -119,7 +117,12 @@ def fuse_planes(
     )
     tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
     tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))
-    _write_cloud(folder, tiles, setup, model.frame, cell)
+    count = sum(tile.count for tile in tiles)
+    if count == 0:
+        raise no_depth(len(model.views))
+    surface = (tile.points(setup.store) for tile in tiles)
+    spool = setup.store.folder / "copc"
+    write_clouds(folder, surface, count, setup.offset_enu, model.frame, cell, spool)
     if (folder / PLANES).exists():  # of a run that was interrupted
         shutil.rmtree(folder / PLANES)
     made: list[Fused] = []
@@ -140,7 +143,7 @@ def fuse_planes(
                 tiles,
                 below,
                 plane,
-                _grid(on_it, cell, plane_frame(model.frame, plane), plane.name),
+                grid_over(on_it, cell),
             )
         )
     if not made:
@@ -176,46 +179,12 @@ def _lay_out(confirmed: Confirmed) -> list[ViewSummary]:
     return list(confirmed.executor.map(lay_out, tasks, label="lay out"))
 
 
-def _grid(
-    bounds: Sequence[tuple[float, float, float, float]], cell: float, frame: WorldFrame, plane: str
-) -> DemGrid:
-    """The grid over all points.
-
-    Raises:
-        ReconstructionError: it would be too large.
-    """
-    grid = grid_over(bounds, cell)
-    if grid.rows * grid.columns > _MOST_CELLS:
-        raise ReconstructionError(
-            f"cells of {cell} {frame.unit} would make a grid of {grid.rows} x {grid.columns} over "
-            f"the plane {plane!r}; raise reconstruct.dem_cell_m"
-        )
-    return grid
-
-
 def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, float, float]:
     """Whole numbers near the middle of the points: east, north, up."""
     up = float(np.nanmedian([s.up for s in summaries]))
     east = float(grid.east_of(grid.columns / 2))
     north = float(grid.north_of(grid.rows / 2))
     return (float(np.round(east)), float(np.round(north)), float(np.round(up)))
-
-
-def _write_cloud(
-    folder: Path,
-    tiles: Sequence[SurfaceTile],
-    setup: FuseSetup,
-    frame: WorldFrame,
-    cell: float,
-) -> None:
-    offset = setup.offset_enu
-    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MOST_POINTS)
-    parts = (vertices_of(tile.points(setup.store), cell, edge) for tile in tiles)
-    with laz_writer(folder / "cloud.laz", offset, frame) as write_laz:
-        count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, frame)
-    if count == 0:
-        raise no_depth(len(setup.stations))
-    write_cloud_json(folder / "cloud.json", count, offset, edge, frame)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -244,14 +213,15 @@ def _project(
     """Write one plane's rasters."""
     frame = confirmed.model.frame
     tasks = []
-    for window in tiles_of(grid, _TILE_CELLS):
+    margin = (_RIM + 1) * grid.cell
+    for window, over in tiles_reached(grid, _TILE_CELLS, boxes_on(tiles, plane), margin):
         part = grid.window(
             int(window.row_off) - _RIM,
             int(window.col_off) - _RIM,
             int(window.height) + 2 * _RIM,
             int(window.width) + 2 * _RIM,
         )
-        tasks.append((window, part, tiles_over(tiles, plane, part)))
+        tasks.append((window, part, [tiles[n] for n in over]))
     label = "project" if plane.is_level else f"project {plane.name}"
     found = confirmed.executor.map(partial(project_tile, setup, plane), tasks, label=label)
     _write_rasters(folder, grid, plane_frame(frame, plane), found)

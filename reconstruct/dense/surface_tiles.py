@@ -15,7 +15,7 @@ from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fu
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightModel
 from reconstruct.planes import Plane
-from reconstruct.raster import DemGrid, tiles_of
+from reconstruct.raster import DemGrid, tiles_reached
 from reconstruct.views.model import View, enu_from_cam
 
 _TILE_CELLS = 256
@@ -91,21 +91,17 @@ def fuse_tasks(
     summaries: Sequence[ViewSummary],
     poses: ErrorsOfPoses | None,
 ) -> list[FuseTask]:
-    """Tiles of a grid over all points, in rows."""
-    nowhere = (np.inf, np.inf, -np.inf, -np.inf)
-    bounds = np.array([summary.bounds or nowhere for summary in summaries])
+    """Tiles of a grid that points of views may fall in, in rows."""
+    boxes = np.array([summary.bounds or (np.nan,) * 4 for summary in summaries])[:, [1, 0, 3, 2]]
+    reached = tiles_reached(grid, _TILE_CELLS, boxes, _RIM_CELLS * grid.cell)
     tasks = []
-    for number, window in enumerate(tiles_of(grid, _TILE_CELLS)):
+    for number, (window, seeing) in enumerate(reached):
         row, column = int(window.row_off), int(window.col_off)
         tile = grid.window(row, column, int(window.height), int(window.width))
-        rim = _RIM_CELLS * grid.cell
         low, high = _corners(tile)
-        away = (bounds[:, 0] >= high[1] + rim) | (bounds[:, 2] <= low[1] - rim)
-        away |= (bounds[:, 1] >= high[0] + rim) | (bounds[:, 3] <= low[0] - rim)
-        seeing = tuple((index, views[index]) for index in np.flatnonzero(~away).tolist())
-        if seeing:
-            near = None if poses is None else poses.around(low[::-1], high[::-1])
-            tasks.append(FuseTask(number=number, grid=tile, views=seeing, poses=near))
+        near = None if poses is None else poses.around(low[::-1], high[::-1])
+        pairs = tuple((index, views[index]) for index in seeing)
+        tasks.append(FuseTask(number=number, grid=tile, views=pairs, poses=near))
     return tasks
 
 
@@ -167,16 +163,11 @@ def on_plane(
     return surface
 
 
-def tiles_over(tiles: Sequence[SurfaceTile], plane: Plane, grid: DemGrid) -> list[SurfaceTile]:
-    """Tiles of which points may lie over a grid in a plane, or next to it."""
-    low, high = _corners(grid)
-    found = []
-    for tile in tiles:
-        place = _swapped(plane.plane_from_world.apply(_swapped(tile.corners_enu)))[:, :2]
-        beyond = (place.max(axis=0) < low - grid.cell) | (place.min(axis=0) > high + grid.cell)
-        if tile.count and not beyond.any():
-            found.append(tile)
-    return found
+def boxes_on(tiles: Sequence[SurfaceTile], plane: Plane) -> Array:
+    """(T, 4) least and most right and up in a plane of the points of tiles; NaN of none."""
+    corners = np.concatenate([tile.corners_enu for tile in tiles])
+    places = _swapped(plane.plane_from_world.apply(_swapped(corners)))[:, :2].reshape(-1, 8, 2)
+    return np.concatenate([places.min(axis=1), places.max(axis=1)], axis=1)
 
 
 def _seen_through(

@@ -23,9 +23,10 @@ from rasterio.warp import calculate_default_transform
 from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_csv, write_json
 from alice_survey.base.errors import ConfigError, ReconstructionError
 from alice_survey.base.frames import Array
-from alice_survey.base.records import MeshRecord
+from alice_survey.base.records import MeshRecord, SurfaceRecord
 from alice_survey.base.run import progress
 from alice_survey.stages import need
+from reconstruct.copc import copc_writer
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.views.model import WorldFrame, read_frame
 
@@ -95,7 +96,7 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
     folder = "".join(c if c.isalnum() else "-" for c in crs)[:60].strip("-")
     stage = Stage(
         name=folder,
-        version=1,
+        version=2,
         settings={"crs": target.crs.to_wkt()},
         inputs=[workspace / name for name in ("dense", "mosaic", "mesh", "sparse/track.csv")],
     )
@@ -135,7 +136,8 @@ def _export(workspace: Path, target: Destination, folder: Path) -> None:
     for name in ("dem", "sigma"):
         shutil.copy2(dense / f"{name}.qml", folder / f"{name}.qml")
     _resample(mosaic / "mosaic.tif", folder / "mosaic.tif", target)
-    _cloud(dense / "cloud.laz", folder / "cloud.laz", target)
+    spacing = SurfaceRecord.read(dense / "surface.json").cell
+    _cloud(dense / "cloud.copc.laz", folder / "cloud.copc.laz", spacing, target)
     offset = _mesh(workspace / "mesh", folder, target)
     _track(workspace / "sparse" / "track.csv", folder / "track.csv", target)
     write_json(
@@ -190,7 +192,7 @@ def _resample(source: Path, path: Path, target: Destination) -> None:
 
 
 @progress.step("transform the cloud")
-def _cloud(source: Path, path: Path, target: Destination) -> None:
+def _cloud(source: Path, path: Path, spacing: float, target: Destination) -> None:
     import laspy
 
     with laspy.open(source) as file:
@@ -200,10 +202,7 @@ def _cloud(source: Path, path: Path, target: Destination) -> None:
         header.scales = file.header.scales
         header.creation_date = file.header.creation_date
         header.add_crs(target.crs)
-        with (
-            atomic_path(path) as temporary,
-            laspy.open(temporary, mode="w", header=header) as made,
-        ):
+        with copc_writer(path, header, spacing, path.with_name("scratch")) as add:
             for part in file.chunk_iterator(_CHUNK):
                 points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
                 for name in part.array.dtype.names or ():
@@ -214,7 +213,7 @@ def _cloud(source: Path, path: Path, target: Destination) -> None:
                 normals = np.column_stack([part["nx"], part["ny"], part["nz"]])
                 turned = target.turned(normals, middle[:2])
                 points["nx"], points["ny"], points["nz"] = turned.T
-                made.write_points(points)
+                add(points)
 
 
 @progress.step("transform the mesh")

@@ -9,10 +9,10 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from reconstruct.raster import DemGrid, tiles_of
-from reconstruct.views.model import SparseModel, View, WorldFrame, enu_from_cam, points_of_views
+from reconstruct.views.model import SparseModel, View, enu_from_cam, points_of_views
 
 Float32 = NDArray[np.float32]
 
@@ -20,7 +20,6 @@ CELL_PX = 8
 """Pixels a side of the cells on which views are compared and seams are laid."""
 ALIGNED_PX = 2 * CELL_PX
 """Blocks are a whole number of these, so that they share the pixels of their pyramids."""
-_MOST_PIXELS = 4_000_000_000
 _FLATTEST_SLOPE = 5.0
 
 
@@ -51,16 +50,10 @@ class Block:
     """How far off, on the ground, the DEM may hide something in the window."""
 
 
-def mosaic_grid(raster: rasterio.DatasetReader, pixel: float, frame: WorldFrame) -> DemGrid:
-    """Pixels over the whole of the DEM; larger ones than wanted where there would be too many."""
+def mosaic_grid(raster: rasterio.DatasetReader, pixel: float) -> DemGrid:
+    """Pixels over the whole of the DEM."""
     transform = raster.transform
     width, height = raster.width * transform.a, -raster.height * transform.e
-    while width * height / pixel**2 > _MOST_PIXELS:
-        warn(
-            f"pixels of {pixel} {frame.unit} would make a mosaic of "
-            f"{width * height / pixel**2 / 1e9:.0f} Gpx; they are doubled"
-        )
-        pixel *= 2.0
     return DemGrid(
         west=transform.c,
         north=transform.f,
@@ -97,7 +90,7 @@ def _footprint(
 
 
 def blocks_of(grid: DemGrid, seen: Footprints, size: int, margin: int) -> list[Block]:
-    """Blocks row by row, each with the views whose footprint reaches it.
+    """Blocks that any view's footprint reaches, row by row, each with those views.
 
     Args:
         grid: of the mosaic.
@@ -119,7 +112,9 @@ def blocks_of(grid: DemGrid, seen: Footprints, size: int, margin: int) -> list[B
         reaching = np.flatnonzero(
             (b[:, 0] < east) & (b[:, 1] > part.west) & (b[:, 2] < part.north) & (b[:, 3] > south)
         )
-        reach = float(seen.reach[reaching].max(initial=0.0))
+        if not len(reaching):
+            continue
+        reach = float(seen.reach[reaching].max())
         blocks.append(
             Block(
                 window=window,
@@ -132,14 +127,12 @@ def blocks_of(grid: DemGrid, seen: Footprints, size: int, margin: int) -> list[B
     return blocks
 
 
-def neighbours(blocks: Sequence[Block], count: int) -> list[list[Block]]:
-    """Blocks in squares of a number of them along and across."""
-    tops = sorted({block.core.row_off for block in blocks})
-    lefts = sorted({block.core.col_off for block in blocks})
+def neighbours(blocks: Sequence[Block], side_px: int) -> list[list[Block]]:
+    """Blocks whose cores start in the same square of so many pixels a side."""
     groups: dict[tuple[int, int], list[Block]] = {}
     for block in blocks:
-        row, column = tops.index(block.core.row_off), lefts.index(block.core.col_off)
-        groups.setdefault((row // count, column // count), []).append(block)
+        square = (block.core.row_off // side_px, block.core.col_off // side_px)
+        groups.setdefault(square, []).append(block)
     return [groups[key] for key in sorted(groups)]
 
 

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ from reconstruct.views.model import View
 
 _PART = 65_536
 """Points of the cloud, which lie together, to a part."""
+_BLOCK_CELLS = 1024
+"""Side of the parts of a DEM that are held at once, wherever a part of the cloud lies."""
 _AROUND_CELLS = 2
 """Cells on each side of a point whose heights count as those around it."""
 _OFF_CELLS = 3.0
@@ -132,19 +135,39 @@ def _off_heights(
 
 def _are_off(points: Array, dem: Path) -> NDArray[np.bool_]:
     """(N,) whether points (N, 3), north, east, down, are off all heights around them."""
+    off = np.zeros(len(points), np.bool_)
     with opened_raster(dem) as raster:
         t = raster.transform
         column = np.floor((points[:, 1] - t.c) / t.a).astype(np.int64)
         row = np.floor((t.f - points[:, 0]) / t.a).astype(np.int64)
-        left, top = column.min() - _AROUND_CELLS, row.min() - _AROUND_CELLS
-        size = column.max() - left + _AROUND_CELLS + 1, row.max() - top + _AROUND_CELLS + 1
-        window = Window(int(left), int(top), int(size[0]), int(size[1]))
-        heights = raster.read(1, window=window, boundless=True, fill_value=np.nan)
+        blocks = np.stack([row, column], axis=1) // _BLOCK_CELLS
+        _, block = np.unique(blocks, axis=0, return_inverse=True)
+        for n in range(block.max(initial=-1) + 1):
+            here = block.reshape(-1) == n
+            off[here] = _off_in_block(points[here, 2], row[here], column[here], raster)
+    return off
+
+
+def _off_in_block(
+    down: Array, row: NDArray[np.int64], column: NDArray[np.int64], raster: Any
+) -> NDArray[np.bool_]:
+    """(N,) whether points are off all heights around them, of those in a part of a DEM.
+
+    Args:
+        down: (N,) of the points.
+        row: (N,) of their cells.
+        column: (N,) of their cells.
+        raster: the DEM.
+    """
+    left, top = column.min() - _AROUND_CELLS, row.min() - _AROUND_CELLS
+    size = column.max() - left + _AROUND_CELLS + 1, row.max() - top + _AROUND_CELLS + 1
+    window = Window(int(left), int(top), int(size[0]), int(size[1]))
+    heights = raster.read(1, window=window, boundless=True, fill_value=np.nan)
     known = np.isfinite(heights)
     side = 2 * _AROUND_CELLS + 1
     highest = maximum_filter(np.where(known, heights, -np.inf), side)[row - top, column - left]
     lowest = minimum_filter(np.where(known, heights, np.inf), side)[row - top, column - left]
-    up, limit = -points[:, 2], _OFF_CELLS * t.a
+    up, limit = -down, _OFF_CELLS * raster.transform.a
     off: NDArray[np.bool_] = (up > highest + limit) | (up < lowest - limit)
     return off
 

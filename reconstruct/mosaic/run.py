@@ -159,7 +159,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     with opened_raster(dem) as raster:
         heights = height_range(raster)
         pixel = reconstruct.mosaic_pixel_m or round_cell(mean_pixel(model))
-        grid = mosaic_grid(raster, pixel, model.frame)
+        grid = mosaic_grid(raster, pixel)
     names = [view.image for view in model.views]
     outline = partial(outline_view, dem, sights, heights)
     label = partial(_label, plane)
@@ -180,7 +180,10 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     )
     views = _seen_views(model, painting.facts)
     ground = footprints(model.views, heights)
+    folder.mkdir(parents=True, exist_ok=True)
     blocks = seam_blocks(grid, ground)
+    if not blocks:
+        return False
     colour = _solve(painting, model, survey, views, blocks, label("compare light"))
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
@@ -195,7 +198,6 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             for block in blocks
         ]
 
-    folder.mkdir(parents=True, exist_ok=True)
     write_labels(
         (label_path(sights), tones_path(sights)),
         folder / "coverage.tif",
@@ -205,7 +207,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = sights / "rough.tif"
-    groups = [tasks(group) for group in neighbours(tiles, _GROUP)]
+    groups = [tasks(group) for group in neighbours(tiles, _GROUP * _TILE_PX)]
     painted = executor.map(paint_tiles, groups, label=label("mosaic"), task_mib=_TASK_MIB)
     covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
     if covered == 0.0:
@@ -252,7 +254,8 @@ def seam_blocks(grid: DemGrid, ground: Footprints) -> list[Block]:
     size = _LABEL_PX
     while True:
         blocks = blocks_of(grid, ground, size, _LABEL_MARGIN_PX)
-        looks = max(len(b.views) * b.grid.rows * b.grid.columns // CELL_PX**2 for b in blocks)
+        cells = [len(b.views) * b.grid.rows * b.grid.columns // CELL_PX**2 for b in blocks]
+        looks = max(cells, default=0)
         if looks <= _MOST_LOOKS or size <= _LEAST_LABEL_PX:
             return blocks
         size //= 2

@@ -1,4 +1,8 @@
-"""Files of the mosaic: cloud-optimised colours, source pictures, coverage, a small picture."""
+"""Files of the mosaic: cloud-optimised colours, source pictures, coverage, a small picture.
+
+Blocks of a raster in which nothing is seen are left out, so that a strip across a large box takes
+the room of the strip.
+"""
 
 import json
 from collections.abc import Iterator
@@ -51,9 +55,11 @@ def write_tiles(
         sources.set_band_description(1, "picture that painted the pixel, from 1; 0 is none")
         for group in groups:
             for tile in group:
-                colours.write(tile.rgba, window=tile.window)
-                sources.write(tile.source.astype(numbers), 1, window=tile.window)
-                painted += int((tile.rgba[3] > 0).sum())
+                seen = int(np.count_nonzero(tile.rgba[3]))
+                if seen:
+                    colours.write(tile.rgba, window=tile.window)
+                    sources.write(tile.source.astype(numbers), 1, window=tile.window)
+                    painted += seen
     return painted / (grid.rows * grid.columns)
 
 
@@ -98,12 +104,16 @@ def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
         "compress": "deflate",
         "zlevel": 1,
         "bigtiff": "if_safer",
+        "sparse_ok": True,
     }
 
 
 @progress.step("write the mosaic with overviews")
 def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
-    """Copy a GeoTIFF with overviews in the layout of a COG."""
+    """Copy a GeoTIFF with overviews in the layout of a COG.
+
+    GDAL works through what is empty too, for overviews mostly.
+    """
     rasterio.shutil.copy(
         rough,
         final,
@@ -114,6 +124,7 @@ def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
         overview_resampling="AVERAGE",
         blocksize=512,
         bigtiff="IF_SAFER",
+        sparse_ok="YES",
         num_threads=str(threads),
     )
 

@@ -17,6 +17,7 @@ from reconstruct.raster import (
     preview_dem,
     tiled_raster,
     tiles_of,
+    tiles_reached,
 )
 from tests.oracles_dense import DATUM, FRAME
 
@@ -114,6 +115,44 @@ def test_preview_is_white_where_nothing_is_known(tmp_path):
     assert picture.shape == (150, 210, 3)
     assert (picture[:, 155:] == 255).all()
     assert (picture[5:-5, 5:145] < 255).any(axis=2).all()
+
+
+def test_tiles_are_reached_by_boxes_that_overlap_them() -> None:
+    rng = np.random.default_rng(4)
+    low = rng.uniform([-40.0, -60.0], [110.0, 60.0], (60, 2))
+    boxes = np.concatenate([low, low + rng.uniform(0.0, 30.0, (60, 2))], axis=1)
+    boxes[7], margin = np.nan, 2.0
+    found = {
+        (window.col_off, window.row_off, window.width, window.height): numbers
+        for window, numbers in tiles_reached(GRID, 64, boxes, margin)
+    }
+    expected = {}
+    for window in tiles_of(GRID, 64):
+        tile = GRID.window(window.row_off, window.col_off, 64, 64)
+        over = (boxes[:, 0] - margin < tile.east_of(64)) & (boxes[:, 2] + margin >= tile.west)
+        over &= (boxes[:, 3] + margin > tile.north_of(64)) & (boxes[:, 1] - margin <= tile.north)
+        if over.any():
+            key = (window.col_off, window.row_off, window.width, window.height)
+            expected[key] = np.flatnonzero(over).tolist()
+    assert list(found.items()) == list(expected.items())
+    assert 10 < len(expected) <= 35
+
+
+def test_a_strip_over_a_box_of_40_gigapixels_reaches_few_tiles(tmp_path: Path) -> None:
+    grid = DemGrid(west=0.0, north=0.0, cell=0.001, rows=200_000, columns=200_000)
+    ends = np.arange(0.0, 199.0)
+    boxes = np.stack([ends, -ends - 1.0, ends + 1.0, -ends], axis=1)
+    reached = tiles_reached(grid, 512, boxes, 0.01)
+    assert 390 < len(reached) < 2400
+    with tiled_raster(tmp_path / "a.tif", grid, FRAME, "float32", np.nan, "height") as raster:
+        for window, _ in reached[::100]:
+            raster.write(np.ones((1, 512, 512), np.float32), window=window)
+    assert (tmp_path / "a.tif").stat().st_size < 3e7
+    with opened_raster(tmp_path / "a.tif") as raster:
+        for window, _ in reached[::100]:
+            assert (raster.read(1, window=window) == 1).all()
+        for window, _ in reached[1::100]:
+            assert np.isnan(raster.read(1, window=window)).all()
 
 
 def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:

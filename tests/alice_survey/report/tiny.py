@@ -57,6 +57,7 @@ def tiny_workspace(
     )
     write_json(folder / "dense" / "surface.json", {
         "match_sigma_px": 0.2, "pose_sigma": 0.0002, "vertical_datum": "sea surface",
+        "cell": CELL_M,
     })  # fmt: skip
     crs = "EPSG:32636" if placed else None
     _write_rasters(folder / "dense", crs)

@@ -1,14 +1,17 @@
 from dataclasses import replace
 
+import laspy
 import numpy as np
 
 from alice_survey.base.artefacts import read_json
+from reconstruct.dense import cloud as cloud_module
 from reconstruct.dense.cloud import (
     VERTEX,
     vertices_of,
     voxel_edge,
     write_cloud,
     write_cloud_json,
+    write_clouds,
 )
 from reconstruct.dense.surface_points import SURFACE_POINT
 from tests.oracles_dense import FRAME
@@ -96,3 +99,21 @@ def test_cloud_json_names_frame_offset_and_datum(tmp_path):
 def test_cubes_grow_only_when_there_are_too_many():
     assert voxel_edge(0.004, 1_000_000, 40_000_000) == 0.004
     assert voxel_edge(0.001, 160_000_000, 40_000_000) == 0.002
+
+
+def test_the_overview_is_thinned_and_the_copc_is_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(cloud_module, "_MOST_OVERVIEW_POINTS", 1000)
+    surface, offset = random_surface(), (1.0, 2.0, -12.0)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    (scratch / "0_0_0.points").write_bytes(bytes(500))  # of a run that was interrupted
+    parts = np.array_split(surface, 5)
+    write_clouds(tmp_path, parts, len(surface), offset, FRAME, 0.05, scratch)
+    about = read_json(tmp_path / "cloud.json")
+    assert about["thinned_to"] == 0.1
+    assert about["points"] < 0.9 * len(surface)
+    cloud = laspy.read(tmp_path / "cloud.copc.laz")
+    found = np.sort(cloud.xyz - offset, axis=0)
+    np.testing.assert_allclose(found, np.sort(surface["enu"], axis=0), atol=6e-5)
+    np.testing.assert_array_equal(np.sort(cloud.red), np.sort(surface["colour"][:, 0] * 257.0))
+    assert not scratch.exists()

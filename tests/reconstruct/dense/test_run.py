@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import rasterio
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
@@ -107,19 +108,23 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
     assert cloud.point.sigma.numpy().min() > 0
 
 
-def test_laz_holds_the_points_of_the_ply_in_the_rasters_projection(workspace: Path):
+def test_copc_holds_the_points_of_the_ply_in_the_rasters_projection(workspace: Path):
     import laspy
     import open3d as o3d
 
     about = read_json(workspace / "dense" / "cloud.json")
     cloud = o3d.t.io.read_point_cloud(str(workspace / "dense" / "cloud.ply"))
-    laz = laspy.read(workspace / "dense" / "cloud.laz")
+    with laspy.CopcReader.open(workspace / "dense" / "cloud.copc.laz") as reader:
+        laz, crs = reader.query(), reader.header.parse_crs()
     enu = cloud.point.positions.numpy() + np.array(about["offset_east_north_up"])
-    np.testing.assert_allclose(laz.xyz, enu, atol=6e-5)
-    np.testing.assert_array_equal(laz.red // 257, cloud.point.colors.numpy()[:, 0])
-    np.testing.assert_array_equal(laz.nz, cloud.point.normals.numpy()[:, 2])
-    np.testing.assert_array_equal(laz.sigma, cloud.point.sigma.numpy()[:, 0])
-    assert "Azimuthal Equidistant" in laz.header.parse_crs().to_wkt()
+    found = np.column_stack([laz.x, laz.y, laz.z])
+    near, at = cKDTree(found).query(enu)
+    assert near.max() < 1e-4
+    np.testing.assert_array_equal(np.sort(at), np.arange(len(found)))
+    np.testing.assert_array_equal(laz.red[at] // 257, cloud.point.colors.numpy()[:, 0])
+    np.testing.assert_array_equal(laz["nz"][at], cloud.point.normals.numpy()[:, 2])
+    np.testing.assert_array_equal(laz["sigma"][at], cloud.point.sigma.numpy()[:, 0])
+    assert "Azimuthal Equidistant" in crs.to_wkt()
 
 
 def test_stations_and_slope(workspace: Path):
@@ -141,7 +146,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
     names = {path.name for path in (workspace / "dense").iterdir()}
     bands = ("dem", "sigma", "slope", "count", "stations", "surfaces", "lower")
     rasters = {f"{name}.tif" for name in bands}
-    clouds = {"cloud.ply", "cloud.laz", "cloud.json"}
+    clouds = {"cloud.ply", "cloud.copc.laz", "cloud.json"}
     others = {
         "dem.png",
         "dem.qml",

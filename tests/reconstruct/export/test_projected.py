@@ -104,7 +104,12 @@ def test_cloud_and_mesh_lie_on_the_raster(workspace: Path):
     folder = workspace / "EPSG-32636"
     with rasterio.open(folder / "dem.tif") as raster:
         dem, at = raster.read(1), ~raster.transform
-    cloud = laspy.read(folder / "cloud.laz")
+    cloud = laspy.read(folder / "cloud.copc.laz")
+    old = laspy.read(workspace / "dense" / "cloud.copc.laz")
+    assert len(cloud) == len(old)
+    np.testing.assert_array_equal(np.sort(cloud["sigma"]), np.sort(old["sigma"]))
+    with laspy.CopcReader.open(folder / "cloud.copc.laz") as reader:
+        assert len(reader.query()) == len(old)
     assert cloud.header.parse_crs().to_epsg() == 32636
     assert "sigma" in cloud.point_format.extra_dimension_names
     offset = json.loads((folder / "projected.json").read_text())["mesh_offset"]
