@@ -315,8 +315,14 @@ class _Tasks:
             self._function, self._packed = function, packed_once(function, store)
         return _Submitted(self, self._packed, packed(args, store))
 
-    def send(self, number: int, function: bytes | str, arguments: bytes) -> "Future[Any]":
+    def send(
+        self, number: int, function: bytes | str, arguments: bytes
+    ) -> "tuple[Future[Any], set[str]] | None":
         """Send a task to workers that are fit for it.
+
+        Returns:
+            Its future, and the addresses that it may go to, all of which may end (none where any
+            may have it); None where no worker is fit now.
 
         Raises:
             AliceError: none has the memory.
@@ -331,16 +337,20 @@ class _Tasks:
                 f"{self.label!r} takes {self._memory / 2**20:.0f} MiB a task, and no worker has "
                 f"more than {most / 2**20:.0f} MiB: start fewer workers on each machine"
             )
-        if cluster.is_any_unfit or len(large) < len(fit):
-            options["workers"] = list(large)
+        allowed = set(large) if cluster.is_any_unfit or len(large) < len(fit) else set()
+        if allowed:
+            options["workers"] = sorted(allowed)
+        elif cluster.is_any_unfit:
+            return None
         if self._memory and large and all(_MEMORY in w["resources"] for w in large.values()):
             options["resources"] = {_MEMORY: self._memory}
         with cluster.lost():
-            return cluster.client.submit(
+            future = cluster.client.submit(
                 run_task, cluster.site, number, function, arguments,
                 key=f"{self.label}-{cluster.site.store.name}-{next(cluster.numbers)}",
                 pure=False, **options,
             )  # fmt: skip
+        return future, allowed
 
 
 class _Submitted:
@@ -350,13 +360,17 @@ class _Submitted:
         self._tasks = tasks
         self._function, self._arguments = function, arguments
         self._number = next(tasks.cluster.numbers)
-        self._future = self._send()
+        self._future: Future[Any] | None = None
+        self._allowed: set[str] = set()
         self._missing_s: float | None = None
+        self._is_reported = False
+        self._send()
 
     def cancel(self) -> None:
         """Forget it; a worker that is doing it goes on to its end."""
-        with contextlib.suppress(CancelledError, OSError):
-            self._future.cancel()
+        if self._future is not None:
+            with contextlib.suppress(CancelledError, OSError):
+                self._future.cancel()
 
     def result(self) -> Any:
         """Wait for the result, or raise what the task raised.
@@ -364,17 +378,18 @@ class _Submitted:
         Raises:
             AliceError: the scheduler was lost, the task ends every worker, or none is fit.
         """
+        cluster = self._tasks.cluster
         while True:
             answer = self._answer()
             if answer is None:
                 continue
-            if not answer.unfit and answer.failed:
+            if answer.failed:
                 answer = replace(answer, unfit=self._recheck(answer.worker))
             if answer.unfit:
-                self._tasks.cluster.exclude(answer.worker, answer.unfit)
-                self._future = self._send()
+                cluster.exclude(answer.worker, answer.unfit)
+                self._send()
                 continue
-            self._tasks.cluster.forget(self._number)
+            cluster.forget(self._number)
             self._tasks.longest_s = max(self._tasks.longest_s, answer.took_s)
             value = pickle.loads(answer.data)  # noqa: S301 (its own)
             if answer.failed:
@@ -383,17 +398,18 @@ class _Submitted:
             spent = replace(value.spent, sent_bytes=sent, received_bytes=len(answer.data))
             return replace(value, spent=spent)
 
-    def _send(self) -> "Future[Any]":
-        cluster = self._tasks.cluster
-        if cluster.is_any_unfit and not cluster.fit():
-            raise AliceError(f"no worker at {cluster.where} is fit any more; {_GOES_ON}")
-        return self._tasks.send(self._number, self._function, self._arguments)
+    def _send(self) -> None:
+        sent = self._tasks.send(self._number, self._function, self._arguments)
+        self._future, self._allowed = sent or (None, set())
 
     def _answer(self) -> Answer | None:
         """The answer, or None where it is not there yet."""
         from distributed.scheduler import KilledWorker
 
         cluster = self._tasks.cluster
+        if self._future is None:
+            self._wait_for_worker()
+            return None
         try:
             with cluster.lost(), contextlib.suppress(TimeoutError):
                 found: Answer = self._future.result(timeout=_LOOK_EVERY_S)
@@ -407,17 +423,34 @@ class _Submitted:
         self._look_after()
         return None
 
+    def _wait_for_worker(self) -> None:
+        """Send the task as soon as a worker is fit for it.
+
+        Raises:
+            AliceError: there are workers, but for a while none that is fit.
+        """
+        cluster, now_s = self._tasks.cluster, time.monotonic()
+        self._missing_s = now_s if self._missing_s is None else self._missing_s
+        if now_s - self._missing_s > _WAIT_S:
+            if cluster.workers():
+                raise AliceError(f"no worker at {cluster.where} is fit any more; {_GOES_ON}")
+            if not self._is_reported:
+                self._is_reported = True
+                warn(f"no worker is left at {cluster.where}: waiting for one")
+        self._send()
+        if self._future is None:
+            time.sleep(_LOOK_EVERY_S)
+        else:
+            self._missing_s = None
+
     def _look_after(self) -> None:
         """Look why the answer takes long."""
         cluster, tasks = self._tasks.cluster, self._tasks
-        if not cluster.workers():
-            now_s = time.monotonic()
-            self._missing_s = now_s if self._missing_s is None else self._missing_s
-            if now_s - self._missing_s > _WAIT_S:
-                self._missing_s = float("inf")
-                warn(f"no worker is left at {cluster.where}: waiting for one")
+        workers = cluster.workers()
+        if not workers or (self._allowed and not self._allowed & set(workers)):
+            self.cancel()
+            self._future = None
             return
-        self._missing_s = None
         begun = cluster.begun(self._number)
         if begun is None or begun[1] not in cluster.fit():
             return
