@@ -5,7 +5,7 @@ matches, and better ones. How far depths from different partners differ, in unit
 `MATCH_SIGMA_PX` would give, shows the true precision: noise, calibration and poses together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -56,7 +56,7 @@ def find_conditions(
     workspace: Path,
     views: Sequence[View],
     partners: Sequence[Sequence[int]],
-    points: Sequence[Array],
+    points_of: Callable[[int], Array],
     scale: float | None,
     executor: Executor,
 ) -> Conditions:
@@ -66,7 +66,7 @@ def find_conditions(
         workspace: with the pictures.
         views: of the model.
         partners: of every view, best first.
-        points: (N, 3) for every view, that bound its depth.
+        points_of: from the number of a view to the points (N, 3) that bound its depth.
         scale: of matching, or None to choose it.
         executor: where tasks run.
     """
@@ -75,7 +75,7 @@ def find_conditions(
     largest = min(matching_scale(views[number]) for number in chosen)
     scales = tuple(largest / 2**n for n in range(_SCALES)) if scale is None else (scale,)
     tasks = [
-        ((views[number], *(views[n] for n in partners[number][:3])), points[number])
+        ((views[number], *(views[n] for n in partners[number][:3])), points_of(number))
         for number in chosen
     ]
     found = executor.map(partial(probe, workspace, scales), tasks, label="try matching")

@@ -24,7 +24,6 @@ from alice_survey.base.robust import MAD_TO_SIGMA
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask
-from reconstruct.light.solve import LightModel
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
 from reconstruct.views.model import View
 
@@ -91,19 +90,19 @@ class Look:
         return self.depth.shape[0], self.depth.shape[1]
 
 
-def mask_moving(workspace: Path, folder: Path, light: LightModel, task: ViewTask) -> MovingShare:
+def mask_moving(workspace: Path, folder: Path, task: ViewTask) -> MovingShare:
     """Find what moves in a view; write its mask where anything does.
 
     Args:
         workspace: with the pictures.
         folder: of the stage; `moving/` in it holds the masks, as taken, 0 = leave out.
-        light: of the survey.
-        task: the view and its neighbours, whose depths have been checked.
+        task: the view and its neighbours, whose depths have been checked; the store has the factors
+            of their light.
     """
     store, view = task.store, task.view
-    look = load_look(store, task.index, view, light)
+    look = load_look(store, task.index, view)
     others = [
-        load_look(store, number, other, light)
+        load_look(store, number, other)
         for number, other in task.others
         if other.station != view.station
     ]
@@ -175,13 +174,13 @@ def _lattice_as_taken(warp: PinholeWarp) -> Array:
     return warp.to_pinhole(taken) / warp.pinhole.size_px
 
 
-def load_look(store: ViewStore, index: int, view: View, light: LightModel) -> Look:
+def load_look(store: ViewStore, index: int, view: View) -> Look:
     """Read a view whose depth has been checked."""
     width, height = view.pinhole.size_px
     step = max(1, round(width / LATTICE_PX))
     h, w = height // step, width // step
     colour = store.load_colour(index).astype(np.float32)
-    factors = cv2.resize(light.factors(view.camera, view.image), (width, height))
+    factors = cv2.resize(store.load_factors(index), (width, height))
     evened = np.log(np.maximum(colour, _DARKEST)) + np.log(factors)
     valid = store.load_mask(index, "valid", width) & (colour.max(axis=2) > _DARKEST)
     depth, _ = store.load_depth(index, "fine")

@@ -40,7 +40,6 @@ from reconstruct.dense.surface_tiles import (
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask, lay_out_view
-from reconstruct.light.solve import LightModel
 from reconstruct.planes import PLANES, Plane, plane_frame, write_plane
 from reconstruct.qgis import write_style
 from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster, tiles_of
@@ -65,7 +64,6 @@ class Confirmed:
     """On the standard deviations of refined depths."""
     shared: float
     """Views whose depths rest on the same pair of pictures, in the mean, 1 to 2."""
-    light: LightModel
     poses: ErrorsOfPoses | None
     executor: Executor
 
@@ -110,7 +108,6 @@ def fuse_planes(
     grid = _grid(bounds, cell, model.frame, "level")
     setup = FuseSetup(
         store=confirmed.store,
-        light=confirmed.light,
         stations=np.array([view.station for view in model.views], dtype=np.int64),
         planes=tuple(planes),
         offset_enu=_offset(grid, summaries),

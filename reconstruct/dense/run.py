@@ -23,10 +23,10 @@ from reconstruct.dense.moving import COMPARED, clear_moving, mask_moving, show_m
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
 from reconstruct.dense.stereo_pairs import (
+    PointsInSight,
     choose_partners,
     depths_per_pair,
     neighbours,
-    points_in_sight,
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
@@ -34,12 +34,13 @@ from reconstruct.dense.views import (
     ViewTask,
     check_view,
     find_sigma_factor,
+    light_parts,
     looked_at,
     prepare_view,
     refine_view,
     view_depth,
 )
-from reconstruct.light.solve import joined_samples, solve_light, write_light
+from reconstruct.light.solve import solve_light, write_light
 from reconstruct.planes import chosen_planes
 from reconstruct.views.model import read_model, scaled_view
 
@@ -61,9 +62,9 @@ def run_dense(
     store = ViewStore(folder / "scratch")
     store.folder.mkdir(parents=True, exist_ok=True)
     partners = choose_partners(model, reconstruct.dense_partners)
-    points = points_in_sight(model)
+    points = PointsInSight(model)
     conditions = find_conditions(
-        workspace, model.views, partners, points, reconstruct.dense_scale, executor
+        workspace, model.views, partners, points.of, reconstruct.dense_scale, executor
     )
     views = [scaled_view(view, conditions.scale) for view in model.views]
 
@@ -76,25 +77,23 @@ def run_dense(
     prepare = partial(prepare_view, workspace)
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
     match = partial(view_depth, conditions.match_sigma_px)
-    matched = list(zip(tasks(partners), points, strict=True))
-    _drain(executor.map(match, matched, label="match"))
+    matched = ((task, points.of(task.index)) for task in tasks(partners))
+    _drain(executor.map(match, matched, label="match", total=len(views)))
     looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
     _drain(executor.map(refine_view, tasks(looks), label="refine"))
     checks = tasks(neighbours(model, _WITNESSES))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
-    shown = list(executor.map(check, checks, label="cross-check"))
-    light = solve_light(
-        joined_samples([one.light for one in shown]),
-        np.stack([one.nodes for one in shown]),
-        [view.image for view in views],
-        [view.camera for view in views],
-    )
+    nodes, samples = zip(*executor.map(check, checks, label="cross-check"), strict=True)
+    images, cameras = [view.image for view in views], [view.camera for view in views]
+    light = solve_light(light_parts(store, samples, executor), np.stack(nodes), images, cameras)
     write_light(folder / "light.json", light)
+    factors = [light.factors(camera, image) for camera, image in zip(cameras, images, strict=True)]
+    store.save_factors(np.stack(factors))
     moving = []
     clear_moving(folder)
     if reconstruct.mask_moving:
-        mask = partial(mask_moving, workspace, folder, light)
+        mask = partial(mask_moving, workspace, folder)
         others = tasks(neighbours(model, COMPARED))
         moving = list(executor.map(mask, others, label="mask what moves"))
         show_moving(workspace, folder, moving)
@@ -108,7 +107,6 @@ def run_dense(
                 for n, chosen in enumerate(looks)
             ]
         ),
-        light=light,
         poses=find_errors_of_poses(workspace, model),
         executor=executor,
     )

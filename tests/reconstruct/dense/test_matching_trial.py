@@ -30,7 +30,9 @@ def survey(tmp_path_factory: pytest.TempPathFactory):
 
 def conditions(workspace: Path, model, scale: float | None = None):
     partners = choose_partners(model, 3)
-    return find_conditions(workspace, model.views, partners, points_of_views(model), scale, SERIAL)
+    return find_conditions(
+        workspace, model.views, partners, points_of_views(model).__getitem__, scale, SERIAL
+    )
 
 
 def test_clear_pictures_are_matched_as_they_are_and_better_than_assumed(survey):
