@@ -24,7 +24,7 @@ from reconstruct.evaluate.cloud_registration import (
 from reconstruct.evaluate.figures import WITHIN_PX, fit_doming, rounded
 from reconstruct.evaluate.plots import plot_reference
 from reconstruct.placing.alignment import Similarity
-from reconstruct.views.model import SparseModel, read_model
+from reconstruct.views.model import SparseModel, points_of_views, read_model
 
 _NAVIGATION = "navigation"
 
