@@ -153,6 +153,12 @@ PARTS = (
         long=True,
     ),
     Part(
+        name="scale",
+        module="scale",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="reconstruct-peers",
         module="reconstruct",
         arguments=_reconstruct("peers"),

@@ -71,10 +71,13 @@ class LinearObservations:
 class LinearParts(Protocol):
     """Observations by whole points, in parts that are linearised where they are needed."""
 
-    stations: Sequence[Indices]
-    """Of each part, the stations (f,) that it sees, ascending; its observations count in these."""
-    points: Sequence[int]
-    """How many points each part has."""
+    @property
+    def stations(self) -> Sequence[Indices]:
+        """Of each part, the stations (f,) that it sees, ascending; observations count in these."""
+
+    @property
+    def points(self) -> Sequence[int]:
+        """How many points each part has."""
 
     def map(
         self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]

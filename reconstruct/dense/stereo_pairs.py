@@ -64,7 +64,8 @@ class PointsInSight:
         reach = _BEYOND * np.linalg.norm(own - centre, axis=1).max()
         near = np.sort(self._tree.query_ball_point(centre, reach))
         inside = near[in_frame(view, self._model.points_world[near])]
-        return self._model.points_world[inside[:: -(-len(inside) // _MOST_BOUNDING) or 1]]
+        chosen: Array = self._model.points_world[inside[:: -(-len(inside) // _MOST_BOUNDING) or 1]]
+        return chosen
 
 
 def neighbours(model: SparseModel, most: int) -> list[list[int]]:
