@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -107,7 +108,7 @@ class Work:
             for name in self.rig.cameras
         ]
 
-    def save_state(self, name: str, state: RigState, **arrays: Array) -> None:
+    def save_state(self, name: str, state: RigState, **arrays: Any) -> None:
         """Keep stations and points for later steps."""
         np.savez(
             self.own / f"{name}.npz", turns=state.turns, centres=state.centres,
@@ -198,7 +199,8 @@ def _light(work: Work) -> Prepared:
     rng = np.random.default_rng(work.pictures)
     axes = [(np.arange(n) + 0.5) / n for n in _LATTICE]
     here = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    around = cKDTree(truth.centres).query(truth.centres, k=_WITNESSES + 1)[1][:, 1:]
+    nearest = cKDTree(truth.centres).query(truth.centres, k=_WITNESSES + 1)[1]
+    around = np.asarray(nearest)[:, 1:]
     lamp = -1.2 * ((here - [0.45, 0.6]) ** 2).sum(axis=1)
     counts = []
     for station, others in enumerate(around.tolist()):
