@@ -34,7 +34,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spent:
+class StepCost:
     """What a step took."""
 
     step: str
@@ -47,7 +47,7 @@ class Spent:
     """How many of what it works on: observations, pairs, samples."""
 
 
-def measure(step: str, pictures: int, work: Path, threads: int) -> Spent | None:
+def measure(step: str, pictures: int, work: Path, threads: int) -> StepCost | None:
     """Run a step, unless its file is there; None where it failed."""
     file = work / f"{pictures}" / f"{step}.json"
     if not file.is_file():
@@ -57,7 +57,7 @@ def measure(step: str, pictures: int, work: Path, threads: int) -> Spent | None:
         ran = subprocess.run([*command, str(work), str(threads)], check=False, env=alone)
         if ran.returncode:
             return None
-    return Spent(step=step, pictures=pictures, **json.loads(file.read_text()))
+    return StepCost(step=step, pictures=pictures, **json.loads(file.read_text()))
 
 
 def growth(first: float, last: float, times: float) -> float:
@@ -65,7 +65,7 @@ def growth(first: float, last: float, times: float) -> float:
     return float(np.log(last / first) / np.log(times)) if first > 0 and last > 0 else np.nan
 
 
-def figures_of(rows: Sequence[Spent], *, judged: bool) -> list[Figure]:
+def figures_of(rows: Sequence[StepCost], *, judged: bool) -> list[Figure]:
     """Figures of one step, by rising number of pictures; small surveys are not judged."""
     name = rows[0].step
     found = [
@@ -102,7 +102,7 @@ def main() -> None:
         f"{heading(about)}\n\n{'step':<14}{'pictures':>9}{'of':>12}{'s':>10}{'GiB':>7}", flush=True
     )
     options.work.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, list[Spent]] = {}
+    rows: dict[str, list[StepCost]] = {}
     failed = []
     for step in [s for s in STEPS if s == MAKE or not options.only or s in options.only]:
         for pictures in sorted(options.pictures):

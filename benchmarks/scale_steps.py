@@ -57,7 +57,7 @@ _LOOK = 8192
 
 
 @dataclass(frozen=True, kw_only=True)
-class Work:
+class StepWork:
     """A survey of so many pictures, and where the steps on it leave what they found."""
 
     folder: Path
@@ -120,7 +120,7 @@ Prepared = Callable[[], int]
 """The part of a step that is measured; what it works on is ready. Returns how many that is."""
 
 
-def _make(work: Work) -> Prepared:
+def _make(work: StepWork) -> Prepared:
     rig = work.rig
 
     def run() -> int:
@@ -131,7 +131,7 @@ def _make(work: Work) -> Prepared:
     return run
 
 
-def _pairs(work: Work) -> Prepared:
+def _pairs(work: StepWork) -> Prepared:
     records = work.records
 
     def run() -> int:
@@ -141,7 +141,7 @@ def _pairs(work: Work) -> Prepared:
     return run
 
 
-def _adjust(work: Work) -> Prepared:
+def _adjust(work: StepWork) -> Prepared:
     pixels, start = work.survey.pixels, near_start(work.survey.truth)
     names = list(work.rig.cameras)
 
@@ -163,7 +163,7 @@ def _adjust(work: Work) -> Prepared:
     return run
 
 
-def _shape(work: Work) -> Prepared:
+def _shape(work: StepWork) -> Prepared:
     pixels, state = work.survey.pixels, work.state(work.read("adjust"))
 
     def run() -> int:
@@ -175,7 +175,7 @@ def _shape(work: Work) -> Prepared:
     return run
 
 
-def _place(work: Work) -> Prepared:
+def _place(work: StepWork) -> Prepared:
     state, modes = work.state(work.read("adjust")), work.read("shape")["modes"]
     records, name = records_of(work.rig, work.survey.truth), next(iter(work.rig.cameras))
     poses = RigidTransform.from_components(state.centres, Rotation.from_matrix(state.turns))
@@ -191,7 +191,7 @@ def _place(work: Work) -> Prepared:
     return run
 
 
-def _light(work: Work) -> Prepared:
+def _light(work: StepWork) -> Prepared:
     """Samples as `check_view` leaves them: a lattice over each view, as its neighbours see it."""
     truth, names = work.survey.truth, list(work.rig.cameras)
     store = ViewStore(work.own / "store")
@@ -235,7 +235,7 @@ def _light(work: Work) -> Prepared:
     return run
 
 
-def _looks(work: Work) -> Prepared:
+def _looks(work: StepWork) -> Prepared:
     """Vectors as of `alike_pairs`, of pictures that navigation does not place."""
     file = work.own / "looks.npy"
     rng = np.random.default_rng(work.pictures)
@@ -256,7 +256,7 @@ def _looks(work: Work) -> Prepared:
     return run
 
 
-def _partners(work: Work) -> Prepared:
+def _partners(work: StepWork) -> Prepared:
     model = _model(work)
 
     def run() -> int:
@@ -270,7 +270,7 @@ def _partners(work: Work) -> Prepared:
     return run
 
 
-def _model(work: Work) -> SparseModel:
+def _model(work: StepWork) -> SparseModel:
     """The truth as pinholes see it."""
     rig, truth, pixels = work.rig, work.survey.truth, work.survey.pixels
     near, far = 0.9 * ALTITUDE_M, 1.1 * ALTITUDE_M
@@ -299,7 +299,7 @@ def _model(work: Work) -> SparseModel:
     )
 
 
-STEPS: dict[str, Callable[[Work], Prepared]] = {
+STEPS: dict[str, Callable[[StepWork], Prepared]] = {
     MAKE: _make,
     "pairs": _pairs,
     "adjust": _adjust,
@@ -329,7 +329,9 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("threads", type=int)
     given = parser.parse_args()
-    work = Work(folder=given.work, pictures=given.pictures, executor=local_executor(given.threads))
+    work = StepWork(
+        folder=given.work, pictures=given.pictures, executor=local_executor(given.threads)
+    )
     work.own.mkdir(parents=True, exist_ok=True)
     run = STEPS[given.step](work)
     before = _spent()[0]

@@ -105,7 +105,7 @@ class OnePart:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pattern:
+class BlockPattern:
     """Which stations meet, as rows of a matrix of blocks."""
 
     pointers: Indices
@@ -120,14 +120,14 @@ class Pattern:
         found: Indices = rows * stations + self.columns
         return found
 
-    def at(self, stations: Indices, part: "Pattern") -> Indices:
+    def at(self, stations: Indices, part: "BlockPattern") -> Indices:
         """Where the blocks of a part of the stations, (f,), are among these."""
         rows, columns = np.divmod(part.keys, len(stations))
         wanted = stations[rows] * (len(self.pointers) - 1) + stations[columns]
         return np.searchsorted(self.keys, wanted)
 
 
-def pattern_of(starts: Indices, station: Indices, stations: int) -> Pattern:
+def pattern_of(starts: Indices, station: Indices, stations: int) -> BlockPattern:
     """The pattern of stations that see points in common.
 
     Args:
@@ -141,7 +141,7 @@ def pattern_of(starts: Indices, station: Indices, stations: int) -> Pattern:
     return _pattern(csr_matrix(seen.T @ seen + identity(stations, np.int32, format="csr")))
 
 
-def joined_pattern(parts: Iterable[tuple[Indices, Pattern]], stations: int) -> Pattern:
+def joined_pattern(parts: Iterable[tuple[Indices, BlockPattern]], stations: int) -> BlockPattern:
     """The pattern of all stations, from those of parts of them, (f,) each."""
     keys = np.arange(stations) * (stations + 1)
     for own, part in parts:
@@ -149,19 +149,21 @@ def joined_pattern(parts: Iterable[tuple[Indices, Pattern]], stations: int) -> P
         keys = np.union1d(keys, own[rows] * stations + own[columns])
     rows, columns = np.divmod(keys, stations)
     pointers = np.searchsorted(rows, np.arange(stations + 1))
-    return Pattern(pointers=pointers.astype(np.int64), columns=columns)
+    return BlockPattern(pointers=pointers.astype(np.int64), columns=columns)
 
 
-def _pattern(meets: csr_matrix) -> Pattern:
+def _pattern(meets: csr_matrix) -> BlockPattern:
     meets.sort_indices()
-    return Pattern(pointers=meets.indptr.astype(np.int64), columns=meets.indices.astype(np.int64))
+    return BlockPattern(
+        pointers=meets.indptr.astype(np.int64), columns=meets.indices.astype(np.int64)
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PartSums:
     """What a part of the points says of its own stations and of what is shared."""
 
-    pattern: Pattern
+    pattern: BlockPattern
     blocks: Array
     border: Array
     shared: Array
@@ -211,7 +213,7 @@ class PointEquations(Equations):
         Args:
             blocks: (B, 6, 6) covariances between the stations that see a point in common.
         """
-        whole = Pattern(pointers=self.pointers, columns=self.columns)
+        whole = BlockPattern(pointers=self.pointers, columns=self.columns)
         near = ((own, *_between(whole, own)) for own in self.parts.stations)
         values = ((pattern, blocks[at]) for _, pattern, at in near)
         return self._by_point(_covariances_of_part, values)
@@ -222,7 +224,7 @@ class PointEquations(Equations):
         return np.concatenate(list(self.parts.map(function, values)))
 
 
-def _between(whole: Pattern, own: Indices) -> tuple[Pattern, Indices]:
+def _between(whole: BlockPattern, own: Indices) -> tuple[BlockPattern, Indices]:
     """The pattern of some of the stations (f,), and where its blocks are in the whole."""
     count = len(whole.columns)
     matrix = csr_matrix(
@@ -254,7 +256,7 @@ def _follow_shared_in_part(linear: LinearObservations, by: tuple[Array, slice]) 
     return np.stack(moved, axis=-1)
 
 
-def _covariances_of_part(linear: LinearObservations, known: tuple[Pattern, Array]) -> Array:
+def _covariances_of_part(linear: LinearObservations, known: tuple[BlockPattern, Array]) -> Array:
     pattern, blocks = known
     inverse = _point_inverse(linear.starts, linear.by_point)
     return _point_covariances(*linear.arrays, inverse, pattern.pointers, pattern.columns, blocks)
@@ -271,7 +273,7 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
     return reduce_parts(OnePart(linear=linear, stations=[np.arange(stations)]), pattern)
 
 
-def reduce_parts(parts: LinearParts, pattern: Pattern) -> PointEquations:
+def reduce_parts(parts: LinearParts, pattern: BlockPattern) -> PointEquations:
     """Eliminate the points, part by part; the sums are added in the order of the parts.
 
     Args:

@@ -23,8 +23,8 @@ from reconstruct.adjustment.exact_observations import (
     exact_observations,
 )
 from reconstruct.adjustment.normal_equations import (
+    BlockPattern,
     LinearObservations,
-    Pattern,
     joined_pattern,
     pattern_of,
 )
@@ -95,7 +95,7 @@ class PixelParts:
         return len(self.runs) == 1
 
     @cached_property
-    def pattern(self) -> Pattern:
+    def pattern(self) -> BlockPattern:
         """Which stations see points in common."""
         if self.is_one:
             return pattern_of(self.pixels.starts, self.pixels.station, self.count)
@@ -163,7 +163,7 @@ class PixelParts:
         return np.concatenate(list(self.map(_misses_of_part, state, repeat(None, len(self.runs)))))
 
 
-def _pattern_of_part(pixels: Pixels, _: None, own: Indices) -> Pattern:
+def _pattern_of_part(pixels: Pixels, _: None, own: Indices) -> BlockPattern:
     return pattern_of(pixels.starts, pixels.station, len(own))
 
 
