@@ -367,7 +367,9 @@ def _linear(
     farther = np.zeros(len(views))
     if samples.ranges is not None:
         farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
-    pairs, pair = np.unique(np.sort(views, axis=1), axis=0, return_inverse=True)
+    keys, pair = np.unique(
+        views.min(axis=1) * len(own) + views.max(axis=1), return_inverse=True
+    )  # several times as quick as by rows
     levels = samples.levels.astype(np.float64)
     unsure = 1.0 if samples.unsure is None else samples.unsure
     return LightEquations(
@@ -376,7 +378,7 @@ def _linear(
         farther=farther,
         views=views,
         pair=pair.ravel().astype(np.int64),
-        pairs=pairs.reshape(-1, 2),
+        pairs=np.column_stack(np.divmod(keys, len(own))),
         target=levels[:, 0] - levels[:, 1],
         misfit=np.full((len(levels), 3), _MISFIT) * unsure,
     )
