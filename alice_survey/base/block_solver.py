@@ -4,22 +4,23 @@ An adjustment of pictures has poses, each of which meets its own pixels, perhaps
 points that both see, and what all share: lenses, ports, the rig. Its normal equations are a
 block-sparse matrix of the poses with a border. Poses are eliminated (Schur complement; Triggs et
 al. 2000, "Bundle adjustment: a modern synthesis", section 6): one by one where none meets another,
-by a sparse factor (`alice_survey.base.block_factor`) where they do. What a caller has eliminated
-before, such as points, shows only in what it promises. Steps follow Levenberg and Marquardt (J. J.
-More 1978, "The Levenberg-Marquardt algorithm: implementation and theory").
+by a sparse factor where they do. What a caller has eliminated before, such as points, shows only in
+what it promises. Steps follow Levenberg and Marquardt (J. J. More 1978, "The Levenberg-Marquardt
+algorithm: implementation and theory").
 """
 
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_matrix, csc_matrix
+from scipy.sparse.linalg import splu
 
-from alice_survey.base.block_factor import BlockFactor
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 
@@ -170,16 +171,72 @@ class PoseFactor:
         right = right * self.equations.free[..., None]
         if len(self.blocks) == len(right):  # no pose meets another
             return np.asarray(np.linalg.solve(self.blocks, right))
-        return self._sparse.solve(right)
+        order, factor = self._sparse
+        solved = np.empty_like(right)
+        flat = right[order].reshape(self.equations.free.size, right.shape[2])
+        solved[order] = factor.solve(flat).reshape(right.shape)
+        return solved
 
     @cached_property
-    def _sparse(self) -> BlockFactor:
-        return BlockFactor(self.equations.pointers, self.equations.columns, self.blocks)
+    def _sparse(self) -> tuple[Indices, Any]:
+        """The order in which poses are eliminated, and the factor of them in that order."""
+        rows, columns, count = self.equations.rows, self.equations.columns, len(self.equations.free)
+        whole, size = np.ones(len(rows)), self.equations.free.size
+        whole[self.equations.own] = 2.0 * count
+        place = _factor(csc_matrix((whole, (rows, columns))), "MMD_AT_PLUS_A").perm_c
+        order: Indices = np.argsort(place)
+        at = np.lexsort((place[columns], place[rows]))
+        pointers = np.concatenate([[0], np.cumsum(np.diff(self.equations.pointers)[order])])
+        ordered = (self.blocks[at], place[columns[at]], pointers)
+        return order, _factor(csc_matrix(bsr_matrix(ordered, shape=(size, size))), "NATURAL")
 
     def inverse_blocks(self) -> Array:
-        """(B, K, K) blocks of the inverse, where the matrix has blocks; 0 of what is held."""
-        rows, columns, free = self.equations.rows, self.equations.columns, self.equations.free
-        found = self._sparse.inverse_blocks(len(self.blocks))
+        """(B, K, K) blocks of the inverse, where the matrix has blocks; 0 of what is held.
+
+        Backwards through the elimination: a pose of its own covariance C that follows those
+        eliminated later by G has G Z with them and C + G Z G^T with itself, Z being theirs. What a
+        pose meets is met by the next one of it too, so that Z is known there (K. Takahashi, J.
+        Fagan & M.-S. Chin 1973, "Formation of a sparse bus impedance matrix").
+        """
+        count, wide = self.equations.free.shape
+        order, factor = self._sparse
+        place = np.argsort(order)
+        rows, columns = self.equations.rows, self.equations.columns
+        meets = _fill(place[rows], place[columns], count)
+        waiting = np.bincount([met[1] for met in meets if len(met) > 1], minlength=count)
+        upper: Any = bsr_matrix(factor.U.tocsr(), blocksize=(wide, wide))
+        keys, found = rows * count + columns, np.zeros_like(self.blocks)
+        known: dict[int, Array] = {}
+        for j in range(count - 1, -1, -1):
+            met = meets[j]
+            stored = slice(upper.indptr[j], upper.indptr[j + 1])
+            row = np.zeros((wide, len(met), wide))
+            row[:, np.searchsorted(met, upper.indices[stored])] = upper.data[stored].swapaxes(0, 1)
+            back = np.linalg.inv(row[:, 0])
+            follow = -(back @ row[:, 1:].reshape(wide, -1))
+            inverse = np.empty((len(met), wide, len(met), wide))
+            if len(met) > 1:
+                parent = int(met[1])
+                at = np.searchsorted(meets[parent], met[1:])
+                inverse[1:, :, 1:] = known[parent][at][:, :, at]
+                waiting[parent] -= 1
+                if not waiting[parent]:
+                    del known[parent]
+            across = follow @ inverse[1:, :, 1:].reshape(follow.shape[1], follow.shape[1])
+            inverse[0, :, 0] = (back * np.diag(row[:, 0])) @ back.T + across @ follow.T
+            inverse[0, :, 1:] = across.reshape(wide, -1, wide)
+            inverse[1:, :, 0] = inverse[0, :, 1:].transpose(1, 2, 0)
+            if waiting[j]:
+                known[j] = inverse
+            own, others = order[j], order[met]
+            for key, block in (
+                (own * count + others, inverse[0].swapaxes(0, 1)),
+                (others * count + own, inverse[:, :, 0]),
+            ):
+                to = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+                asked = keys[to] == key
+                found[to[asked]] = block[asked]
+        free = self.equations.free
         found *= free[rows, :, None] & free[columns, None, :]
         return found
 
@@ -196,6 +253,31 @@ def inverse_of(matrix: Array) -> Array:
     weight = np.outer(scale, scale)
     inverse: Array = np.linalg.inv(matrix * weight) * weight
     return 0.5 * (inverse + inverse.T)
+
+
+def _factor(matrix: csc_matrix, order: str) -> Any:
+    """Factor of a symmetric matrix without pivoting, in one of SuperLU's orders."""
+    factor: Any = splu
+    return factor(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _fill(rows: Indices, columns: Indices, count: int) -> list[Indices]:
+    """Each unknown, and what meets it later when those before it are eliminated in order; sorted.
+
+    Args:
+        rows: (B,) of the blocks of a symmetric matrix.
+        columns: (B,) of them.
+        count: how many rows there are.
+    """
+    met: list[set[int]] = [set() for _ in range(count)]
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        if column >= row:
+            met[row].add(column)
+    for row, own in enumerate(met):
+        later = own - {row}
+        if later:
+            met[min(later)] |= later
+    return [np.array(sorted(own), dtype=np.int64) for own in met]
 
 
 class Problem(Protocol[Guess, Normal]):
