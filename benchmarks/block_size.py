@@ -41,12 +41,12 @@ from reconstruct.adjustment.soft_modes import soft_modes
 from reconstruct.adjustment.survey_fit import SurveyProblem
 from reconstruct.placing.georeference import fit_navigation, level
 
-_ALTITUDE_M, _STEP_M, _LINES_M, _DEPTH_M, _SPEED_MPS = 2.0, 0.4, 0.8, 10.0, 0.2
+ALTITUDE_M, _STEP_M, _LINES_M, _DEPTH_M, _SPEED_MPS = 2.0, 0.4, 0.8, 10.0, 0.2
 _MATCHED = 0.5
 """Share of the pictures that show a point in which it is matched."""
 _PLACE_M, _TURN_RAD = 0.002, 0.0005
 """How far off the start is."""
-_DATUM = Datum(32.8236, 34.9553)
+DATUM = Datum(32.8236, 34.9553)
 PARTS = ("factor", "adjustment", "stations", "points", "modes", "navigation")
 Result = TypeVar("Result")
 
@@ -83,9 +83,9 @@ def block(rig: Rig, stations: int, points: int) -> Block:
     turns = (ahead * leaning * rig.body_from_cam(names[0]).rotation).as_matrix()
     low, high = centres.min(axis=0)[:2] - 1.0, centres.max(axis=0)[:2] + 1.0
     ground = rng.uniform(low, high, (points * stations, 2))
-    down = _DEPTH_M + _ALTITUDE_M + 0.1 * np.sin(3.0 * ground).sum(axis=1)
+    down = _DEPTH_M + ALTITUDE_M + 0.1 * np.sin(3.0 * ground).sum(axis=1)
     floor = np.column_stack([ground, down])
-    near = cKDTree(ground).query_ball_point(centres[:, :2], 0.8 * _ALTITUDE_M)
+    near = cKDTree(ground).query_ball_point(centres[:, :2], 0.8 * ALTITUDE_M)
     station = np.repeat(np.arange(stations), [len(row) for row in near])
     point = np.concatenate([np.array(row, dtype=np.int64) for row in near])
     arm = np.einsum("nij,ni->nj", turns[station], floor[point] - centres[station])
@@ -115,6 +115,18 @@ def block(rig: Rig, stations: int, points: int) -> Block:
     )
 
 
+def near_start(truth: RigState) -> RigState:
+    """A state a little off the truth."""
+    rng, count = np.random.default_rng(1), len(truth.centres)
+    off = Rotation.from_rotvec(rng.normal(0, _TURN_RAD, (count, 3))).as_matrix()
+    return replace(
+        truth,
+        turns=off @ truth.turns,
+        centres=truth.centres + rng.normal(0, _PLACE_M, (count, 3)),
+        points=truth.points + rng.normal(0, _PLACE_M, truth.points.shape),
+    )
+
+
 def seconds(rig: Rig, of: Block) -> dict[str, float]:
     """Seconds of computing of every part."""
     spent: dict[str, float] = {}
@@ -126,15 +138,7 @@ def seconds(rig: Rig, of: Block) -> dict[str, float]:
         return found
 
     truth, names = of.truth, list(rig.cameras)
-    rng = np.random.default_rng(1)
-    count = len(truth.centres)
-    off = Rotation.from_rotvec(rng.normal(0, _TURN_RAD, (count, 3))).as_matrix()
-    start = replace(
-        truth,
-        turns=off @ truth.turns,
-        centres=truth.centres + rng.normal(0, _PLACE_M, (count, 3)),
-        points=truth.points + rng.normal(0, _PLACE_M, truth.points.shape),
-    )
+    start, count = near_start(truth), len(truth.centres)
     problem = SurveyProblem(of.pixels, start, Prior.of_rig(rig, calibrated_parameters(rig, names)))
     found = timed(
         "adjustment", lambda: minimise(problem, problem.start, settled=0.05, most_steps=20)
@@ -143,7 +147,7 @@ def seconds(rig: Rig, of: Block) -> dict[str, float]:
         raise RuntimeError(f"{count} stations: the adjustment did not settle")
     state = found.guess.state
     equations = problem.reduced(found.guess, found.noise, ())
-    gauge = Gauge(state.centres, _ALTITUDE_M, False)
+    gauge = Gauge(state.centres, ALTITUDE_M, False)
     equations = replace(equations, free=~gauge.held)
     timed("factor", lambda: equations.factor().solve(gauge.weighed[..., :1]))
     blocks = timed("stations", lambda: gauge.shape_blocks(equations))
@@ -154,10 +158,10 @@ def seconds(rig: Rig, of: Block) -> dict[str, float]:
     timed(
         "navigation",
         lambda: fit_navigation(
-            _records(rig, truth),
+            records_of(rig, truth),
             list(poses),
             {names[0]: rig.body_from_cam(names[0])},
-            _DATUM,
+            DATUM,
             level(state.points, state.centres),
             known_scale=1.0,
             modes=modes.stations[:, [3, 4, 5, 0, 1, 2]],
@@ -166,13 +170,13 @@ def seconds(rig: Rig, of: Block) -> dict[str, float]:
     return spent
 
 
-def _records(rig: Rig, truth: RigState) -> list[ImageRecord]:
+def records_of(rig: Rig, truth: RigState) -> list[ImageRecord]:
     """A log with a constant and a white error of depth and white errors of the rest."""
     name, rng = next(iter(rig.cameras)), np.random.default_rng(2)
     poses = RigidTransform.from_components(truth.centres, Rotation.from_matrix(truth.turns))
     bodies = poses * rig.body_from_cam(name).inv()
     ned = bodies.translation + rng.normal(0, [0.03, 0.03, 0.002], (len(poses), 3)) + [0, 0, 0.05]
-    places = _DATUM.geodetic_from_ned(ned)
+    places = DATUM.geodetic_from_ned(ned)
     angles = np.rad2deg(attitude_from_rotation(bodies.rotation))
     angles = angles + rng.normal(0, 0.02, angles.shape)
     return [
@@ -181,7 +185,7 @@ def _records(rig: Rig, truth: RigState) -> list[ImageRecord]:
             time_s=i * _STEP_M / _SPEED_MPS, latitude_deg=float(place[0]),
             longitude_deg=float(place[1]), depth_m=float(place[2]), roll_deg=float(angle[0]),
             pitch_deg=float(angle[1]), heading_deg=float(angle[2] % 360.0),
-            altitude_m=_ALTITUDE_M, sigma_horizontal_m=0.03, sigma_depth_m=0.05,
+            altitude_m=ALTITUDE_M, sigma_horizontal_m=0.03, sigma_depth_m=0.05,
             sigma_attitude_deg=0.02, sigma_heading_deg=0.02,
         )
         for i, (place, angle) in enumerate(zip(places, angles, strict=True))

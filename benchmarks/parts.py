@@ -160,6 +160,12 @@ PARTS = (
         packages=("distributed",),
     ),
     Part(
+        name="scale",
+        module="scale",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="reconstruct-peers",
         module="reconstruct",
         arguments=_reconstruct("peers"),

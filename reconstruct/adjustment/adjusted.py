@@ -17,6 +17,7 @@ from alice_survey.base.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig
+from reconstruct.adjustment.pixel_parts import ALONE, Workers
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
 from reconstruct.adjustment.uncertainty import Uncertainty, estimate
@@ -80,6 +81,7 @@ def adjust_survey(
     rig: Rig | None,
     distances: RangeRecord | None,
     settings: ReconstructConfig,
+    workers: Workers = ALONE,
 ) -> AdjustedSurvey:
     """Adjust a mapped survey a last time by its pictures and its calibration.
 
@@ -89,6 +91,7 @@ def adjust_survey(
         rig: as calibrated; None where the cameras calibrated themselves.
         distances: for which the model's pinholes are the best.
         settings: `refine_port` and `refine_rig`.
+        workers: where parts of a large survey are worked on.
 
     Raises:
         ReconstructionError: the settings insist on a refinement of the rig, and the model has no
@@ -99,7 +102,7 @@ def adjust_survey(
         rig = part_of_rig(rig, list(mapped.warps))
     try:
         if rig is not None and distances is not None and mapped.scaled:
-            exact = _exact(mapped, records, rig, distances, settings)
+            exact = _exact(mapped, records, rig, distances, settings, workers)
         elif settings.refine_port or settings.refine_rig == "on":
             raise ReconstructionError(
                 "refine_port and refine_rig need two cameras, whose known baseline gives the "
@@ -126,6 +129,7 @@ def _exact(
     rig: Rig,
     distances: RangeRecord,
     settings: ReconstructConfig,
+    workers: Workers,
 ) -> ExactSurvey:
     names = list(mapped.warps)
     seen = Observations(
@@ -136,7 +140,7 @@ def _exact(
         warps=mapped.warps,
     )
     pose = frees_poses(settings, rig, names)
-    fit = fit_survey(mapped, seen, rig, port=settings.refine_port, pose=pose)
+    fit = fit_survey(mapped, seen, rig, port=settings.refine_port, pose=pose, workers=workers)
     return ExactSurvey(mapped=mapped, seen=seen, distances=distances, fit=fit)
 
 

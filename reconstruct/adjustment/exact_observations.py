@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
@@ -51,13 +52,37 @@ class Pixels:
         counts: Indices = np.diff(self.starts)
         return np.repeat(counts, counts)
 
-    def parts(self) -> "list[Pixels]":
-        """Runs of whole points, of about `PART` observations each."""
+    def parts(self) -> list[tuple[int, int]]:
+        """Runs of points, first and end, of about `PART` observations each."""
         ends = np.searchsorted(self.starts, np.arange(PART, len(self.station), PART))
         bounds = np.unique([0, *ends, self.points])
-        return [self._run(first, end) for first, end in pairwise(bounds.tolist())]
+        return list(pairwise(bounds.tolist()))
 
-    def _run(self, first: int, end: int) -> "Pixels":
+    def by_place(self, centres: Array) -> "tuple[Pixels, Indices]":
+        """The same with points next to each other that neighbouring stations see.
+
+        Parts of many observations then have few stations. Where all are one part, points stay.
+
+        Args:
+            centres: (F, 3) of the stations.
+
+        Returns:
+            The observations, and (P,) which point each is.
+        """
+        if len(self.parts()) <= 1:
+            return self, np.arange(self.points)
+        leaf = np.argsort(KDTree(centres).indices)
+        order = np.argsort(np.minimum.reduceat(leaf[self.station], self.starts[:-1]), kind="stable")
+        counts = np.diff(self.starts)[order]
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        rows = np.repeat(self.starts[order] - starts[:-1], counts) + np.arange(starts[-1])
+        return Pixels(
+            starts=starts, station=self.station[rows], camera=self.camera[rows],
+            taken=self.taken[rows], point=np.repeat(np.arange(self.points), counts),
+        ), order  # fmt: skip
+
+    def run(self, first: int, end: int) -> "Pixels":
+        """The observations of points from the first up to the end."""
         rows = slice(self.starts[first], self.starts[end])
         return Pixels(
             starts=self.starts[first : end + 1] - self.starts[first], station=self.station[rows],

@@ -8,8 +8,10 @@ one, which leaves a block-sparse system of the stations with a border of what is
 (`alice_survey.base.block_solver`).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_matrix, identity
@@ -19,6 +21,7 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.mapping.arrays import first_of
 
+Result = TypeVar("Result")
 POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""
 
@@ -65,14 +68,119 @@ class LinearObservations:
         return replace(self, by_point=root * self.by_point, rest=root * self.rest)
 
 
+class LinearParts(Protocol):
+    """Observations by whole points, in parts that are linearised where they are needed."""
+
+    @property
+    def stations(self) -> Sequence[Indices]:
+        """Of each part, the stations (f,) that it sees, ascending; observations count in these."""
+
+    @property
+    def points(self) -> Sequence[int]:
+        """How many points each part has."""
+
+    def map(
+        self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
+    ) -> Iterator[Result]:
+        """Yield `function(part, value)` of every part with its value, in order."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OnePart:
+    """All observations as one part, in this process."""
+
+    linear: LinearObservations
+    stations: Sequence[Indices]
+
+    @property
+    def points(self) -> Sequence[int]:
+        """How many points it has."""
+        return [len(self.linear.starts) - 1]
+
+    def map(
+        self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
+    ) -> Iterator[Result]:
+        """Yield what a function makes of all."""
+        return (function(self.linear, value) for value in values)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockPattern:
+    """Which stations meet, as rows of a matrix of blocks."""
+
+    pointers: Indices
+    """(F + 1,) and (B,): the blocks of every station's row, and their columns, sorted."""
+    columns: Indices
+
+    @cached_property
+    def keys(self) -> Indices:
+        """(B,) row and column of each block as one number, ascending."""
+        stations = len(self.pointers) - 1
+        rows = np.repeat(np.arange(stations), np.diff(self.pointers))
+        found: Indices = rows * stations + self.columns
+        return found
+
+    def at(self, stations: Indices, part: "BlockPattern") -> Indices:
+        """Where the blocks of a part of the stations, (f,), are among these."""
+        rows, columns = np.divmod(part.keys, len(stations))
+        wanted = stations[rows] * (len(self.pointers) - 1) + stations[columns]
+        return np.searchsorted(self.keys, wanted)
+
+
+def pattern_of(starts: Indices, station: Indices, stations: int) -> BlockPattern:
+    """The pattern of stations that see points in common.
+
+    Args:
+        starts: (P + 1,) start of each point's observations.
+        station: (O,) of all observations.
+        stations: F, how many there are.
+    """
+    seen = csr_matrix(
+        (np.ones(len(station), np.int32), station, starts), shape=(len(starts) - 1, stations)
+    )
+    return _pattern(csr_matrix(seen.T @ seen + identity(stations, np.int32, format="csr")))
+
+
+def joined_pattern(parts: Iterable[tuple[Indices, BlockPattern]], stations: int) -> BlockPattern:
+    """The pattern of all stations, from those of parts of them, (f,) each."""
+    keys = np.arange(stations) * (stations + 1)
+    for own, part in parts:
+        rows, columns = np.divmod(part.keys, len(own))
+        keys = np.union1d(keys, own[rows] * stations + own[columns])
+    rows, columns = np.divmod(keys, stations)
+    pointers = np.searchsorted(rows, np.arange(stations + 1))
+    return BlockPattern(pointers=pointers.astype(np.int64), columns=columns)
+
+
+def _pattern(meets: csr_matrix) -> BlockPattern:
+    meets.sort_indices()
+    return BlockPattern(
+        pointers=meets.indptr.astype(np.int64), columns=meets.indices.astype(np.int64)
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PartSums:
+    """What a part of the points says of its own stations and of what is shared."""
+
+    pattern: BlockPattern
+    blocks: Array
+    border: Array
+    shared: Array
+    """Below its diagonal; all three as in `Equations`."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointEquations(Equations):
     """Normal equations of stations and of what is shared, the points eliminated."""
 
-    parts: Iterable[LinearObservations]
-    """Observations by whole points, in order; all that is taken from them is a sum over points."""
-    point_inverse: Array
-    """(P, 3, 3) covariance of the points where all else is known."""
+    parts: LinearParts
+    """All that is taken from the observations is a sum over points, or stays with one."""
+
+    @cached_property
+    def point_inverse(self) -> Array:
+        """(P, 3, 3) covariance of the points where all else is known."""
+        return self._by_point(_inverse_of_part, [None for _ in self.parts.stations])
 
     def point_steps(self, step: BlockStep) -> Array:
         """How far every point moves, (P, 3), where all else takes a step."""
@@ -80,7 +188,8 @@ class PointEquations(Equations):
 
     def follow(self, poses: Array, rest: Array) -> Array:
         """Motions (P, 3) of points by steps (F, 6) of stations and (G + 1,) of the `rest`."""
-        return self._by_point(lambda part, inverse: _follow(*part.arrays, inverse, poses, rest))
+        steps = ((poses[own], rest) for own in self.parts.stations)
+        return self._by_point(_follow_part, steps)
 
     def follow_shared(self, response: Array, every: int) -> Array:
         """Motions (P', 3, G) of every n-th point by what is shared.
@@ -89,16 +198,12 @@ class PointEquations(Equations):
             response: (F, 6, G) how stations move by it.
             every: n.
         """
-        poses = np.ascontiguousarray(response.transpose(2, 0, 1))
-        units = np.eye(len(poses), len(poses) + 1)
-
-        def found(part: LinearObservations, inverse: Array) -> Array:
-            moved = [
-                _follow(*part.arrays, inverse, *step) for step in zip(poses, units, strict=True)
-            ]
-            return np.stack(moved, axis=-1)
-
-        return self._by_point(found, every)
+        firsts = np.cumsum([0, *self.parts.points])[:-1].tolist()
+        steps = (
+            (response[own], slice(-first % every, None, every))
+            for own, first in zip(self.parts.stations, firsts, strict=True)
+        )
+        return self._by_point(_follow_shared_in_part, steps)
 
     def point_covariances(self, blocks: Array) -> Array:
         """Covariance of every point, (P, 3, 3), from those of its stations.
@@ -108,20 +213,53 @@ class PointEquations(Equations):
         Args:
             blocks: (B, 6, 6) covariances between the stations that see a point in common.
         """
-        pattern = self.pointers, self.columns
-        return self._by_point(
-            lambda part, inverse: _point_covariances(*part.arrays, inverse, *pattern, blocks)
-        )
+        whole = BlockPattern(pointers=self.pointers, columns=self.columns)
+        near = ((own, *_between(whole, own)) for own in self.parts.stations)
+        values = ((pattern, blocks[at]) for _, pattern, at in near)
+        return self._by_point(_covariances_of_part, values)
 
     def _by_point(
-        self, found: Callable[[LinearObservations, Array], Array], every: int = 1
+        self, function: Callable[[LinearObservations, Any], Array], values: Iterable[Any]
     ) -> Array:
-        values, first = [], 0
-        for part in self.parts:
-            end = first + len(part.starts) - 1
-            values.append(found(part, self.point_inverse[first:end])[-first % every :: every])
-            first = end
-        return np.concatenate(values)
+        return np.concatenate(list(self.parts.map(function, values)))
+
+
+def _between(whole: BlockPattern, own: Indices) -> tuple[BlockPattern, Indices]:
+    """The pattern of some of the stations (f,), and where its blocks are in the whole."""
+    count = len(whole.columns)
+    matrix = csr_matrix(
+        (np.arange(1, count + 1), whole.columns, whole.pointers),
+        shape=(len(whole.pointers) - 1,) * 2,
+    )
+    part = matrix[own][:, own]
+    part.sort_indices()
+    return _pattern(part), part.data - 1
+
+
+def _inverse_of_part(linear: LinearObservations, _: None) -> Array:
+    return _point_inverse(linear.starts, linear.by_point)
+
+
+def _follow_part(linear: LinearObservations, steps: tuple[Array, Array]) -> Array:
+    """Motions (p, 3) of a part's points by steps of its stations and of the rest."""
+    return _follow(*linear.arrays, _point_inverse(linear.starts, linear.by_point), *steps)
+
+
+def _follow_shared_in_part(linear: LinearObservations, by: tuple[Array, slice]) -> Array:
+    response, chosen = by
+    inverse = _point_inverse(linear.starts, linear.by_point)
+    poses = np.ascontiguousarray(response.transpose(2, 0, 1))
+    units = np.eye(len(poses), len(poses) + 1)
+    moved = [
+        _follow(*linear.arrays, inverse, *step)[chosen] for step in zip(poses, units, strict=True)
+    ]
+    return np.stack(moved, axis=-1)
+
+
+def _covariances_of_part(linear: LinearObservations, known: tuple[BlockPattern, Array]) -> Array:
+    pattern, blocks = known
+    inverse = _point_inverse(linear.starts, linear.by_point)
+    return _point_covariances(*linear.arrays, inverse, pattern.pointers, pattern.columns, blocks)
 
 
 def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
@@ -131,38 +269,51 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
         linear: observations; every point needs two that see it from apart.
         stations: F, how many there are.
     """
-    return reduce_parts([linear], linear.starts, linear.station, stations)
+    pattern = pattern_of(linear.starts, linear.station, stations)
+    return reduce_parts(OnePart(linear=linear, stations=[np.arange(stations)]), pattern)
 
 
-def reduce_parts(
-    parts: Iterable[LinearObservations], starts: Indices, station: Indices, stations: int
-) -> PointEquations:
-    """Eliminate the points of observations that are too many to be linearised all at a time.
+def reduce_parts(parts: LinearParts, pattern: BlockPattern) -> PointEquations:
+    """Eliminate the points, part by part; the sums are added in the order of the parts.
 
     Args:
-        parts: the observations by whole points, in order; iterated whenever they are needed.
-        starts: (P + 1,) start of each point's observations.
-        station: (O,) of all observations.
-        stations: F, how many there are.
+        parts: the observations.
+        pattern: of all stations.
     """
-    seen = csr_matrix(
-        (np.ones(len(station), np.int32), station, starts), shape=(len(starts) - 1, stations)
-    )
-    meets = csr_matrix(seen.T @ seen + identity(stations, np.int32, format="csr"))
-    meets.sort_indices()
-    pointers, columns = meets.indptr.astype(np.int64), meets.indices.astype(np.int64)
-    inverses: list[Array] = []
-    for part in parts:
-        if not inverses:
-            count = part.rest.shape[2]
-            blocks, border = np.zeros((len(columns), POSE, POSE)), np.zeros((stations, POSE, count))
-            shared = np.zeros((count, count))
-        inverses.append(_reduce(*part.arrays, pointers, columns, blocks, border, shared))
-    return PointEquations(
-        pointers=pointers, columns=columns, blocks=blocks, border=border,
-        shared=shared + np.tril(shared, -1).T, free=np.ones((stations, POSE), dtype=np.bool_),
-        parts=parts, point_inverse=np.concatenate(inverses),
+    stations = len(pattern.pointers) - 1
+    found: PointEquations | None = None
+    for own, sums in zip(
+        parts.stations, parts.map(_reduce_part, map(len, parts.stations)), strict=True
+    ):
+        if found is None:
+            count = len(sums.shared)
+            found = PointEquations(
+                pointers=pattern.pointers, columns=pattern.columns, parts=parts,
+                blocks=np.zeros((len(pattern.columns), POSE, POSE)),
+                border=np.zeros((stations, POSE, count)), shared=np.zeros((count, count)),
+                free=np.ones((stations, POSE), dtype=np.bool_),
+            )  # fmt: skip
+        found.blocks[pattern.at(own, sums.pattern)] += sums.blocks
+        found.border[own] += sums.border
+        found.shared[:] += sums.shared
+    if found is None:
+        raise ValueError("no observations")
+    found.shared[:] += np.tril(found.shared, -1).T
+    return found
+
+
+def _reduce_part(linear: LinearObservations, stations: int) -> PartSums:
+    pattern = pattern_of(linear.starts, linear.station, stations)
+    count = linear.rest.shape[2]
+    sums = PartSums(
+        pattern=pattern, blocks=np.zeros((len(pattern.columns), POSE, POSE)),
+        border=np.zeros((stations, POSE, count)), shared=np.zeros((count, count)),
     )  # fmt: skip
+    _reduce(
+        *linear.arrays, _point_inverse(linear.starts, linear.by_point), pattern.pointers,
+        pattern.columns, sums.blocks, sums.border, sums.shared,
+    )  # fmt: skip
+    return sums
 
 
 @compiled
@@ -203,29 +354,42 @@ def _invert(m: Array, out: Array) -> None:
 
 
 @compiled
-def _reduce(
-    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array,
-    pointers: Indices, columns: Indices, blocks: Array, border: Array, shared: Array,
-) -> Array:  # fmt: skip
-    """Add what some points say, in place, of `shared` below its diagonal; their (P, 3, 3)."""
-    points, count = starts.shape[0] - 1, rest.shape[2]
-    longest = np.diff(starts).max()
-    inverse = np.empty((points, 3, 3))
-    pose = np.empty((longest, 2, 6))
-    cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
-    own, together, solved = np.empty((3, 3)), np.empty((3, count)), np.empty((3, count))
+def _point_inverse(starts: Indices, by_point: Array) -> Array:
+    """Covariances (P, 3, 3) of points where all else is known."""
+    points = starts.shape[0] - 1
+    inverse, own = np.empty((points, 3, 3)), np.empty((3, 3))
     for p in range(points):
-        first, end = starts[p], starts[p + 1]
-        own[:], together[:] = 0.0, 0.0
-        for o in range(first, end):
+        own[:] = 0.0
+        for o in range(starts[p], starts[p + 1]):
             for row in range(2):
                 for i in range(3):
                     s = by_point[o, row, i]
                     for j in range(3):
                         own[i, j] += s * by_point[o, row, j]
+        _invert(own, inverse[p])
+    return inverse
+
+
+@compiled
+def _reduce(
+    starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array, inverse: Array,
+    pointers: Indices, columns: Indices, blocks: Array, border: Array, shared: Array,
+) -> None:  # fmt: skip
+    """Add what some points say, in place, of `shared` below its diagonal."""
+    points, count = starts.shape[0] - 1, rest.shape[2]
+    longest = np.diff(starts).max()
+    pose = np.empty((longest, 2, 6))
+    cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
+    together, solved = np.empty((3, count)), np.empty((3, count))
+    for p in range(points):
+        first, end = starts[p], starts[p + 1]
+        together[:] = 0.0
+        for o in range(first, end):
+            for row in range(2):
+                for i in range(3):
+                    s = by_point[o, row, i]
                     for g in range(count):
                         together[i, g] += s * rest[o, row, g]
-        _invert(own, inverse[p])
         back = inverse[p]
         for i in range(3):
             for g in range(count):
@@ -276,7 +440,6 @@ def _reduce(
             for j in range(3):
                 for h in range(g + 1):
                     shared[g, h] -= together[j, g] * solved[j, h]
-    return inverse
 
 
 @compiled

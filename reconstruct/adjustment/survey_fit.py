@@ -7,7 +7,7 @@ what is free. The model is then rebuilt on the pinholes of the refined rig.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -30,17 +30,15 @@ from reconstruct.adjustment.exact_observations import (
     RigState,
     calibrated_parameters,
     choose_pixels,
-    exact_misses,
-    exact_observations,
     start_state,
 )
 from reconstruct.adjustment.keypoint_bias import bias_covariance
 from reconstruct.adjustment.normal_equations import (
     POSE,
-    LinearObservations,
     PointEquations,
     reduce_parts,
 )
+from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
 from reconstruct.adjustment.rig_evidence import Contradiction, contradiction
 from reconstruct.adjustment.soft_modes import Motions, SoftModes
 from reconstruct.mapping.arrays import (
@@ -169,7 +167,13 @@ class SurveyFit:
 
 @progress.step("adjust stations, points and rig")
 def fit_survey(
-    mapped: Mapped, seen: Observations, rig: Rig, *, port: bool, pose: bool
+    mapped: Mapped,
+    seen: Observations,
+    rig: Rig,
+    *,
+    port: bool,
+    pose: bool,
+    workers: Workers = ALONE,
 ) -> SurveyFit:
     """Adjust a finished model on exact rays.
 
@@ -179,6 +183,7 @@ def fit_survey(
         rig: as calibrated or designed.
         port: free distance and normal of the ports and the water's index.
         pose: free the poses of the cameras on the rig. Without both the rig is held.
+        workers: where parts of a large survey are worked on.
 
     Raises:
         ReconstructionError: the survey does not determine what is requested.
@@ -187,7 +192,10 @@ def fit_survey(
     frames = frames_of(mapped.model)
     pixels, ids = choose_pixels(mapped, seen, names, frames)
     free = _prior(rig, names, port=port, pose=pose) if port or pose else Prior.around(rig, {})
-    problem = SurveyProblem(pixels, start_state(mapped, rig, names, frames, ids), free)
+    start = start_state(mapped, rig, names, frames, ids)
+    pixels, order = pixels.by_place(start.centres)
+    start = replace(start, points=start.points[order])
+    problem = SurveyProblem(pixels, start, free, workers)
     found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
     if not found.is_settled:
         warn(f"the last adjustment did not settle in {_STEPS} steps: trust it with care")
@@ -203,7 +211,7 @@ def fit_survey(
     weights = cauchy_weights(guess.miss, sigma_px)
     return SurveyFit(
         calibrated=rig,
-        state=guess.state,
+        state=replace(guess.state, points=guess.state.points[np.argsort(order)]),
         point_ids=ids,
         parameters=problem.fields,
         before=np.array([value(problem.start.state.rig, name) for name in problem.fields]),
@@ -243,31 +251,14 @@ class _Guess:
     """Observations that no ray explains: they do not count."""
 
 
-class _Linearised:
-    """Weighted observations from one guess, part by part; a single part is computed once only."""
-
-    def __init__(self, state: RigState, pixels: Pixels, fields: Sequence[str], noise: Array):
-        self.state, self.fields, self.noise = state, fields, noise
-        self.runs = pixels.parts()
-        self.kept: LinearObservations | None = None
-
-    def __iter__(self) -> Iterator[LinearObservations]:
-        sigma, variance = self.noise
-        for run in self.runs:
-            found = self.kept
-            if found is None:
-                found = exact_observations(self.state, run, self.fields)
-                found = found.weighted(cauchy_weights(found.miss, sigma) / variance)
-            if len(self.runs) == 1:
-                self.kept = found
-            yield found
-
-
 class SurveyProblem:
     """Stations, points and rig of a survey as `minimise` adjusts them."""
 
-    def __init__(self, pixels: Pixels, state: RigState, prior: Prior) -> None:
+    def __init__(
+        self, pixels: Pixels, state: RigState, prior: Prior, workers: Workers = ALONE
+    ) -> None:
         self.pixels, self.prior, self.fields = pixels, prior, prior.parameters
+        self.parts = PixelParts(pixels, len(state.centres), workers)
         self.information = prior.information.copy()
         _hold_baseline(self.information, self.fields, state.rig)
         self.left = self._spare(state) / (2 * len(pixels.station))
@@ -289,7 +280,7 @@ class SurveyProblem:
         return spare
 
     def _seen(self, state: RigState) -> _Guess:
-        miss = exact_misses(state, self.pixels)
+        miss = self.parts.misses(state)
         lost = ~np.isfinite(miss).all(axis=1)
         miss[lost] = 0.0
         return _Guess(state=state, miss=miss, lost=int(lost.sum()))
@@ -318,10 +309,11 @@ class SurveyProblem:
 
     def reduced(self, guess: _Guess, noise: Array, fields: Sequence[str]) -> PointEquations:
         """The same without what is known before the pictures, for any fields of the rig."""
-        pixels = self.pixels
-        parts = _Linearised(guess.state, pixels, fields, noise)
-        stations = len(guess.state.centres)
-        found = reduce_parts(parts, pixels.starts, pixels.station, stations)
+        sigma, variance = noise.tolist()
+        parts = Linearised(
+            pixels=self.parts, state=guess.state, fields=fields, noise=(sigma, variance)
+        )
+        found = reduce_parts(parts, self.parts.pattern)
         found.free[self.held] = False
         return found
 

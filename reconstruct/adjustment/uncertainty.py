@@ -139,8 +139,9 @@ def estimate(
     weights = cauchy_weights(linear.miss, sigma)
     variance = variance_of(linear.miss, weights, left)
     centres = rig_poses(model, frames).inv().translation
+    linear = linear.weighted(weights / variance)
     shape = shape_of_block(
-        linear.weighted(weights / variance), centres, seen.points, calibration,
+        linear, centres, seen.points, calibration,
         scale_free=scale_free, held=held,
     )  # fmt: skip
     first = _first_pictures(model, seen, frames)
@@ -281,6 +282,7 @@ def pinhole_observations(
     """
     points, local, pixels = seen.points, seen.in_cameras, seen.pixels
     order = np.argsort(seen.point, kind="stable")
+    place = np.argsort(order)
     station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
     rest = np.empty((len(order), 2, 1))
     centres = rig_poses(model, frames).inv().translation
@@ -291,16 +293,17 @@ def pinhole_observations(
         zero = np.zeros_like(z)
         slopes = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=-1)
         turn = image.cam_from_world().matrix()[:, :3]
-        by_point[rows] = slopes.reshape(-1, 2, 3) @ turn
-        rest[rows, :, 0] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
-        station[rows] = np.searchsorted(frames, image.frame_id)
+        to = place[rows]
+        by_point[to] = slopes.reshape(-1, 2, 3) @ turn
+        rest[to, :, 0] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
+        station[to] = np.searchsorted(frames, image.frame_id)
     counts = np.bincount(seen.point, minlength=len(points))
     linear = LinearObservations(
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        station=station[order],
-        by_point=by_point[order],
-        arm=(points[seen.point] - centres[station])[order],
-        rest=rest[order],
+        station=station,
+        by_point=by_point,
+        arm=points[seen.point[order]] - centres[station],
+        rest=rest,
     )
     return linear, order.astype(np.int64)
 

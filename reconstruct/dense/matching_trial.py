@@ -4,7 +4,7 @@ In dim or turbid water the finest detail of a picture is noise: half the resolut
 matches, and better ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -53,7 +53,7 @@ def find_scale(
     workspace: Path,
     views: Sequence[View],
     partners: Sequence[Sequence[int]],
-    points: Sequence[Array],
+    points_of: Callable[[int], Array],
     executor: Executor,
 ) -> float:
     """Factor by which pictures are shrunk for matching, from a few views.
@@ -62,12 +62,12 @@ def find_scale(
         workspace: with the pictures.
         views: of the model.
         partners: of every view, best first.
-        points: (N, 3) for every view, that bound its depth.
+        points_of: from the number of a view to the points (N, 3) that bound its depth.
         executor: where tasks run.
     """
     chosen = probed(partners)
     tasks = [
-        ((views[number], *(views[n] for n in partners[number])), points[number])
+        ((views[number], *(views[n] for n in partners[number])), points_of(number))
         for number in chosen
     ]
     largest = min(matching_scale(views[number]) for number in chosen)

@@ -24,7 +24,6 @@ from alice_survey.base.robust import MAD_TO_SIGMA
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask
-from reconstruct.light.solve import LightModel
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, shown_at
@@ -177,19 +176,18 @@ def _lattice_as_taken(warp: PinholeWarp) -> Array:
     return warp.to_pinhole(taken) / warp.pinhole.size_px
 
 
-def keep_look(light: LightModel, task: ViewTask) -> None:
+def keep_look(task: ViewTask) -> None:
     """Keep what a view shows on its lattice, for all views that are compared with it.
 
     Args:
-        light: of the survey.
-        task: a view whose depth has been checked.
+        task: a view whose depth has been checked; the store has the factors of its light.
     """
     store, index, view = task.store, task.index, task.view
     width, height = view.pinhole.size_px
     step = _step(view)
     h, w = height // step, width // step
     colour = store.load_colour(index)
-    factors = cv2.resize(light.factors(view.camera, view.image), (width, height))
+    factors = cv2.resize(store.load_factors(index), (width, height))
     valid = store.load_mask(index, "valid", width) & (colour.max(axis=2) > _DARKEST)
     depth, _ = store.load_depth(index, "fine")
     depth[~store.load_mask(index, "kept", width)] = np.nan

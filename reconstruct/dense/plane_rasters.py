@@ -34,7 +34,6 @@ from reconstruct.dense.surface_tiles import (
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask, lay_out_view
-from reconstruct.light.solve import LightModel
 from reconstruct.planes import PLANES, Plane, plane_frame, write_plane
 from reconstruct.qgis import write_style
 from reconstruct.raster import (
@@ -64,7 +63,6 @@ class Confirmed:
     """On the standard deviations of refined depths."""
     shared: float
     """Views whose depths rest on the same pair of pictures, in the mean, 1 to 2."""
-    light: LightModel
     poses: ErrorsOfPoses | None
     executor: Executor
 
@@ -108,7 +106,6 @@ def fuse_planes(
     grid = grid_over(bounds, cell)
     setup = FuseSetup(
         store=confirmed.store,
-        light=confirmed.light,
         stations=np.array([view.station for view in model.views], dtype=np.int64),
         planes=tuple(planes),
         offset_enu=_offset(grid, summaries),

@@ -23,10 +23,10 @@ from reconstruct.dense.moving import COMPARED, clear_moving, keep_look, mask_mov
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
 from reconstruct.dense.stereo_pairs import (
+    PointsInSight,
     choose_partners,
     depths_per_pair,
     neighbours,
-    points_in_sight,
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
@@ -35,12 +35,13 @@ from reconstruct.dense.views import (
     check_view,
     find_match_sigma,
     find_sigma_factor,
+    light_parts,
     looked_at,
     prepare_view,
     refine_view,
     view_depth,
 )
-from reconstruct.light.solve import joined_samples, solve_light, write_light
+from reconstruct.light.solve import solve_light, write_light
 from reconstruct.planes import chosen_planes
 from reconstruct.views.model import read_model, scaled_view
 
@@ -62,10 +63,10 @@ def run_dense(
     store = ViewStore(folder / "scratch")
     store.folder.mkdir(parents=True, exist_ok=True)
     partners = choose_partners(model, reconstruct.dense_partners)
-    points = points_in_sight(model)
+    points = PointsInSight(model)
     scale = reconstruct.dense_scale
     if scale is None:
-        scale = find_scale(workspace, model.views, partners, points, executor)
+        scale = find_scale(workspace, model.views, partners, points.of, executor)
     views = [scaled_view(view, scale) for view in model.views]
 
     def tasks(others: Sequence[Sequence[int]]) -> list[ViewTask]:
@@ -76,28 +77,27 @@ def run_dense(
 
     prepare = partial(prepare_view, workspace)
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
-    matched = list(zip(tasks(partners), points, strict=True))
-    match_sigma_px = find_match_sigma(matched, probed(partners), executor)
+    to_match = tasks(partners)
+    probes = [(to_match[n], points.of(n)) for n in probed(partners)]
+    match_sigma_px = find_match_sigma(probes, executor)
     match = partial(view_depth, match_sigma_px)
-    _drain(executor.map(match, matched, label="match"))
+    matched = ((task, points.of(task.index)) for task in to_match)
+    _drain(executor.map(match, matched, label="match", total=len(views)))
     looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
     _drain(executor.map(refine_view, tasks(looks), label="refine"))
     checks = tasks(neighbours(model, _WITNESSES))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
-    shown = list(executor.map(check, checks, label="cross-check"))
-    light = solve_light(
-        joined_samples([one.light for one in shown]),
-        np.stack([one.nodes for one in shown]),
-        [view.image for view in views],
-        [view.camera for view in views],
-    )
+    nodes, samples = zip(*executor.map(check, checks, label="cross-check"), strict=True)
+    images, cameras = [view.image for view in views], [view.camera for view in views]
+    light = solve_light(light_parts(store, samples, executor), np.stack(nodes), images, cameras)
     write_light(folder / "light.json", light)
+    factors = [light.factors(camera, image) for camera, image in zip(cameras, images, strict=True)]
+    store.save_factors(np.stack(factors))
     moving = []
     clear_moving(folder)
     if reconstruct.mask_moving:
-        keep = partial(keep_look, light)
-        _drain(executor.map(keep, tasks([()] * len(views)), label="even out light"))
+        _drain(executor.map(keep_look, tasks([()] * len(views)), label="even out light"))
         mask = partial(mask_moving, workspace, folder)
         others = tasks(neighbours(model, COMPARED))
         moving = list(executor.map(mask, others, label="mask what moves"))
@@ -112,7 +112,6 @@ def run_dense(
                 for n, chosen in enumerate(looks)
             ]
         ),
-        light=light,
         poses=find_errors_of_poses(workspace, model),
         executor=executor,
     )

@@ -43,24 +43,29 @@ def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
     return np.asarray(inside.all(axis=1))
 
 
-@progress.step("find points in sight")
-def points_in_sight(model: SparseModel) -> list[Array]:
-    """Per view the points (N, 3) in its frame, its own and others', that bound its depth.
+class PointsInSight:
+    """The points in the frame of each view, its own and others', that bound its depth.
 
-    Of many every n-th is taken. The work grows with the views, not with views times points.
+    They are found when they are wanted: those of all views take a hundred kilobytes a view. The
+    work grows with the views, not with views times points.
     """
-    tree = cKDTree(model.points_world) if len(model.points_world) else None
-    found = []
-    for view, own in zip(model.views, points_of_views(model), strict=True):
-        if tree is None or len(own) == 0:
-            found.append(own)
-            continue
+
+    def __init__(self, model: SparseModel) -> None:
+        """Take views and points."""
+        self._model, self._own = model, points_of_views(model)
+        self._tree = cKDTree(model.points_world) if len(model.points_world) else None
+
+    def of(self, number: int) -> Array:
+        """(N, 3) of a view; of many every n-th."""
+        own, view = self._own[number], self._model.views[number]
+        if self._tree is None or len(own) == 0:
+            return own
         centre = view.world_from_cam.translation
         reach = _BEYOND * np.linalg.norm(own - centre, axis=1).max()
-        near = np.sort(tree.query_ball_point(centre, reach))
-        inside = near[in_frame(view, model.points_world[near])]
-        found.append(model.points_world[inside[:: -(-len(inside) // _MOST_BOUNDING) or 1]])
-    return found
+        near = np.sort(self._tree.query_ball_point(centre, reach))
+        inside = near[in_frame(view, self._model.points_world[near])]
+        chosen: Array = self._model.points_world[inside[:: -(-len(inside) // _MOST_BOUNDING) or 1]]
+        return chosen
 
 
 def neighbours(model: SparseModel, most: int) -> list[list[int]]:

@@ -13,7 +13,6 @@ from reconstruct.dense.points import EDGE_ON, Points, joined, points_in_box
 from reconstruct.dense.pose_part import ErrorsOfPoses
 from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settled
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.light.solve import LightModel
 from reconstruct.planes import Plane
 from reconstruct.raster import DemGrid, tiles_reached
 from reconstruct.views.model import View, enu_from_cam
@@ -44,8 +43,7 @@ class FuseSetup:
     """What all tiles share."""
 
     store: ViewStore
-    """With the depth of every view."""
-    light: LightModel
+    """With the depth of every view, and the factors of its light."""
     stations: NDArray[np.int64]
     """(V,) station of every view."""
     planes: tuple[Plane, ...]
@@ -212,7 +210,7 @@ def _points_over(
                 sigma,
                 store.load_mask(index, "inside", view.pinhole.width_px) & sure,
                 store.load_colour(index),
-                setup.light.factors(view.camera, view.image),
+                store.load_factors(index),
                 offset,
                 (low[0], high[0], low[1], high[1]),
                 np.asarray(store.load(index, "blocks")),

@@ -6,7 +6,8 @@ and leaves its own there.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,16 @@ from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.surface_tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joined_samples, low_pass
+from reconstruct.light.parts import Parts
+from reconstruct.light.solve import (
+    LightSamples,
+    as_rows,
+    at_nodes,
+    compare_light,
+    from_rows,
+    joined_samples,
+    low_pass,
+)
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
@@ -37,6 +47,10 @@ from reconstruct.views.range_shift import slopes_of
 
 _BOUND_PERCENT = 0.1
 """Share of a view's points left out on each of its four sides, so that none strays far off."""
+LIGHT = "samples"
+"""Name of a view's samples of light in the store."""
+_PART = 400_000
+"""Samples of light that are worked on at a time, some: they take 0.3 kB each."""
 _LIGHT_LATTICE = 28
 """Pixels along a picture's width at which the light of views is compared."""
 LOOKS = 4
@@ -58,16 +72,6 @@ class ViewTask:
     index: int
     view: View
     others: tuple[tuple[int, View], ...]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ViewLight:
-    """What a view shows of the survey's light."""
-
-    light: LightSamples
-    """What it and its neighbours show of the same spots."""
-    nodes: Array
-    """What it shows at the nodes of the light model; see `light.at_nodes`."""
 
 
 def prepare_view(workspace: Path, task: ViewTask) -> None:
@@ -94,21 +98,18 @@ def _look(store: ViewStore, index: int, width: int) -> tuple[NDArray[Any], ...]:
     return prepared(store.load_bright(index), store.load_mask(index, "valid", width))
 
 
-def find_match_sigma(
-    matched: Sequence[tuple[ViewTask, Array]], chosen: Sequence[int], executor: Executor
-) -> float:
+def find_match_sigma(probes: Sequence[tuple[ViewTask, Array]], executor: Executor) -> float:
     """Standard deviation of a match in pixels as matched.
 
     How far depths from different partners differ, in units of what a match of `MATCH_SIGMA_PX`
     would give, shows the true precision: noise, calibration and poses together.
 
     Args:
-        matched: views with their partners, and points (N, 3) that bound their depth.
-        chosen: which of them to compare partners in; what they find stays for `view_depth`.
+        probes: some views with their partners, and points (N, 3) that bound their depth; what
+            partners find stays for `view_depth`.
         executor: where tasks run.
     """
-    tasks = [matched[n] for n in chosen]
-    return match_sigma(list(executor.map(match_apart, tasks, label="compare partners")))
+    return match_sigma(list(executor.map(match_apart, probes, label="compare partners")))
 
 
 def match_apart(matched: tuple[ViewTask, Array]) -> float:
@@ -244,7 +245,7 @@ def looked_at(views: Sequence[View], index: int, partners: Sequence[int]) -> lis
     return [n for n in partners if n not in apart[LOOKS:]]
 
 
-def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:
+def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
     """Keep the depths that two independent looks support.
 
     A depth stays where the neighbours whose windows look alike (or the partners that agree) and the
@@ -254,6 +255,10 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:
     Args:
         sigma_factor: on the standard deviations of refined depths.
         task: the view and its neighbours.
+
+    Returns:
+        What the view shows at the nodes of the light model (see `light.at_nodes`), and how many
+        spots it and its neighbours show, which are left in the store.
     """
     store, view = task.store, task.view
     depth, sigma = store.load_depth(task.index, "fine")
@@ -281,10 +286,35 @@ def check_view(sigma_factor: float, task: ViewTask) -> ViewLight:
     nodes = at_nodes(np.asarray(store.load(task.index, "low")))
     if len(rows) < _LEAST_PIXELS:
         store.save_mask(task.index, "kept", np.zeros_like(kept))
-        return ViewLight(light=joined_samples([]), nodes=nodes)
+        store.save(task.index, LIGHT, as_rows(joined_samples([])))
+        return nodes, 0
     store.save_mask(task.index, "kept", kept)
     points = _world_points(view, depth, rows, columns)
-    return ViewLight(light=_shared_light(task, points, rows, columns), nodes=nodes)
+    light = as_rows(_shared_light(task, points, rows, columns))
+    store.save(task.index, LIGHT, light)
+    return nodes, len(light)
+
+
+def light_parts(
+    store: ViewStore, samples: Sequence[int], executor: Executor
+) -> Parts[range, LightSamples]:
+    """What all views and their neighbours show of the same spots, by runs of views.
+
+    Args:
+        store: with the samples of all views.
+        samples: how many each view has.
+        executor: where tasks run.
+    """
+    part = np.cumsum([0, *samples])[:-1] // _PART
+    bounds = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(samples)]
+    return Parts(
+        items=[range(first, end) for first, end in pairwise(bounds)],
+        load=partial(_load_light, store), label="light of all pictures", executor=executor,
+    )  # fmt: skip
+
+
+def _load_light(store: ViewStore, views: range) -> LightSamples:
+    return joined_samples([from_rows(store.load(view, LIGHT)) for view in views])
 
 
 def lay_out_view(sigma_factor: float, task: ViewTask) -> ViewSummary:

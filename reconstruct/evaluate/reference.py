@@ -24,7 +24,7 @@ from reconstruct.evaluate.cloud_registration import (
 from reconstruct.evaluate.figures import WITHIN_PX, fit_doming, rounded
 from reconstruct.evaluate.plots import plot_reference
 from reconstruct.placing.alignment import Similarity
-from reconstruct.views.model import SparseModel, read_model
+from reconstruct.views.model import SparseModel, points_of_views, read_model
 
 _NAVIGATION = "navigation"
 
@@ -32,10 +32,9 @@ _NAVIGATION = "navigation"
 def ground_pixel_of(model: SparseModel) -> float:
     """Median side of a pixel on the surface, from the points that each view sees."""
     pixels = []
-    for index, view in enumerate(model.views):
-        seen = model.observations[model.observations[:, 1] == index, 0]
+    for view, seen in zip(model.views, points_of_views(model), strict=True):
         if len(seen):
-            depth = view.world_from_cam.inv().apply(model.points_world[seen])[:, 2]
+            depth = view.world_from_cam.inv().apply(seen)[:, 2]
             pixels.append(depth / view.pinhole.focal_px)
     return float(np.median(np.concatenate(pixels)))
 

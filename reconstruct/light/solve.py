@@ -16,9 +16,11 @@ eliminated first (their block is sparse: a picture meets its neighbours alone), 
 dense system for the patterns and the fall-off: the Schur complement, as in bundle adjustment.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +33,7 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
+from reconstruct.light.parts import Histogram, Parts, percentiles, values_in
 
 GRID = (9, 11)
 """Rows and columns of nodes over a picture, first and last on its edges."""
@@ -74,6 +77,8 @@ class LightSamples:
     """(N, 2, 3) logarithm of the low-passed BGR levels."""
     ranges: NDArray[np.float32] | None = None
     """(N, 2) distances at which the views see the spots; None where they do not count."""
+    unsure: Array | None = None
+    """(N, 3) factors of their errors over the usual; None for 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,7 +107,10 @@ class LightModel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightEquations:
-    """Samples as equations: nodes @ x + gain of view 0 - gain of view 1 = target, N rows."""
+    """Samples as equations: nodes @ x + gain of view 0 - gain of view 1 = target, N rows.
+
+    Views count among those of their part.
+    """
 
     nodes: NDArray[np.int64]
     """(N, 8) numbers of the nodes of both sides among all cameras'."""
@@ -116,10 +124,14 @@ class LightEquations:
     """(N,) row of `pairs`."""
     pairs: NDArray[np.int64]
     """(M, 2) views that share spots."""
-    patterns: int
-    """Number of nodes."""
-    pictures: int
-    """Number of views."""
+    target: Array
+    """(N, 3) differences of logarithms."""
+    misfit: Array
+    """(N, 3) where an error becomes large; also the expected size of one."""
+
+
+LinearParts = Parts[Any, LightEquations]
+"""Equations of all samples, in the same parts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -211,6 +223,21 @@ def compare_light(
     )
 
 
+_STORED = np.dtype([("views", "i4", 2), ("places", "f4", (2, 2)), ("levels", "f4", (2, 3))])
+
+
+def as_rows(samples: LightSamples) -> NDArray[np.void]:
+    """Samples without ranges as one array (N,) to keep in a file."""
+    rows = np.empty(len(samples.views), _STORED)
+    rows["views"], rows["places"], rows["levels"] = samples.views, samples.places, samples.levels
+    return rows
+
+
+def from_rows(rows: NDArray[np.void]) -> LightSamples:
+    """The samples that `as_rows` kept."""
+    return LightSamples(views=rows["views"], places=rows["places"], levels=rows["levels"])
+
+
 def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
     """Samples of several pairs as one; their ranges count when all parts have some."""
     ranges = [p.ranges for p in parts if p.ranges is not None]
@@ -222,21 +249,34 @@ def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
     )
 
 
+SampleParts = Parts[Any, LightSamples]
+"""Samples of a survey, in parts that fit in memory."""
+
+
+def in_one_part(samples: LightSamples) -> SampleParts:
+    """Samples that are in memory."""
+    return Parts(items=[samples], load=_as_they_are, label="light of all pictures")
+
+
+def _as_they_are(samples: LightSamples) -> LightSamples:
+    return samples
+
+
 @progress.step("solve the light of all pictures")
 def solve_light(
-    samples: LightSamples, nodes: Array, images: Sequence[str], cameras: Sequence[str]
+    parts: SampleParts, nodes: Array, images: Sequence[str], cameras: Sequence[str]
 ) -> LightModel:
     """Find patterns and gains by robust least squares over all pairs of views.
 
     Args:
-        samples: spots seen by two views.
+        parts: spots seen by two views, without ranges.
         nodes: (V, rows, columns, 3) logarithm of what each view shows at the nodes, BGR; NaN where
             it shows nothing.
         images: names of the views, by number.
         cameras: their cameras.
     """
-    even = solve_patterns(samples, nodes, images, cameras)
-    return replace(even, white=_white(samples, even, images, cameras))
+    even = _solve_parts(parts, nodes, images, cameras, _GAIN_SIGMA, 0.0)
+    return replace(even, white=_white(parts, even, images, cameras))
 
 
 def solve_patterns(
@@ -257,35 +297,43 @@ def solve_patterns(
         gain_sigma: expected size of the logarithm of a picture's own light.
         unsure: (N, 3) factors of the samples' errors over the usual; None for 1.
     """
-    names = sorted(set(cameras))
-    camera_of = np.array([names.index(camera) for camera in cameras])
     middle = 0.0
     if samples.ranges is not None and len(samples.views):
         middle = float(np.median(samples.ranges))
-    equations = _equations(samples, camera_of, len(names))
+    parts = in_one_part(replace(samples, unsure=unsure))
+    return _solve_parts(parts, nodes, images, cameras, gain_sigma, middle)
+
+
+def _solve_parts(
+    parts: SampleParts,
+    nodes: Array,
+    images: Sequence[str],
+    cameras: Sequence[str],
+    gain_sigma: float,
+    middle: float,
+) -> LightModel:
+    """As `solve_patterns`, of samples in parts with a middle range."""
+    names = sorted(set(cameras))
+    number = {name: n for n, name in enumerate(names)}
+    camera_of = np.array([number[camera] for camera in cameras])
     bends = _prior(len(names), FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
     pull, pulled = _typical(nodes, camera_of, len(names))
     brightness, known_gain = _brightness(nodes, camera_of, len(names))
-    levels = samples.levels.astype(np.float64)
-    misfit = np.full((len(levels), 3), _MISFIT) * (1.0 if unsure is None else unsure)
-    found = [
-        solve_robustly(
-            equations,
-            levels[:, 0, channel] - levels[:, 1, channel],
-            LightPrior(
-                patterns=bends + np.diag(pull[:, channel]),
-                right=pulled[:, channel],
-                gain=gain_sigma**-2 + known_gain / _SCENE_SIGMA**2,
-                gain_right=brightness[:, channel] / _SCENE_SIGMA**2,
-            ),
-            np.ascontiguousarray(misfit[:, channel]),
-            SAMPLES_PER_FACT,
-            _ROUNDS,
+    priors = [
+        LightPrior(
+            patterns=bends + np.diag(pull[:, channel]),
+            right=pulled[:, channel],
+            gain=gain_sigma**-2 + known_gain / _SCENE_SIGMA**2,
+            gain_right=brightness[:, channel] / _SCENE_SIGMA**2,
         )
         for channel in range(3)
     ]
-    solution = np.stack([x for x, _, _ in found], axis=1)
-    gains = np.stack([gain for _, gain, _ in found], axis=1)
+    views = [np.arange(len(cameras))] if parts.is_one else list(parts.map(_views_of))
+    linear: LinearParts = Parts(
+        items=[(item, own, camera_of[own]) for item, own in zip(parts.items, views, strict=True)],
+        load=partial(_linear, parts.load, len(names)), label=parts.label, executor=parts.executor,
+    )  # fmt: skip
+    solution, gains, variance = solve_robustly(linear, views, priors)
     patterns = solution[:-1].reshape(len(names), *GRID, 3)
     patterns = patterns - patterns.mean(axis=(0, 1, 2))
     gains = gains - gains.mean(axis=0)
@@ -294,29 +342,45 @@ def solve_patterns(
         gains=dict(zip(images, gains, strict=True)),
         white=np.ones(3),
         fall_off=solution[-1],
-        fall_off_sigma=np.sqrt([variance for _, _, variance in found]),
+        fall_off_sigma=np.sqrt(variance),
         middle_range=middle,
     )
 
 
-def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> LightEquations:
+def _views_of(samples: LightSamples, _: None) -> NDArray[np.int64]:
+    found: NDArray[np.int64] = np.unique(samples.views).astype(np.int64)
+    return found
+
+
+def _linear(
+    load: Callable[[Any], LightSamples],
+    cameras: int,
+    part: tuple[Any, NDArray[np.int64], NDArray[np.int64]],
+) -> LightEquations:
+    """The equations of a part, which count in its own views (v,) of cameras (v,)."""
+    item, own, camera_of = part
+    samples = load(item)
     size = GRID[0] * GRID[1]
-    views = samples.views.astype(np.int64)
+    views = np.searchsorted(own, samples.views)
     sides = [node_weights(samples.places[:, side]) for side in range(2)]
     number = [nodes + size * camera_of[views[:, n]][:, None] for n, (nodes, _) in enumerate(sides)]
     farther = np.zeros(len(views))
     if samples.ranges is not None:
         farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
-    pairs, pair = np.unique(np.sort(views, axis=1), axis=0, return_inverse=True)
+    keys, pair = np.unique(
+        views.min(axis=1) * len(own) + views.max(axis=1), return_inverse=True
+    )  # several times as quick as by rows
+    levels = samples.levels.astype(np.float64)
+    unsure = 1.0 if samples.unsure is None else samples.unsure
     return LightEquations(
         nodes=np.ascontiguousarray(np.concatenate(number, axis=1)),
         weights=np.ascontiguousarray(np.concatenate([sides[0][1], -sides[1][1]], axis=1)),
         farther=farther,
         views=views,
         pair=pair.ravel().astype(np.int64),
-        pairs=pairs.reshape(-1, 2),
-        patterns=size * cameras,
-        pictures=len(camera_of),
+        pairs=np.column_stack(np.divmod(keys, len(own))),
+        target=levels[:, 0] - levels[:, 1],
+        misfit=np.full((len(levels), 3), _MISFIT) * unsure,
     )
 
 
@@ -424,21 +488,69 @@ def at_nodes(low: NDArray[np.float32]) -> Array:
 
 
 def _white(
-    samples: LightSamples, light: LightModel, images: Sequence[str], cameras: Sequence[str]
+    parts: SampleParts, light: LightModel, images: Sequence[str], cameras: Sequence[str]
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out."""
-    if not len(samples.views):
+    views = list(parts.map(_first_views_of))
+
+    def lit() -> Iterable[_LitViews]:
+        for own in views:
+            factors = [light.factors(cameras[n], images[n]).reshape(-1, 3) for n in own]
+            yield _LitViews(views=own, factors=np.array(factors).reshape(-1, GRID[0] * GRID[1], 3))
+
+    sums, counts = zip(*parts.map(_norm_sums, lit()), strict=True)
+    if not sum(counts):
         return np.ones(3)
-    first = samples.views[:, 0]
-    nodes, weights = node_weights(samples.places[:, 0])
-    level = np.empty((len(first), 3))
-    for number in np.unique(first):
-        mine = first == number
-        factors = light.factors(cameras[number], images[number]).reshape(-1, 3)
-        lift = (factors[nodes[mine]] * weights[mine][..., None]).sum(axis=1)
-        level[mine] = np.exp(samples.levels[mine, 0]) * lift
-    neutral = neutral_factors(level)
-    return neutral * brightening(level * neutral, _WHITE_LEVEL, _GREY_LEVEL)
+    neutral = _neutral(np.sum(sums, axis=0) / sum(counts))
+
+    def wanted(bins: NDArray[np.int64]) -> Iterable[Array]:
+        return parts.map(_grey_in, ((one, neutral, bins) for one in lit()))
+
+    counted = parts.map(_grey_histogram, ((one, neutral) for one in lit()))
+    bright, middle = percentiles([BRIGHT_PERCENT, 50.0], counted, wanted)
+    return neutral * min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _LitViews:
+    """Factors that even the light of some views."""
+
+    views: NDArray[np.int64]
+    """(v,) ascending."""
+    factors: NDArray[np.float32]
+    """(v, nodes, 3)."""
+
+    def levels(self, samples: LightSamples) -> Array:
+        """(N, 3) even light of the first views of samples, all of which are here."""
+        nodes, weights = node_weights(samples.places[:, 0])
+        first = np.searchsorted(self.views, samples.views[:, 0])
+        lift = (self.factors[first[:, None], nodes] * weights[..., None]).sum(axis=1)
+        level: Array = np.exp(samples.levels[:, 0]) * lift
+        return level
+
+
+def _first_views_of(samples: LightSamples, _: None) -> NDArray[np.int64]:
+    found: NDArray[np.int64] = np.unique(samples.views[:, 0]).astype(np.int64)
+    return found
+
+
+def _norm_sums(samples: LightSamples, lit: _LitViews) -> tuple[Array, int]:
+    level = lit.levels(samples)
+    return (level**_NORM).sum(axis=0), len(level)
+
+
+def _grey(samples: LightSamples, lit: _LitViews, neutral: Array) -> Array:
+    found: Array = (lit.levels(samples) * neutral).mean(axis=1)
+    return found
+
+
+def _grey_histogram(samples: LightSamples, value: tuple[_LitViews, Array]) -> Histogram:
+    return Histogram.of(_grey(samples, *value))
+
+
+def _grey_in(samples: LightSamples, value: tuple[_LitViews, Array, NDArray[np.int64]]) -> Array:
+    lit, neutral, bins = value
+    return values_in(_grey(samples, lit, neutral), bins)
 
 
 def neutral_factors(level: Array) -> Array:
@@ -447,7 +559,12 @@ def neutral_factors(level: Array) -> Array:
     The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
     purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
     """
-    cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
+    return _neutral((level**_NORM).mean(axis=0))
+
+
+def _neutral(power: Array) -> Array:
+    """Factors (3,) that make the means (3,) of levels to the power of the norm equal."""
+    cast = power ** (1.0 / _NORM)
     neutral: Array = cast.mean() / cast
     return neutral
 
@@ -489,48 +606,108 @@ def read_light(path: Path) -> LightModel:
 
 
 def solve_robustly(
-    equations: LightEquations,
-    target: Array,
-    prior: LightPrior,
-    misfit: Array,
-    per_fact: float,
-    rounds: int,
-) -> tuple[Array, Array, float]:
-    """Nodes and fall-off (P + 1,), gains (V,), and the variance of the fall-off.
+    parts: LinearParts, views: Sequence[NDArray[np.int64]], priors: Sequence[LightPrior]
+) -> tuple[Array, Array, Array]:
+    """Nodes and fall-off (P + 1, 3), gains (V, 3), and the variance of the fall-off (3,).
 
     Errors above `misfit` count by their size instead of its square (Huber's weights are 1 below and
     fall as its inverse above).
 
     Args:
-        equations: of the samples.
-        target: (N,) differences of logarithms.
-        prior: what holds without them.
-        misfit: (N,) where an error becomes large; also the expected size of one.
-        per_fact: samples that together count as much as one independent one.
-        rounds: of reweighting.
+        parts: equations of the samples.
+        views: (v,) of each part.
+        priors: of every channel: what holds without samples.
     """
-    e = equations
-    x, gains, variance = np.zeros(e.patterns + 1), np.zeros(e.pictures), np.inf
-    for _ in range(rounds):
-        dense, mixed, own, shared, right, right_gains = normal_equations(
-            e.nodes, e.weights, e.farther, e.views, e.pair, len(e.pairs), target, x, gains,
-            misfit, per_fact,
+    unknowns, pictures = len(priors[0].right), len(priors[0].gain)
+    x, gains = np.zeros((unknowns, 3)), np.zeros((pictures, 3))
+    variance = np.full(3, np.inf)
+    for _ in range(_ROUNDS):
+        sums = _LightSums.zero(unknowns, pictures)
+        steps = ((x, gains[own]) for own in views)
+        for own, part in zip(views, parts.map(_sums_of_part, steps), strict=True):
+            sums.add(own, part)
+        for channel, prior in enumerate(priors):
+            x[:, channel], gains[:, channel], variance[channel] = sums.solve(channel, prior)
+    return x, gains, variance
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _LightSums:
+    """Normal equations of the three channels; see `normal_equations`."""
+
+    dense: Array
+    """(3, P + 1, P + 1)."""
+    mixed: Array
+    """(3, P + 1, V)."""
+    own: Array
+    """(3, V)."""
+    right: Array
+    """(3, P + 1)."""
+    right_gains: Array
+    """(3, V)."""
+    pairs: list[NDArray[np.int64]]
+    """(M, 2) of views, part by part."""
+    shared: list[Array]
+    """(3, M) of them."""
+
+    @classmethod
+    def zero(cls, unknowns: int, pictures: int) -> "_LightSums":
+        return cls(
+            dense=np.zeros((3, unknowns, unknowns)), mixed=np.zeros((3, unknowns, pictures)),
+            own=np.zeros((3, pictures)), right=np.zeros((3, unknowns)),
+            right_gains=np.zeros((3, pictures)), pairs=[], shared=[],
         )  # fmt: skip
-        dense = dense + np.triu(dense, 1).T + prior.patterns
-        right, right_gains = right + prior.right, right_gains + prior.gain_right
-        block = _gains_block(e, own + prior.gain, shared)
-        wanted = np.column_stack([mixed.T, right_gains])
-        if e.pictures <= _DENSE_PICTURES:
+
+    def add(self, views: NDArray[np.int64], part: "_LightSums") -> None:
+        """Add, in place, those of a part with views (v,) of its own."""
+        self.dense[:] += part.dense
+        self.mixed[:, :, views] += part.mixed
+        self.own[:, views] += part.own
+        self.right[:] += part.right
+        self.right_gains[:, views] += part.right_gains
+        self.pairs.extend(views[pairs] for pairs in part.pairs)
+        self.shared.extend(part.shared)
+
+    def solve(self, channel: int, prior: LightPrior) -> tuple[Array, Array, float]:
+        """Nodes and fall-off (P + 1,), gains (V,), and the variance of the fall-off."""
+        mixed, pictures = self.mixed[channel], self.own.shape[1]
+        dense = self.dense[channel] + np.triu(self.dense[channel], 1).T + prior.patterns
+        right = self.right[channel] + prior.right
+        block = _gains_block(
+            self.own[channel] + prior.gain, np.concatenate(self.pairs),
+            np.concatenate([shared[channel] for shared in self.shared]),
+        )  # fmt: skip
+        wanted = np.column_stack([mixed.T, self.right_gains[channel] + prior.gain_right])
+        if pictures <= _DENSE_PICTURES:
             solved = solve_symmetric(block.toarray(), wanted)
         else:
             solved = splu(block).solve(wanted)
         taken = _product(mixed, np.ascontiguousarray(solved))
-        last = np.zeros(e.patterns + 1)
+        last = np.zeros(len(right))
         last[-1] = 1.0
         both = solve_symmetric(dense - taken[:, :-1], np.column_stack([right - taken[:, -1], last]))
         x, variance = both[:, 0], float(both[-1, 1])
-        gains = solved[:, -1] - (solved[:, :-1] * x).sum(axis=1)
-    return x, gains, variance
+        return x, solved[:, -1] - (solved[:, :-1] * x).sum(axis=1), variance
+
+
+def _sums_of_part(e: LightEquations, solution: tuple[Array, Array]) -> _LightSums:
+    x, gains = solution
+    channels = [
+        normal_equations(
+            e.nodes, e.weights, e.farther, e.views, e.pair, len(e.pairs),
+            np.ascontiguousarray(e.target[:, channel]), np.ascontiguousarray(x[:, channel]),
+            np.ascontiguousarray(gains[:, channel]), np.ascontiguousarray(e.misfit[:, channel]),
+            SAMPLES_PER_FACT,
+        )
+        for channel in range(3)
+    ]  # fmt: skip
+    dense, mixed, own, shared, right, right_gains = (
+        np.stack(values) for values in zip(*channels, strict=True)
+    )
+    return _LightSums(
+        dense=dense, mixed=mixed, own=own, right=right, right_gains=right_gains, pairs=[e.pairs],
+        shared=[shared],
+    )  # fmt: skip
 
 
 # numpy's products and solvers start threads that wait for each other: on a busy machine these small
@@ -576,12 +753,12 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     return found
 
 
-def _gains_block(e: LightEquations, own: Array, shared: Array) -> csc_array:
-    a, b = e.pairs[:, 0], e.pairs[:, 1]
-    every = np.arange(e.pictures)
+def _gains_block(own: Array, pairs: NDArray[np.int64], shared: Array) -> csc_array:
+    a, b = pairs.T
+    every = np.arange(len(own))
     values = np.concatenate([own, -shared, -shared])
     rows, columns = np.concatenate([every, a, b]), np.concatenate([every, b, a])
-    return csc_array((values, (rows, columns)), shape=(e.pictures, e.pictures))
+    return csc_array((values, (rows, columns)), shape=(len(own), len(own)))
 
 
 @compiled

@@ -55,7 +55,8 @@ _SAMPLE = 30_000
 _ROUNDS = 12
 _LARGEST = 1500
 """Features of each picture that are described."""
-_BLOCK = 512
+_BLOCK, _AT_A_TIME = 512, 4096
+"""Pictures whose partners are sought at a time, and those they are compared with: 0.3 GiB."""
 
 
 def choose_pairs(
@@ -380,24 +381,60 @@ def alike_pairs(
     if len(features) < 2 or not len(wanted):
         return []
     words = make_codebook(features, seed)
+    file = features[0].parent / "looks.npy"
+    looks = np.lib.format.open_memmap(
+        file, mode="w+", dtype=np.float32, shape=(len(features), words.size)
+    )
     rows = executor.map(partial(describe, words=words), features, label="looks of pictures")
-    looks = np.stack(list(rows))
-    looks = looks - looks.mean(axis=0)
-    looks = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+    for number, row in enumerate(rows):
+        looks[number] = row
+    find = partial(most_alike, file, looks.mean(axis=0), min(partners, len(features) - 1))
+    looks.flush()
+    blocks = [np.asarray(wanted[n : n + _BLOCK]) for n in range(0, len(wanted), _BLOCK)]
+    found = executor.map(find, blocks, label="pictures that look alike")
     pairs: set[Pair] = set()
-    chosen = np.asarray(wanted)
-    for start in range(0, len(chosen), _BLOCK):
-        some = chosen[start : start + _BLOCK]
-        likeness = looks[some] @ looks.T
-        likeness[np.arange(len(some)), some] = -np.inf
-        count = min(partners, len(features) - 1)
-        best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
+    for some, best in zip(blocks, found, strict=True):
         pairs |= {
             (min(int(i), int(j)), max(int(i), int(j)))
             for i, row in zip(some, best, strict=True)
             for j in row
         }
+    file.unlink()
     return sorted(pairs)
+
+
+def most_alike(
+    file: Path, mean: NDArray[np.float32], count: int, some: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The pictures (n, count) that look most like some pictures (n,), best first.
+
+    Args:
+        file: vectors of all pictures; a part of them is in memory at a time.
+        mean: of all.
+        count: how many for each.
+        some: the pictures.
+    """
+    looks = np.load(file, mmap_mode="r")
+    own = _directions(looks[some], mean)
+    best, likeness = np.empty((len(some), 0), np.int64), np.empty((len(some), 0), np.float32)
+    for start in range(0, len(looks), _AT_A_TIME):
+        others = np.arange(start, min(start + _AT_A_TIME, len(looks)))
+        like = own @ _directions(looks[others], mean).T
+        like[some[:, None] == others] = -np.inf
+        every = np.concatenate([best, np.broadcast_to(others, like.shape)], axis=1)
+        likeness = np.concatenate([likeness, like], axis=1)
+        order = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
+        best = np.take_along_axis(every, order, axis=1)
+        likeness = np.take_along_axis(likeness, order, axis=1)
+    return best
+
+
+def _directions(looks: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:
+    looks = looks - mean
+    found: NDArray[np.float32] = looks / np.maximum(
+        np.linalg.norm(looks, axis=1, keepdims=True), 1e-9
+    ).astype(np.float32)
+    return found
 
 
 def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:

@@ -5,6 +5,7 @@ so that a new scale or georeference does not repeat the mapping.
 """
 
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,7 @@ from alice_survey.base.records import (
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, mounted, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
+from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
@@ -90,7 +92,12 @@ def run_sparse(
     rig = inputs.rig
     if rig is not None and not reconstruct.refine_port:  # that finds the index from far off
         rig = knowing_water(rig, index_sigma)
-    adjusted = adjust_survey(known, inputs.records, rig, mapping.distances, reconstruct)
+    with executor.started() as started:
+        workers = Workers(executor=started, folder=folder / "parts")
+        adjusted = adjust_survey(
+            known, inputs.records, rig, mapping.distances, reconstruct, workers=workers
+        )
+    shutil.rmtree(folder / "parts", ignore_errors=True)
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()
         for image in adjusted.mapped.model.images.values()

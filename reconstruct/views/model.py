@@ -173,7 +173,7 @@ def read_model(sparse: str | Path) -> SparseModel:
 
 
 def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
-    from reconstruct.views.model_files import as_transform
+    from reconstruct.views.model_files import as_transform, keypoints_of
 
     warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
     # Without lengths in metres a port's shift is not known.
@@ -197,18 +197,17 @@ def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
                 shift=shifts[record.camera],
             )
         )
-    view_of = {image.image_id: index for index, image in enumerate(images)}
-    ids = sorted(model.points3D)
-    rows = [
-        (index, view_of[element.image_id])
-        for index, point_id in enumerate(ids)
-        for element in model.points3D[point_id].track.elements
-    ]
+    ids = np.array(sorted(model.points3D), dtype=np.int64)
+    keypoints = keypoints_of(model)
+    seen = [kept[kept >= 0] for kept in (keypoints[i.image_id]["point"] for i in images)]
+    points = np.searchsorted(ids, np.concatenate([ids[:0], *seen]))
+    numbers = np.repeat(np.arange(len(seen)), [len(one) for one in seen])
+    order = np.lexsort((numbers, points))
     return SparseModel(
         frame=frame,
         views=tuple(views),
-        points_world=np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3),
-        observations=np.array(rows, dtype=np.int64).reshape(-1, 2),
+        points_world=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
+        observations=np.column_stack([points[order], numbers[order]]),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
@@ -17,7 +18,14 @@ from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations, survey_fit
 from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
-from reconstruct.adjustment.exact_observations import start_state
+from reconstruct.adjustment.exact_observations import (
+    Pixels,
+    RigState,
+    choose_pixels,
+    start_state,
+)
+from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
+from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
 from reconstruct.mapping.arrays import frames_of, observed
 from reconstruct.mapping.database import Observations
@@ -25,6 +33,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
 from tests.cameras import changed
+from tests.engines import PicklingThreads
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
@@ -203,25 +212,80 @@ def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
     wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
     mapped, seen = modelled(scene, wrong, tmp_path)
     whole = fit_survey(mapped, seen, wrong, port=False, pose=True)
-    monkeypatch.setattr(exact_observations, "PART", whole.observations // 7)
+    monkeypatch.setattr(exact_observations, "PART", -(-whole.observations // 7))
     parts = fit_survey(mapped, seen, wrong, port=False, pose=True)
     assert whole.calibration is not None and parts.calibration is not None
     assert whole.observations == parts.observations
+    away, same = KDTree(whole.calibration.places).query(parts.calibration.places)
+    assert away.max() < 1e-6
     for found, wanted in (
         (parts.after, whole.after),
         (parts.covariance, whole.covariance),
         (parts.state.points, whole.state.points),
-        (parts.calibration.points, whole.calibration.points),
+        (parts.calibration.points, whole.calibration.points[same]),
     ):
         np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
+    for workers in (1, 2, 3):
+        with PicklingThreads(workers) as engine:
+            folder = tmp_path / f"{workers}"
+            again = fit_survey(
+                mapped, seen, wrong, port=False, pose=True,
+                workers=Workers(executor=engine.executor, folder=folder),
+            )  # fmt: skip
+        assert engine.tasks > 3 * 7
+        assert len(list(folder.iterdir())) == 7
+        assert again.calibration is not None
+        np.testing.assert_array_equal(again.after, parts.after)
+        np.testing.assert_array_equal(again.state.points, parts.state.points)
+        np.testing.assert_array_equal(again.calibration.points, parts.calibration.points)
     monkeypatch.setattr(survey_fit, "_MOST_PLACES", len(whole.point_ids) // 3)
     some = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
     assert some is not None
     assert 0.2 < len(some.places) / len(whole.point_ids) < 0.35
     every = round(len(whole.point_ids) / len(some.places))
-    wanted = whole.calibration.points[::every]
-    np.testing.assert_allclose(some.points, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
-    np.testing.assert_allclose(some.places, whole.state.points[::every], rtol=1e-9)
+    np.testing.assert_array_equal(some.points, parts.calibration.points[::every])
+    np.testing.assert_array_equal(some.places, parts.calibration.places[::every])
+
+
+def test_parts_say_of_stations_and_points_what_all_observations_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = noisy(4)
+    mapped, seen = modelled(scene, scene.rig, tmp_path)
+    names, frames = list(seen.cameras), frames_of(mapped.model)
+    pixels, ids = choose_pixels(mapped, seen, names, frames)
+    state = start_state(mapped, scene.rig, names, frames, ids)
+    fields = ("right.rx_rad", "right.x_m", "left.fx_px")
+    monkeypatch.setattr(exact_observations, "PART", -(-len(pixels.station) // 5))
+    near, order = pixels.by_place(state.centres)
+    moved = replace(state, points=state.points[order])
+
+    def equations(pixels: Pixels, state: RigState) -> PointEquations:
+        parts = PixelParts(pixels, len(state.centres))
+        linear = Linearised(pixels=parts, state=state, fields=fields, noise=(0.3, 0.09))
+        return reduce_parts(linear, parts.pattern)
+
+    parts = equations(near, moved)
+    assert len(parts.parts.stations) == 5
+    assert min(len(own) for own in parts.parts.stations) < len(state.centres)
+    monkeypatch.setattr(exact_observations, "PART", 10**9)
+    whole = equations(pixels, state)
+
+    np.testing.assert_array_equal(parts.pointers, whole.pointers)
+    np.testing.assert_array_equal(parts.columns, whole.columns)
+    rng = np.random.default_rng(0)
+    poses, rest = rng.normal(0, 1e-3, (len(state.centres), 6)), rng.normal(0, 1e-4, 4)
+    covariances = np.tile(1e-6 * np.eye(6), (len(whole.columns), 1, 1))
+    for found, wanted in (
+        (parts.blocks, whole.blocks),
+        (parts.border, whole.border),
+        (parts.shared, whole.shared),
+        (parts.point_inverse, whole.point_inverse[order]),
+        (parts.follow(poses, rest), whole.follow(poses, rest)[order]),
+        (parts.point_covariances(covariances), whole.point_covariances(covariances)[order]),
+    ):
+        size = np.abs(wanted).max(axis=0)
+        np.testing.assert_allclose(found / size, wanted / size, rtol=1e-9, atol=1e-9)
 
 
 def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path) -> None:

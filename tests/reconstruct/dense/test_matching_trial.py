@@ -34,8 +34,8 @@ def survey(tmp_path_factory: pytest.TempPathFactory):
 def conditions(workspace: Path, model, folder: Path) -> tuple[float, float]:
     """Scale, and the standard deviation of a match."""
     partners, points = choose_partners(model, 3), points_of_views(model)
-    scale = find_scale(workspace, model.views, partners, points, SERIAL)
-    return scale, find_match_sigma(matched(workspace, model, scale, folder), [0, 1], SERIAL)
+    scale = find_scale(workspace, model.views, partners, points.__getitem__, SERIAL)
+    return scale, find_match_sigma(matched(workspace, model, scale, folder)[:2], SERIAL)
 
 
 def matched(workspace: Path, model, scale: float, folder: Path) -> list[tuple[ViewTask, Array]]:
@@ -63,7 +63,7 @@ def test_views_in_which_partners_were_compared_get_the_depth_of_any_other(survey
     depths = []
     for chosen in ([0], []):
         found = matched(workspace, model, 1.0, tmp_path / f"store{len(chosen)}")
-        find_match_sigma(found, chosen, SERIAL)
+        find_match_sigma([found[n] for n in chosen], SERIAL)
         store = found[0][0].store
         assert store.has(0, "apart") == bool(chosen)
         view_depth(0.25, found[0])

@@ -6,11 +6,11 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError
 from reconstruct.dense.stereo_pairs import (
+    PointsInSight,
     choose_partners,
     depths_per_pair,
     in_frame,
     neighbours,
-    points_in_sight,
 )
 from reconstruct.views.model import points_of_views
 from tests.oracles_dense import ALTITUDE_M, Scene, flat, position_code, sparse_model, stereo_views
@@ -70,7 +70,9 @@ def test_pictures_without_overlap_are_refused():
 def test_points_in_sight_are_all_that_lie_in_the_frame_and_near():
     model = sparse_model(line(), SCENE, points=900)
     own = points_of_views(model)
-    for view, points, seen in zip(model.views, points_in_sight(model), own, strict=True):
+    sight = PointsInSight(model)
+    for number, (view, seen) in enumerate(zip(model.views, own, strict=True)):
+        points = sight.of(number)
         centre = view.world_from_cam.translation
         away = np.linalg.norm(model.points_world - centre, axis=1)
         reach = 1.2 * np.linalg.norm(seen - centre, axis=1).max()

@@ -1,14 +1,20 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import WorkspaceError
+from reconstruct.light.parts import Histogram, Parts, percentiles, values_in
 from reconstruct.light.solve import (
     GRID,
     LightSamples,
+    as_rows,
     at_nodes,
     at_places,
     compare_light,
+    from_rows,
+    in_one_part,
     joined_samples,
     low_pass,
     read_light,
@@ -16,6 +22,7 @@ from reconstruct.light.solve import (
     solve_patterns,
     write_light,
 )
+from tests.engines import PicklingThreads
 
 IMAGES = [f"left/{n}.png" for n in range(9)]
 UNKNOWN = np.full((len(IMAGES), *GRID, 3), np.nan)
@@ -69,7 +76,7 @@ def misfit(found: np.ndarray) -> float:
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 def test_overlaps_alone_separate_the_lamp_from_the_sea_floor(outliers: float):
     gains, found = samples(outliers=outliers)
-    light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
     for channel in range(3):
         assert 1e-4 < misfit(light.patterns["left"][..., channel]) < 0.03
     assert misfit(np.zeros(GRID)) > 0.1
@@ -80,8 +87,12 @@ def test_the_median_picture_gives_what_a_single_line_cannot():
     _, found = samples(lines=1)
     rng = np.random.default_rng(9)
     shown = pattern(NODES_X, NODES_Y)[None, ..., None] + rng.normal(4.2, 0.1, (9, *GRID, 3))
-    alone = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES)).patterns["left"][..., 1]
-    helped = solve_light(found, shown, IMAGES, ["left"] * len(IMAGES)).patterns["left"][..., 1]
+    alone = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES)).patterns[
+        "left"
+    ][..., 1]
+    helped = solve_light(in_one_part(found), shown, IMAGES, ["left"] * len(IMAGES)).patterns[
+        "left"
+    ][..., 1]
     assert misfit(alone) > 0.06
     assert misfit(helped) < 0.04
 
@@ -123,7 +134,7 @@ def test_a_long_line_does_not_drift_from_bright_to_dark():
 
 def test_corrected_views_of_a_spot_agree_better_than_raw_ones():
     _, found = samples()
-    light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
     raw, even = [], []
     for (a, b), places, levels in zip(found.views, found.places, found.levels, strict=True):
         lift = [
@@ -143,14 +154,14 @@ def test_even_light_is_left_as_it_is_but_for_the_common_white():
     views = rng.integers(0, 9, (900, 2)).astype(np.int32)
     cameras = ["left", "right", "left"] * 3
     same = LightSamples(views=views, places=places, levels=np.stack([ground, ground], axis=1))
-    light = solve_light(same, UNKNOWN, IMAGES, cameras)
+    light = solve_light(in_one_part(same), UNKNOWN, IMAGES, cameras)
     for image, camera in zip(IMAGES, cameras, strict=True):
         factors = light.factors(camera, image)
         np.testing.assert_allclose(factors, np.broadcast_to(light.white, factors.shape), rtol=1e-5)
 
 
 def test_without_overlap_nothing_is_changed():
-    light = solve_light(joined_samples([]), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = solve_light(in_one_part(joined_samples([])), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
     np.testing.assert_allclose(light.factors("left", IMAGES[0]), 1.0)
 
 
@@ -181,7 +192,7 @@ def test_dark_and_burnt_spots_are_left_out():
 
 def test_light_file_round_trip(tmp_path):
     _, found = samples()
-    light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
     write_light(tmp_path / "light.json", light)
     again = read_light(tmp_path / "light.json")
     np.testing.assert_allclose(again.patterns["left"], light.patterns["left"], atol=1e-5)
@@ -202,3 +213,53 @@ def test_a_light_file_that_lacks_a_value_names_itself(tmp_path):
     write_json(tmp_path / "light.json", {"patterns": {}, "gains": {}})
     with pytest.raises(WorkspaceError, match=r"light\.json"):
         read_light(tmp_path / "light.json")
+
+
+def read_rows(path: Path) -> LightSamples:
+    return from_rows(np.load(path))
+
+
+def test_samples_in_files_give_the_light_of_all_at_once(tmp_path):
+    """In parts, each with views of its own, whoever works on them."""
+    _, found = samples(outliers=0.1)
+    cameras = ["left", "right", "left"] * 3
+    shown = pattern(NODES_X, NODES_Y)[None, ..., None] + np.full((9, *GRID, 3), 4.2)
+    at_once = solve_light(in_one_part(found), shown, IMAGES, cameras)
+    order = np.argsort(found.views[:, 0], kind="stable")
+    files = []
+    for number, chosen in enumerate(np.array_split(order, 4)):
+        part = LightSamples(
+            views=found.views[chosen], places=found.places[chosen], levels=found.levels[chosen]
+        )
+        files.append(tmp_path / f"{number}.npy")
+        np.save(files[-1], as_rows(part))
+    by_parts = [
+        solve_light(
+            Parts(items=files, load=read_rows, label="light", executor=engine.executor),
+            shown, IMAGES, cameras,
+        )
+        for workers in (1, 2, 3)
+        for engine in [PicklingThreads(workers)]
+    ]  # fmt: skip
+    for light in by_parts:
+        for camera in ("left", "right"):
+            np.testing.assert_allclose(
+                light.patterns[camera], at_once.patterns[camera], rtol=1e-9, atol=1e-10
+            )
+            np.testing.assert_array_equal(light.patterns[camera], by_parts[0].patterns[camera])
+        for image in IMAGES:
+            np.testing.assert_allclose(light.gains[image], at_once.gains[image], atol=1e-9)
+        np.testing.assert_allclose(light.white, at_once.white, rtol=1e-9)
+        np.testing.assert_array_equal(light.white, by_parts[0].white)
+
+
+@pytest.mark.parametrize("count", [1, 2, 999, 4000])
+def test_percentiles_of_parts_are_those_of_all(count: int):
+    values = np.random.default_rng(count).lognormal(0.0, 2.0, count)
+    parts = np.array_split(values, 3)
+    found = percentiles(
+        [0.0, 50.0, 98.0, 100.0],
+        [Histogram.of(part) for part in parts],
+        lambda bins: [values_in(part, bins) for part in parts],
+    )
+    np.testing.assert_allclose(found, np.percentile(values, [0.0, 50.0, 98.0, 100.0]), rtol=1e-12)

@@ -1,0 +1,141 @@
+"""What the serial parts of a reconstruction cost by the number of pictures: up to 100,000 of them.
+
+    python -m benchmarks.scale --work FOLDER [--pictures 1000 5000 10000] [--only STEP ...]
+        [--threads 1] [--quick] [--json FILE]
+
+A calibrated stereo rig flies a lawnmower pattern over a rough plane; tracks, footprints and samples
+of light are made from the truth, and no picture is rendered (`benchmarks.scale_steps`). Every step
+runs in a process of its own, on what the steps before it left in FOLDER; one that is done for a
+number of pictures is not run again. A row has seconds of computing and the peak of memory by
+pictures, then the exponent of growth between the two largest surveys, and what that makes of
+100,000 pictures.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
+from benchmarks.machine import heading, machine
+from benchmarks.scale_steps import MAKE, STEPS
+
+_MANY = 100_000
+_MOST_GIB = 8.0
+"""At that many pictures."""
+_MOST_EXPONENT = 1.25
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepCost:
+    """What a step took."""
+
+    step: str
+    pictures: int
+    cpu_s: float
+    """Of the process and its workers."""
+    peak_gib: float
+    """Of the process, or of the largest of its workers."""
+    amount: int
+    """How many of what it works on: observations, pairs, samples."""
+
+
+def measure(step: str, pictures: int, work: Path, threads: int) -> StepCost | None:
+    """Run a step, unless its file is there; None where it failed."""
+    file = work / f"{pictures}" / f"{step}.json"
+    if not file.is_file():
+        command = [sys.executable, "-m", "benchmarks.scale_steps", step, str(pictures)]
+        # threads of libraries that wait for each other count as computing on a busy machine
+        alone = {**os.environ, **dict.fromkeys(_THREADS, "1")}
+        ran = subprocess.run([*command, str(work), str(threads)], check=False, env=alone)
+        if ran.returncode:
+            return None
+    return StepCost(step=step, pictures=pictures, **json.loads(file.read_text()))
+
+
+def growth(first: float, last: float, times: float) -> float:
+    """Exponent of growth, from values of two surveys of which one is so many times as large."""
+    return float(np.log(last / first) / np.log(times)) if first > 0 and last > 0 else np.nan
+
+
+def figures_of(rows: Sequence[StepCost], *, judged: bool) -> list[Figure]:
+    """Figures of one step, by rising number of pictures; small surveys are not judged."""
+    name = rows[0].step
+    found = [
+        figure
+        for row in rows
+        for figure in (
+            Figure(name=f"{name}: {row.pictures} pictures, time", value=row.cpu_s, unit="s"),
+            Figure(name=f"{name}: {row.pictures} pictures, peak", value=row.peak_gib, unit="GiB"),
+        )
+    ]
+    if len(rows) == 1:
+        return found
+    first, last = rows[-2:]
+    times, left = last.pictures / first.pictures, _MANY / last.pictures
+    power = growth(first.cpu_s, last.cpu_s, times)
+    slope = (last.peak_gib - first.peak_gib) / (last.pictures - first.pictures)
+    peak = last.peak_gib + max(slope, 0.0) * (_MANY - last.pictures)
+    print(f"{'':14}exponent {power:.2f}; at {_MANY} pictures {last.cpu_s * left**power:.0f} s, "
+          f"{peak:.1f} GiB", flush=True)  # fmt: skip
+    return [
+        *found,
+        Figure(name=f"{name}: exponent", value=power, unit="",
+               goal=Goal(most=_MOST_EXPONENT) if judged else None),
+        Figure(name=f"{name}: peak at {_MANY} pictures", value=peak, unit="GiB",
+               goal=Goal(most=_MOST_GIB) if judged else None),
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    options = _options()
+    about = machine(("numpy", "scipy"))
+    print(
+        f"{heading(about)}\n\n{'step':<14}{'pictures':>9}{'of':>12}{'s':>10}{'GiB':>7}", flush=True
+    )
+    options.work.mkdir(parents=True, exist_ok=True)
+    rows: dict[str, list[StepCost]] = {}
+    failed = []
+    for step in [s for s in STEPS if s == MAKE or not options.only or s in options.only]:
+        for pictures in sorted(options.pictures):
+            spent = measure(step, pictures, options.work, options.threads)
+            if spent is None:
+                failed.append(f"{step} of {pictures} pictures")
+                continue
+            rows.setdefault(step, []).append(spent)
+            print(f"{step:<14}{pictures:>9}{spent.amount:>12}{spent.cpu_s:>10.2f}"
+                  f"{spent.peak_gib:>7.2f}", flush=True)  # fmt: skip
+    figures = [
+        figure
+        for step, row in rows.items()
+        if step != MAKE
+        for figure in figures_of(row, judged=not options.quick)
+    ]
+    findings = Findings(figures=tuple(figures), failed=tuple(failed))
+    kept = {step: [asdict(row) for row in row_of] for step, row_of in rows.items()}
+    sys.exit(hand_over(options, about, findings, {"steps": kept}))
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True, help="keeps surveys and results")
+    parser.add_argument("--pictures", type=int, nargs="+", default=[1000, 5000, 10000], metavar="N")
+    parser.add_argument("--only", nargs="+", default=[], choices=STEPS, metavar="STEP")
+    parser.add_argument("--threads", type=int, default=1, help="workers")
+    add_options(parser, quick="200 and 400 pictures of the demo's rig")
+    options = parser.parse_args()
+    if options.quick:
+        options.pictures = [200, 400]
+    return options
+
+
+if __name__ == "__main__":
+    main()
