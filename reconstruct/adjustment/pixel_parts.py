@@ -53,7 +53,7 @@ ALONE = Workers()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Part(Generic[Value]):
+class _PixelPart(Generic[Value]):
     """A part for a worker."""
 
     pixels: Pixels | Path
@@ -68,7 +68,7 @@ class _Part(Generic[Value]):
         return function(pixels, self.state, self.value)
 
 
-def _run(function: Callable[[Pixels, RigState, Any], Result], part: _Part[Any]) -> Result:
+def _run(function: Callable[[Pixels, RigState, Any], Result], part: _PixelPart[Any]) -> Result:
     return part.run(function)
 
 
@@ -122,7 +122,7 @@ class PixelParts:
         self, function: Callable[..., Result], states: Iterable[Any], values: Iterable[Any]
     ) -> Iterator[Result]:
         tasks = (
-            _Part(pixels=self._of(k), state=state, value=value)
+            _PixelPart(pixels=self._of(k), state=state, value=value)
             for k, state, value in zip(range(len(self.runs)), states, values, strict=True)
         )
         run, executor = partial(_run, function), self.workers.executor

@@ -85,7 +85,7 @@ class Cell:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Level:
+class CellLevel:
     """The cells of one size."""
 
     origin: tuple[float, float]
@@ -254,14 +254,14 @@ def decimate_square(
 
 
 def coarser(
-    level: Level,
+    level: CellLevel,
     folder: Path,
     error: float,
     least_area: float,
     executor: Executor,
     *,
     most: int = MOST_CELL_TRIANGLES,
-) -> Level:
+) -> CellLevel:
     """The level of cells twice as wide.
 
     Args:
@@ -292,4 +292,4 @@ def coarser(
         ]
         work = partial(decimate_square, into, error, least_area, most)
         cells = dict(pair for made in executor.map(work, tasks, label="decimate") for pair in made)
-    return Level(origin=level.origin, side=2 * level.side, error=error, cells=cells)
+    return CellLevel(origin=level.origin, side=2 * level.side, error=error, cells=cells)

@@ -27,8 +27,8 @@ from alice_survey.base.frames import Array
 from reconstruct.mesh.cells import (
     GROWTH,
     Cell,
+    CellLevel,
     CellMesh,
-    Level,
     coarser,
     decimated,
     part_of,
@@ -87,7 +87,7 @@ def mesh_cloud(
     most_triangles: int,
     folder: Path,
     executor: Executor,
-) -> tuple[TriangleMesh, list[Level]]:
+) -> tuple[TriangleMesh, list[CellLevel]]:
     """Mesh a cloud.
 
     Args:
@@ -125,7 +125,7 @@ def mesh_cloud(
 
 def finest_level(
     cloud: CloudFile, step: float, error: float, folder: Path, executor: Executor
-) -> Level:
+) -> CellLevel:
     """The mesh of a cloud in cells of 2 x 2 tiles; arguments as `mesh_cloud` takes them."""
     sample = cloud.sample(200_000)
     sigma = float(np.median(sample["sigma"])) if "sigma" in (sample.dtype.names or ()) else 1.0
@@ -134,7 +134,7 @@ def finest_level(
     (folder / "lattice").mkdir(parents=True)
     mesh = partial(mesh_tile, cloud, step, sigma, error, folder / "lattice")
     made = zip(tiles, executor.map(mesh, tiles, label="mesh"), strict=True)
-    lattice = Level(
+    lattice = CellLevel(
         origin=(x * step, y * step),
         side=side * step,
         error=error,
@@ -144,7 +144,9 @@ def finest_level(
     return coarser(lattice, folder / "0", error, least, executor, most=0)
 
 
-def coarser_level(levels: Sequence[Level], step: float, folder: Path, executor: Executor) -> Level:
+def coarser_level(
+    levels: Sequence[CellLevel], step: float, folder: Path, executor: Executor
+) -> CellLevel:
     """The level after the last, with twice its error; arguments as `mesh_cloud` takes them."""
     least, into = _LEAST_PART_STEPS2 * step * step, folder / str(len(levels))
     return coarser(levels[-1], into, 2.0 * levels[-1].error, least, executor)

@@ -33,7 +33,7 @@ from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Wedges, make_pages, make_wedges
-from reconstruct.mesh.cells import Cell, CellMesh, Key, Level, join
+from reconstruct.mesh.cells import Cell, CellLevel, CellMesh, Key, join
 from reconstruct.mesh.formats import write_glb
 from reconstruct.mesh.labels import choose_axes, choose_views, make_charts
 from reconstruct.mesh.texture import (
@@ -129,7 +129,7 @@ class BakeTask:
 
 def write_tiles(
     setup: TileSetup,
-    levels: Sequence[Level],
+    levels: Sequence[CellLevel],
     frame: WorldFrame,
     views: Sequence[View],
     light: LightModel,
@@ -178,7 +178,7 @@ def _around(key: Key, ring: int, ratio: int = 1) -> list[Key]:
 
 
 def region_tasks(
-    setup: TileSetup, levels: Sequence[Level], views: Sequence[View], light: LightModel
+    setup: TileSetup, levels: Sequence[CellLevel], views: Sequence[View], light: LightModel
 ) -> Iterator[RegionTask]:
     """Regions, each with the views that may see it, one by one as they are asked for."""
     fine, coarse = levels[0], levels[min(REGION_LEVEL, len(levels) - 1)]
@@ -411,7 +411,7 @@ def _colours_next_to(
     return colours
 
 
-def _write_tree(setup: TileSetup, levels: Sequence[Level], frame: WorldFrame) -> None:
+def _write_tree(setup: TileSetup, levels: Sequence[CellLevel], frame: WorldFrame) -> None:
     """Write `tileset.json`, and a file like it for every so many levels below."""
     present = [set(level.cells) for level in levels]
     for finer, keys in pairwise(present):

@@ -65,8 +65,8 @@ class Occluders:
         middle = view.world_from_cam.inv().apply(self.centres)
         low, high = view.pinhole.slopes(np.array([(0, 0), view.pinhole.size_px]))
         slope = _MARGIN * float(np.hypot(*np.maximum(-low, high)))
-        beside = np.hypot(middle[:, 0], middle[:, 1]) - slope * middle[:, 2]
-        near = (beside < self.radii * math.hypot(1.0, slope)) & (middle[:, 2] > -self.radii)
+        away = np.hypot(middle[:, 0], middle[:, 1]) - slope * middle[:, 2]
+        near = (away < self.radii * math.hypot(1.0, slope)) & (middle[:, 2] > -self.radii)
         parts = [np.load(_part_path(self.folder, number)) for number in self.numbers[near]]
         return np.concatenate([np.empty((0, 3), np.float32), *parts])
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from alice_survey.base.cluster.connection import Connection, connected
 from alice_survey.base.cluster.worker import (
     Answer,
-    Site,
+    RunSite,
     check_worker,
     code_and_versions,
     run_task,
@@ -76,7 +76,7 @@ def cluster_executor(
         _store(workspace) as store,
     ):
         warnings.filterwarnings("ignore", "Sending large graph")
-        site = Site(
+        site = RunSite(
             folder=str(Path.cwd()),
             store=store,
             host=socket.gethostname(),
@@ -132,7 +132,7 @@ class ClusterExecutor(Executor):
 class Cluster:
     """Workers of a scheduler that take the tasks of one run."""
 
-    def __init__(self, connection: Connection, site: Site) -> None:
+    def __init__(self, connection: Connection, site: RunSite) -> None:
         self.client: Client = connection.client
         self.site = site
         self.numbers = itertools.count()

@@ -22,7 +22,7 @@ _PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 
 
 @dataclass(frozen=True)
-class Site:
+class RunSite:
     """Where the tasks of a run find their files, and the code that they need."""
 
     folder: str
@@ -67,7 +67,7 @@ def code_and_versions() -> tuple[tuple[str, str], ...]:
     return tuple(sorted(found.items()))
 
 
-def run_task(site: Site, number: int, function: bytes | str, arguments: bytes) -> Answer:
+def run_task(site: RunSite, number: int, function: bytes | str, arguments: bytes) -> Answer:
     """Run a task on this worker; whatever it raises is part of the answer."""
     from distributed import get_worker
 
@@ -95,7 +95,7 @@ def run_task(site: Site, number: int, function: bytes | str, arguments: bytes) -
     )
 
 
-def check_worker(site: Site, reply: str) -> str:
+def check_worker(site: RunSite, reply: str) -> str:
     """Check this worker, and write a file that the run can look for; why it is unfit, if it is."""
     why = why_unfit(site)
     if not why:
@@ -106,7 +106,7 @@ def check_worker(site: Site, reply: str) -> str:
     return why
 
 
-def why_unfit(site: Site) -> str:
+def why_unfit(site: RunSite) -> str:
     """Why this worker cannot run the tasks of a run; empty where it can."""
     _prepare(site.host)
     try:

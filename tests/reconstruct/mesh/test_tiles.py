@@ -18,7 +18,7 @@ from alice_survey.base.executor import SERIAL, local_executor
 from alice_survey.stages import spec
 from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.mesh import surface
-from reconstruct.mesh.cells import Level
+from reconstruct.mesh.cells import CellLevel
 from reconstruct.mesh.surface import coarser_level, finest_level
 from reconstruct.mesh.topology import edges_of
 from reconstruct.ply import open_cloud
@@ -124,7 +124,7 @@ def settings_for(tiles: str) -> SurveyConfig:
 
 
 @pytest.fixture(scope="module")
-def levels(survey: Path) -> list[Level]:
+def levels(survey: Path) -> list[CellLevel]:
     cloud, folder = open_cloud(survey / "dense" / "cloud.ply"), survey / "levels"
     found = [finest_level(cloud, STEP_M, ERROR_M, folder, SERIAL)]
     while len(found[-1].cells) > 1:
@@ -197,7 +197,7 @@ def test_boxes_and_errors_of_tiles_hold_what_is_below(tiles: list[Tile]):
             assert (tile.high <= tile.parent.high + 2e-6).all()
 
 
-def test_distance_bounds_that_from_the_finest_cells(levels: list[Level], tiles: list[Tile]):
+def test_distance_bounds_that_from_the_finest_cells(levels: list[CellLevel], tiles: list[Tile]):
     fine = levels[0].whole()
     for number, level in enumerate(levels[1:], 1):
         for (x, y), cell in level.cells.items():
@@ -252,7 +252,7 @@ def test_root_is_where_pyproj_puts_it(survey: Path, tiles: list[Tile]):
     np.testing.assert_allclose(placed, np.stack(chain.transform(*enu.T), axis=1), atol=1e-6)
 
 
-def test_cells_are_the_same_bytes_with_two_workers(survey: Path, levels: list[Level]):
+def test_cells_are_the_same_bytes_with_two_workers(survey: Path, levels: list[CellLevel]):
     cloud, again = open_cloud(survey / "dense" / "cloud.ply"), survey / "again"
     with local_executor(2).started() as two:
         made = [finest_level(cloud, STEP_M, ERROR_M, again, two)]
