@@ -192,6 +192,10 @@ def test_a_worker_that_loses_the_files_is_left_out(tmp_path: Path) -> None:
                 subprocess.run([*enter, "mount", "-t", "tmpfs", "none", str(folder)], check=True)
                 (tmp_path / "go").touch()
                 assert all_found.result() == [7 * n for n in range(8)]
+            # Tasks may now go to one worker alone; it ends, and another takes its place.
+            ends = [(tmp_path / "ended", n) for n in range(20)]
+            squares = executor.map(dask_tasks.end_worker_once, ends, label="end")
+            assert list(squares) == [n * n for n in range(20)]
         assert [text for text in warnings if "hidden" in text and "does not see" in text]
 
 

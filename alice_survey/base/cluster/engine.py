@@ -15,7 +15,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -42,6 +42,8 @@ STORE = ".cluster"
 _WAIT_S = 30.0
 """For the first worker of a scheduler, and before a missing worker is reported."""
 _LOOK_EVERY_S = 2.0
+_CHECKED_AT_ONCE = 32
+"""Workers that are asked at once, before the work."""
 _PATIENCE_S, _TIMES_LONGEST = 600.0, 20.0
 """A task hangs that takes longer than this, and than so many times the longest of its kind."""
 _GOES_ON = "the same command goes on from here"
@@ -158,9 +160,12 @@ class Cluster:
         checked: dict[str, Any] = {}
         while not checked:
             found = self._first_workers()
-            with progress.step("checking workers", len(found)) as counter:
-                for address, about in found.items():
-                    why_unfit = why_threads(about) or self.why_unfit(address)
+            with (
+                progress.step("checking workers", len(found)) as counter,
+                ThreadPoolExecutor(_CHECKED_AT_ONCE) as waiting,
+            ):
+                reasons = waiting.map(self.why_unfit, found)
+                for (address, about), why_unfit in zip(found.items(), reasons, strict=True):
                     if why_unfit:
                         raise WorkspaceError(f"worker {_named(address, about)}: {why_unfit}")
                     if why_unfit is not None:
@@ -190,6 +195,9 @@ class Cluster:
         Its answer waits for whatever it is doing.
         """
         reply = f"reply{next(self.numbers)}"
+        about = self.workers().get(address)
+        if about is not None and why_threads(about):
+            return why_threads(about)
         try:
             if self._asked(address, import_module, check_worker.__module__) is None:
                 return None
