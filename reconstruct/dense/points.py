@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from reconstruct.dense.view_store import WHOLE, Part
 from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.range_shift import FAST, KernelLens, slopes_of
 
@@ -46,6 +47,31 @@ class Points:
         return Points(**{field.name: getattr(self, field.name)[chosen] for field in fields(Points)})
 
 
+def part_in_box(
+    view: View, offset_enu: Array, box: tuple[float, float, float, float], blocks: Float32
+) -> Part | None:
+    """The part of a view whose points may be in a box, and what their normals need around it.
+
+    Args:
+        view: the view.
+        offset_enu: origin of the box.
+        box: see `points_in_box`.
+        blocks: where the view's points lie, see `block_bounds`.
+
+    Returns:
+        Rows and columns; None where no point is in the box.
+    """
+    meeting = _meeting(blocks, offset_enu, box)
+    if not meeting.any():
+        return None
+    sides = []
+    for axis, size in ((1, view.pinhole.height_px), (0, view.pinhole.width_px)):
+        found = np.flatnonzero(meeting.any(axis=axis))
+        first, last = int(found[0]) * _BLOCK - _REACH, (int(found[-1]) + 1) * _BLOCK + _REACH
+        sides.append(slice(max(first, 0), min(last, size)))
+    return sides[0], sides[1]
+
+
 def points_in_box(
     view: View,
     number: int,
@@ -57,13 +83,14 @@ def points_in_box(
     offset_enu: Array,
     box: tuple[float, float, float, float],
     blocks: Float32,
+    part: Part = WHOLE,
 ) -> Points:
     """The kept points of a depth map inside of a box.
 
     Args:
         view: that the depth belongs to.
         number: of the view.
-        depth: (H, W) along the axis.
+        depth: (H, W) along the axis, of the part of the view.
         sigma: (H, W) of it.
         kept: (H, W) which pixels to take.
         colour: (H, W, 3) BGR.
@@ -71,11 +98,13 @@ def points_in_box(
         offset_enu: (3,) origin of the points.
         box: west, east, south, north from that origin; a point on the west or north edge is inside.
         blocks: where the view's points lie, see `block_bounds`.
+        part: of the view, which `part_in_box` gives.
     """
     transform = enu_from_cam(view, offset_enu)
+    frame = (part[0].start or 0, part[1].start or 0, *view.pinhole.size_px[::-1])
     enu, normals, colours, sigmas = gather(
         depth, sigma, kept, colour, factors, view.kernel_lens, transform, np.array(box),
-        _meeting(blocks, offset_enu, box),
+        _meeting(blocks, offset_enu, box), frame,
     )  # fmt: skip
     return Points(
         enu=enu,
@@ -160,6 +189,7 @@ def gather(
     enu_from_cam: Array,
     box: Array,
     meeting: NDArray[np.bool_],
+    frame: tuple[int, int, int, int],
 ) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:
     """Points, normals, colours (RGB) and standard deviations of pixels whose point is in a box.
 
@@ -167,7 +197,7 @@ def gather(
     between the two.
 
     Args:
-        depth: (H, W) along the axis, NaN where unknown.
+        depth: (H, W) along the axis, of a part of the picture, NaN where unknown.
         sigma: (H, W) of it.
         kept: (H, W) which pixels to take.
         colour: (H, W, 3) BGR.
@@ -176,20 +206,24 @@ def gather(
         enu_from_cam: (3, 4) transform.
         box: (4,) west, east, south, north.
         meeting: (h, w) blocks of pixels of which any may be in the box.
+        frame: row and column of the picture that the part starts with, and the picture's height and
+            width.
 
     Returns:
         (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN next to unknown depth, and where
         the surface is seen edge-on.
     """
     height, width = depth.shape
+    top, left, whole_height, whole_width = frame
     t = enu_from_cam
-    slopes = slopes_of(depth, lens)
+    slopes = slopes_of(depth, lens, top, left)
     enu = np.empty((height * width, 3), np.float32)
     pixels = np.empty((height * width, 2), np.int32)
     count = 0
     for row in range(height):
         for column in range(width):
-            if not (meeting[row // _BLOCK, column // _BLOCK] and kept[row, column]):
+            block = meeting[(top + row) // _BLOCK, (left + column) // _BLOCK]
+            if not (block and kept[row, column]):
                 continue
             z = depth[row, column]
             x, y = slopes[row, column, 0], slopes[row, column, 1]
@@ -210,10 +244,10 @@ def gather(
     for i in range(count):
         row, column = pixels[i, 0], pixels[i, 1]
         sigmas[i] = sigma[row, column]
-        place = (row + 0.5) / height * (factors.shape[0] - 1)
+        place = (top + row + 0.5) / whole_height * (factors.shape[0] - 1)
         node_row = min(int(place), factors.shape[0] - 2)
         p = place - node_row
-        place = (column + 0.5) / width * (factors.shape[1] - 1)
+        place = (left + column + 0.5) / whole_width * (factors.shape[1] - 1)
         node = min(int(place), factors.shape[1] - 2)
         q = place - node
         for k in range(3):

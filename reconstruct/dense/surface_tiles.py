@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from reconstruct.dense.free_space import look_at_points
-from reconstruct.dense.points import EDGE_ON, Points, joined, points_in_box
+from reconstruct.dense.points import EDGE_ON, Points, joined, part_in_box, points_in_box
 from reconstruct.dense.pose_part import ErrorsOfPoses
 from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settled
 from reconstruct.dense.view_store import ViewStore
@@ -186,34 +186,35 @@ def _seen_through(
     return through > found
 
 
-def _depth_of(setup: FuseSetup, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Refined depth (H, W) of a view and its standard deviation."""
-    depth, sigma = setup.store.load_depth(index, "fine")
-    return depth, sigma * np.float32(setup.sigma_factor)
-
-
 def _points_over(
     setup: FuseSetup, task: FuseTask, offset: Array, box: tuple[Array, Array]
 ) -> Points:
     """The confirmed points of all views in a box (west and south, east and north)."""
     store, (low, high) = setup.store, box
-    parts = []
+    sides = (low[0], high[0], low[1], high[1])
+    found = []
     for index, view in task.views:
-        depth, sigma = _depth_of(setup, index)
+        blocks = np.asarray(store.load(index, "blocks"))
+        part = part_in_box(view, offset, sides, blocks)
+        if part is None:
+            continue
+        depth, sigma = store.load_depth(index, "fine", part)
+        sigma *= np.float32(setup.sigma_factor)
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * task.grid.cell
-        parts.append(
+        found.append(
             points_in_box(
                 view,
                 index,
                 depth,
                 sigma,
-                store.load_mask(index, "inside", view.pinhole.width_px) & sure,
-                store.load_colour(index),
+                store.load_mask(index, "inside", view.pinhole.width_px, part) & sure,
+                store.load_colour(index, part),
                 store.load_factors(index),
                 offset,
-                (low[0], high[0], low[1], high[1]),
-                np.asarray(store.load(index, "blocks")),
+                sides,
+                blocks,
+                part,
             )
         )
-    return joined(parts)
+    return joined(found)

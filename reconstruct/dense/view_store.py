@@ -27,6 +27,9 @@ _SIGMA_LEAST = 1e-6
 """Relative to the depth; 254 steps of 5 % reach a third of the depth."""
 
 
+Part = tuple[slice, slice]
+"""Rows and columns of a picture; of colours the first of either is even."""
+WHOLE: Part = (slice(None), slice(None))
 StoredDepth = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
 """(H, W) codes of depth, (H, W) codes of its relative deviation, and what the codes of either mean:
 NaN for 0. Kernels that look at few pixels take it as it is."""
@@ -81,36 +84,38 @@ class ViewStore:
         self.save(view, f"{name}.sigma", share)
         self.save(view, name, level)
 
-    def stored_depth(self, view: int, name: str) -> StoredDepth:
+    def stored_depth(self, view: int, name: str, part: Part = WHOLE) -> StoredDepth:
         """Depth (H, W) and its standard deviation as they are stored, read only where touched."""
         least, step = self.load(view, f"{name}.scale").tolist()
-        level, share = self.load(view, name), self.load(view, f"{name}.sigma")
+        level, share = self.load(view, name)[part], self.load(view, f"{name}.sigma")[part]
         return np.asarray(level), np.asarray(share), _depths(least, step), _shares()
 
-    def load_depth(self, view: int, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def load_depth(
+        self, view: int, name: str, part: Part = WHOLE
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth (H, W) and its standard deviation, NaN where unknown."""
-        return decoded(self.stored_depth(view, name))
+        return decoded(self.stored_depth(view, name, part))
 
     def save_colour(self, view: int, colour: NDArray[np.uint8]) -> None:
         """Keep a picture (H, W, 3) BGR: brightness in full, colour at half the resolution."""
-        ycc = cv2.cvtColor(colour, cv2.COLOR_BGR2YCrCb)
         height, width = colour.shape[:2]
-        half = ((width + 1) // 2, (height + 1) // 2)
+        even = cv2.copyMakeBorder(colour, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        ycc = cv2.cvtColor(even, cv2.COLOR_BGR2YCrCb)
+        half = (ycc.shape[1] // 2, ycc.shape[0] // 2)
         self.save(view, "tint", cv2.resize(ycc[..., 1:], half, interpolation=cv2.INTER_AREA))
-        self.save(view, "bright", np.ascontiguousarray(ycc[..., 0]))
+        self.save(view, "bright", np.ascontiguousarray(ycc[:height, :width, 0]))
 
-    def load_bright(self, view: int) -> NDArray[np.uint8]:
+    def load_bright(self, view: int, part: Part = WHOLE) -> NDArray[np.uint8]:
         """Brightness (H, W) of a picture."""
-        return np.asarray(self.load(view, "bright"))
+        return np.asarray(self.load(view, "bright")[part])
 
-    def load_colour(self, view: int) -> NDArray[np.uint8]:
-        """A picture (H, W, 3) BGR."""
-        bright = self.load_bright(view)
-        tint = cv2.resize(
-            np.asarray(self.load(view, "tint")),
-            bright.shape[::-1],
-            interpolation=cv2.INTER_LINEAR,
-        )
+    def load_colour(self, view: int, part: Part = WHOLE) -> NDArray[np.uint8]:
+        """A picture (H, W, 3) BGR; of a part the outermost pixels have the tint of those inside."""
+        bright = self.load_bright(view, part)
+        first = tuple((side.start or 0) // 2 for side in part)
+        half = tuple(slice(a, a + (n + 1) // 2) for a, n in zip(first, bright.shape, strict=True))
+        tint = cv2.resize(self.load(view, "tint")[half], None, fx=2.0, fy=2.0)
+        tint = tint[: bright.shape[0], : bright.shape[1]]
         colour: NDArray[np.uint8] = cv2.cvtColor(np.dstack([bright, tint]), cv2.COLOR_YCrCb2BGR)
         return colour
 
@@ -118,9 +123,11 @@ class ViewStore:
         """Keep a mask (H, W), one bit a pixel."""
         self.save(view, name, np.packbits(mask, axis=1))
 
-    def load_mask(self, view: int, name: str, width: int) -> NDArray[np.bool_]:
-        """A mask (H, W)."""
-        return np.unpackbits(self.load(view, name), axis=1, count=width).astype(np.bool_)
+    def load_mask(self, view: int, name: str, width: int, part: Part = WHOLE) -> NDArray[np.bool_]:
+        """A mask (H, W) of a picture of some width."""
+        rows, columns = part
+        bits = np.unpackbits(self.load(view, name)[rows], axis=1, count=width)
+        return bits[:, columns].astype(np.bool_)
 
 
 def stored(depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> StoredDepth:

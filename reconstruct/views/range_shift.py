@@ -220,18 +220,24 @@ def line_of(
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def slopes_of(depth: NDArray[np.float32], lens: KernelLens) -> NDArray[np.float32]:
+def slopes_of(
+    depth: NDArray[np.float32], lens: KernelLens, top: int = 0, left: int = 0
+) -> NDArray[np.float32]:
     """Slopes x/z, y/z (H, W, 2) of the spots that a warped picture shows; NaN without depth.
 
     Args:
-        depth: (H, W) of the view.
+        depth: (H, W) of the view, or of a part of it.
         lens: of the view.
+        top: row of the view that the part starts with.
+        left: column.
     """
     pinhole, field, inverse_working = lens
     slopes = np.empty((*depth.shape, 2), np.float32)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
-            x, y, by_x, by_y = line_of(pinhole, field, inverse_working, column + 0.5, row + 0.5)
+            x, y, by_x, by_y = line_of(
+                pinhole, field, inverse_working, left + column + 0.5, top + row + 0.5
+            )
             inverse = 1.0 / depth[row, column]
             slopes[row, column, 0] = x + by_x * inverse
             slopes[row, column, 1] = y + by_y * inverse

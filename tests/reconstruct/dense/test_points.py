@@ -1,9 +1,11 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import block_bounds, joined, points_in_box
+from reconstruct.dense.points import block_bounds, joined, part_in_box, points_in_box
+from reconstruct.dense.view_store import WHOLE, ViewStore
 from reconstruct.views.model import enu_from_cam
 from reconstruct.views.range_shift import no_shift
 from tests.oracles_dense import (
@@ -160,3 +162,43 @@ def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():
     np.testing.assert_allclose(back, pixels, atol=2e-3)
     bare = gathered(replace(view, shift=no_shift(*view.pinhole.size_px)), depth=depth).enu + OFFSET
     assert 5e-4 < np.abs(bare - points).max() < 0.05
+
+
+def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp_path):
+    """From a store, for a view through a port, whose pixels show other places at other depths."""
+    view = port_view([0.2, 0.1, 10.0], [2.0, -3.0, 40.0])
+    depth = depth_of(view)
+    rng = np.random.default_rng(4)
+    colour = cv2.GaussianBlur(rng.integers(0, 255, (*depth.shape, 3), np.uint8), (0, 0), 2.0)
+    store = ViewStore(tmp_path)
+    store.save_depth(7, "fine", depth, np.full_like(depth, 0.01))
+    store.save_mask(7, "inside", rng.random(depth.shape) > 0.1)
+    store.save_colour(7, colour)
+    rows, columns = np.nonzero(np.isfinite(depth))
+    pixels = np.column_stack([columns, rows]) + 0.5
+    world = view.at_depth(pixels, depth[rows, columns].astype(float))
+    blocks = block_bounds(depth.shape, rows, columns, world)
+    east, north = world[:, 1] - OFFSET[0], world[:, 0] - OFFSET[1]
+    factors = rng.uniform(0.5, 1.5, (5, 6, 3)).astype(np.float32)
+
+    def points(box, part):
+        return points_in_box(
+            view, 7, *store.load_depth(7, "fine", part),
+            store.load_mask(7, "inside", view.pinhole.width_px, part), store.load_colour(7, part),
+            factors, OFFSET, box, blocks, part,
+        )  # fmt: skip
+
+    sizes = []
+    for at_east, at_north in ((0.05, 0.5), (0.5, 0.5), (0.97, 0.03)):
+        middle = np.quantile(east, at_east), np.quantile(north, at_north)
+        side = 0.15 * np.ptp(east)
+        box = (middle[0] - side, middle[0] + side, middle[1] - side, middle[1] + side)
+        part = part_in_box(view, OFFSET, box, blocks)
+        found, whole = points(box, part), points(box, WHOLE)
+        for name in ("enu", "normals", "sigmas", "views"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+        assert np.abs(found.colours.astype(int) - whole.colours).max() <= 1
+        assert len(found.enu) > 200
+        sizes.append(store.load_depth(7, "fine", part)[0].size)
+    assert max(sizes) < 0.6 * depth.size
+    assert part_in_box(view, OFFSET, (1e3, 2e3, 1e3, 2e3), blocks) is None
