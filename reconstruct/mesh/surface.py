@@ -141,7 +141,10 @@ def finest_level(
         cells={((i - x) // side, (j - y) // side): c for ((i, j), _), c in made if c is not None},
     )
     least = _LEAST_PART_STEPS2 * step * step
-    return coarser(lattice, folder / "0", error, least, executor, most=0)
+    found = coarser(lattice, folder / "0", error, least, executor, most=0)
+    if not found.cells:  # a survey that is smaller than what is a stray elsewhere
+        found = coarser(lattice, folder / "all", error, 0.0, executor, most=0)
+    return found
 
 
 def coarser_level(

@@ -289,3 +289,19 @@ def write_ripples(path: Path, length_m: float) -> None:
     points["ny"], points["nz"] = -slope / np.hypot(slope, 1), 1 / np.hypot(slope, 1)
     points["sigma"] = 1e-3
     write_cloud(path, [points], OFFSET, FRAME)
+
+
+def test_a_survey_smaller_than_a_stray_is_meshed(tmp_path: Path):
+    east, north = (a.ravel() for a in np.mgrid[0:12, 0:12] * STEP_M)
+    points = np.zeros(len(east), VERTEX)
+    points["x"], points["y"], points["nz"], points["sigma"] = east, north, 1.0, 1e-3
+    write_cloud(tmp_path / "cloud.ply", [points], OFFSET, FRAME)
+
+    mesh, _ = surface.mesh_cloud(
+        open_cloud(tmp_path / "cloud.ply"), STEP_M, ERROR_M, 10_000, tmp_path, SERIAL
+    )
+
+    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert 9**2 < area / STEP_M**2 < 15**2
+    assert np.abs(mesh.vertices[:, 2]).max() < ERROR_M
