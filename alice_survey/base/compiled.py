@@ -42,7 +42,11 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """
 
     def decorated(plain: Callable[..., Any]) -> Any:
-        kernel = njit(cache=True, **options)(plain)
+        # A copy of such a kernel in the code of its caller may round in another way than its own
+        # code, and whichever is loaded first is called: results would depend on what was compiled
+        # before. What is inlined is always that of the caller.
+        rounding = {"forceinline": True} if options.get("fastmath") else {}
+        kernel = njit(cache=True, **rounding, **options)(plain)
         index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if hasattr(index, "_source_stamp"):
             index._source_stamp = _Stamp(kernel)

@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -180,3 +183,31 @@ def test_what_noise_hides_is_aligned_on_smaller_pictures() -> None:
     assert np.isfinite(whole[:, 0]).mean() < 0.3
     assert kept.mean() > 0.8
     assert 0.02 < np.sqrt(((found - truth)[kept] ** 2).mean()) < 0.35
+
+
+FIRST_AND_LATER = """
+import sys
+import numpy as np
+from reconstruct.matching.refinement import align_patches
+from tests.reconstruct.matching.test_refinement import AFFINE, SHIFT, Texture, spots
+texture, reference = Texture(0), spots(60)
+first = texture.picture(np.eye(2), np.zeros(2), noise=2.0)
+second = texture.picture(AFFINE, SHIFT, gain=0.7, noise=2.0)
+start = np.broadcast_to(AFFINE, (60, 2, 2))
+found = align_patches(first, second, reference, reference @ AFFINE.T + SHIFT, start)
+sys.stdout.buffer.write(found.tobytes())
+"""
+
+
+def test_positions_are_the_same_where_kernels_are_compiled_and_where_they_are_loaded(
+    tmp_path: Path,
+) -> None:
+    """Sums that may be reordered are reordered in one way, whatever was compiled before."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", FIRST_AND_LATER]
+    found = [
+        subprocess.run(command, env=environment, check=True, capture_output=True).stdout
+        for _ in range(2)
+    ]
+    assert len(found[0]) == 60 * 2 * 8
+    assert found[0] == found[1]
