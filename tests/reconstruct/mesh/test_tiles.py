@@ -276,7 +276,7 @@ def test_memory_of_a_pass_is_that_of_a_cell(tmp_path: Path, monkeypatch: pytest.
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert len(levels[1].cells) > 7
-    assert 0.7 * peaks[0] < peaks[1] < 1.3 * peaks[0]
+    assert 0.7 * peaks[0] < peaks[1] < 2.0 * peaks[0]  # of an area four times as large
 
 
 def write_ripples(path: Path, length_m: float) -> None:
