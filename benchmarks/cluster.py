@@ -15,11 +15,12 @@ the survey, a cap), the model is pessimistic.
 """
 
 import argparse
+import contextlib
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from alice_survey.base.artefacts import read_json
@@ -32,9 +33,6 @@ from benchmarks.machine import heading, machine
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128)
 _MEASURED = (1, 2)
 _STAGES = tuple(spec(name).folder for name in names("reconstruct"))
-_LOCAL = """start = "distributed.LocalCluster"
-options = {{ n_workers = {}, threads_per_worker = 1 }}
-"""
 
 
 def command(*arguments: str) -> None:
@@ -56,36 +54,48 @@ def pictures_in(work: Path, survey: Path | None) -> Path:
     return made
 
 
+@contextlib.contextmanager
+def workers_of(work: Path, count: int) -> Iterator[Path]:
+    """A scheduler and workers that are no part of the command; yields the scheduler's file."""
+    file = work / "scheduler.json"
+    file.unlink(missing_ok=True)
+    scheduler = ["scheduler", "--scheduler-file", str(file), "--port", "0", "--no-dashboard"]
+    worker = ["worker", "--scheduler-file", str(file), "--nthreads", "1", "--nworkers", str(count)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "dask"]
+    with contextlib.ExitStack() as stack:
+        for part in (scheduler, worker):
+            process = subprocess.Popen([*dask, *part, "--host", "127.0.0.1"], **quiet)
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+            while not file.exists():
+                time.sleep(0.1)
+        yield file
+
+
 def measured_s(work: Path, survey: Path, workers: int) -> float:
     """Reconstruct a copy of a survey on local workers; how long its stages took."""
     copy, events = work / f"on-{workers}", work / f"on-{workers}.jsonl"
     shutil.rmtree(copy, ignore_errors=True)
     events.unlink(missing_ok=True)
     shutil.copytree(survey, copy)
-    cluster = work / f"{workers}.toml"
-    cluster.write_text(_LOCAL.format(workers))
-    command(
-        "reconstruct", "-w", str(copy), "--quiet", "--cluster", str(cluster),
-        "--events", str(events),
-    )  # fmt: skip
+    with workers_of(work, workers) as file:
+        command(
+            "reconstruct", "-w", str(copy), "--quiet", "--cluster", str(file),
+            "--events", str(events),
+        )  # fmt: skip
     return sum(read_json(copy / stage / "stage.json")["took_s"] for stage in _STAGES)
 
 
-def task_cost_s(tasks: int = 300) -> float:
+def task_cost_s(work: Path, tasks: int = 300) -> float:
     """What an empty task costs the command and the scheduler on this machine."""
     from alice_survey.base.cluster.engine import cluster_executor
 
-    work = Path.cwd()
-    cluster = work / ".empty.toml"
-    cluster.write_text(_LOCAL.format(1))
-    try:
-        with cluster_executor(work, None, cluster) as executor:
-            list(executor.map(abs, range(20), label="first"))
-            began_s = time.perf_counter()
-            list(executor.map(abs, range(tasks), label="empty"))
-            return (time.perf_counter() - began_s) / tasks
-    finally:
-        cluster.unlink()
+    with workers_of(work, 1) as file, cluster_executor(work, None, file) as executor:
+        list(executor.map(abs, range(20), label="first"))
+        began_s = time.perf_counter()
+        list(executor.map(abs, range(tasks), label="empty"))
+        return (time.perf_counter() - began_s) / tasks
 
 
 def report_scaling(stages: Sequence[RecordedStage], network: Network) -> list[Figure]:
@@ -123,7 +133,7 @@ def main() -> None:
     about = machine(("alice-survey", "distributed"))
     print(f"{heading(about)}\n", flush=True)
     options.work.mkdir(parents=True, exist_ok=True)
-    network = Network(task_s=task_cost_s())
+    network = Network(task_s=task_cost_s(options.work))
     print(f"an empty task: {1e3 * network.task_s:.2f} ms")
     figures = [Figure(name="an empty task", value=1e3 * network.task_s, unit="ms")]
     events, survey = options.events, options.survey

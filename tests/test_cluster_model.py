@@ -31,7 +31,7 @@ def test_equal_tasks_run_in_rounds(workers: int) -> None:
 
 @pytest.mark.parametrize("workers", [1, 3, 64])
 def test_a_step_takes_no_less_than_its_bounds_and_no_more_than_grahams(workers: int) -> None:
-    """Tasks given to whoever is free take at most 2 - 1/W times the optimum (Graham, 1969)."""
+    """Tasks given to any free worker take at most 2 - 1/W times the optimum (Graham, 1969)."""
     times = np.random.default_rng(3).lognormal(size=most_in_flight(workers))
     least = max(times.sum() / workers, times.max())
     found = makespan(step(times), workers, FREE)

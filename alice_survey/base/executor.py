@@ -120,7 +120,6 @@ class Executor:
         task_mib: float,
     ) -> "Iterator[TaskResult[Result]]":
         """What tasks give, in the order of the items."""
-        del label  # for engines that show it
         workers = self.workers
         if self._is_local:
             workers = min(workers, _fitting(task_mib), workers if total is None else max(1, total))

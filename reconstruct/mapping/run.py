@@ -93,13 +93,13 @@ def run_mapping(
         ImageError: there are too few pictures, or they are not those of the rig.
         ReconstructionError: the pictures give no model.
     """
-    inputs, settings = read_inputs(workspace), reconstruct
+    inputs = read_inputs(workspace)
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-    features, counts = _find_all(inputs, folder / "features", settings, executor)
-    warps, distances = _warps(inputs, features, settings, executor)
+    features, counts = _find_all(inputs, folder / "features", reconstruct, executor)
+    warps, distances = _warps(inputs, features, reconstruct, executor)
     cameras, exif_focal = _cameras(inputs, warps)
     known = None if distances is None or not distances.measured else distances
-    pairs = _match_all(inputs, features, cameras, warps, known, settings, seed, executor)
+    pairs = _match_all(inputs, features, cameras, warps, known, reconstruct, seed, executor)
     refined = refine_tracks(
         all_pixels(features),
         [_grey_file(path) for path in features],
@@ -120,7 +120,7 @@ def run_mapping(
             poses,
             folder,
             seed,
-            method=settings.mapper,
+            method=reconstruct.mapper,
             executor=executor,
         )
         mapped, refracted = refract(mapped, seen, folder, poses, settle=not mapped.scaled)

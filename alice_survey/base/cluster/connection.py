@@ -116,7 +116,12 @@ def connected(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
                 cluster.scale(config.workers)
             address, where = cluster.scheduler_address, {"address": cluster}
         elif config.scheduler_file is not None:
-            address, where = str(config.scheduler_file), {"scheduler_file": address_of(config)}
+            address = str(config.scheduler_file)
+            if not config.scheduler_file.is_file():
+                raise ConfigError(
+                    f"{address}: no such file; it is what 'dask scheduler --scheduler-file' writes"
+                )
+            where = {"scheduler_file": address}
         else:
             address, where = str(config.address), {"address": config.address}
         try:
@@ -131,20 +136,6 @@ def connected(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
                 "scheduler', or give the address that it prints"
             ) from None
         yield Connection(client=client, address=address, is_own=config.start is not None)
-
-
-def address_of(config: ClusterConfig) -> str:
-    """Name of Dask's JSON file.
-
-    Raises:
-        ConfigError: it is not there.
-    """
-    path = Path(str(config.scheduler_file))
-    if not path.is_file():
-        raise ConfigError(
-            f"{path}: no such file; 'dask scheduler --scheduler-file {path}' writes it"
-        )
-    return str(path)
 
 
 def read_cluster_file(path: Path) -> ClusterConfig:
@@ -180,7 +171,7 @@ def _started(config: ClusterConfig) -> Iterator[Any]:
         kind = getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError):
         raise ConfigError(
-            f"start = {config.start!r} is no class that can be imported here: give one such as "
+            f"start = {config.start!r} is not a class that can be imported here: give one such as "
             "'dask_jobqueue.SLURMCluster' (pip install dask-jobqueue) or 'distributed.LocalCluster'"
         ) from None
     security = config.security()

@@ -82,6 +82,7 @@ def cluster_executor(
             folder=str(Path.cwd()),
             store=store,
             host=socket.gethostname(),
+            process=os.getpid(),
             code=code_and_versions(),
         )
         cluster = Cluster(connection, site)
@@ -126,9 +127,7 @@ class ClusterExecutor(Executor):
         task_mib: float,
     ) -> Iterator[TaskResult[Result]]:
         tasks = _Tasks(self.cluster, label, task_mib)
-        for found in in_order(tasks, function, items, tasks.most_queued):
-            count_elsewhere(found.spent.cpu_s)
-            yield found
+        yield from in_order(tasks, function, items, tasks.most_queued)
 
 
 class Cluster:
@@ -203,7 +202,7 @@ class Cluster:
                 return None
             found: str | None = self._asked(address, check_worker, self.site, reply)
         except ImportError as error:
-            return f"it has no alice-survey ({error}): install the same version there"
+            return f"alice-survey cannot be imported ({error}): install the same version there"
         if found == "" and not (self.site.store / reply).exists():
             return f"{self.site.store} is another folder there"
         return found
@@ -402,6 +401,8 @@ class _Submitted:
             value = pickle.loads(answer.data)  # noqa: S301 (its own)
             if answer.failed:
                 raise value
+            if not answer.is_below:
+                count_elsewhere(value.spent.cpu_s)
             sent = len(self._arguments)
             spent = replace(value.spent, sent_bytes=sent, received_bytes=len(answer.data))
             return replace(value, spent=spent)

@@ -30,6 +30,9 @@ class RunSite:
     store: Path
     """Absolute folder of the workspace for values that tasks share; each run has its own."""
     host: str
+    """Machine of the run."""
+    process: int
+    """Its process there."""
     code: tuple[tuple[str, str], ...]
     """As `code_and_versions` gives it."""
 
@@ -51,6 +54,8 @@ class Answer:
     unfit: str = ""
     """Why the task was not run there."""
     took_s: float = 0.0
+    is_below: bool = False
+    """Whether the worker is a process below that of the run, whose computing counts as its own."""
 
 
 @cache
@@ -92,6 +97,7 @@ def run_task(site: RunSite, number: int, function: bytes | str, arguments: bytes
         data=_pickled(result),
         failed=failed,
         took_s=time.monotonic() - began_s,
+        is_below=_is_below(site.host, site.process),
     )
 
 
@@ -120,9 +126,13 @@ def why_unfit(site: RunSite) -> str:
         )
     if seen != site.store.name:
         return f"{site.store} is another folder there"
-    for (name, here), (_, wanted) in zip(code_and_versions(), site.code, strict=False):
-        if here != wanted:
-            return f"it has {name} {here}, this machine has {wanted}: install the same on both"
+    here, wanted = dict(code_and_versions()), dict(site.code)
+    for name in sorted(here.keys() | wanted.keys()):
+        if here.get(name) != wanted.get(name):
+            return (
+                f"it has {name} {here.get(name, 'not at all')}, this machine has "
+                f"{wanted.get(name, 'none')}: install the same on both"
+            )
     return ""
 
 
@@ -133,6 +143,14 @@ def _pickled(value: Any) -> bytes:
         if not isinstance(value, BaseException):
             raise
         return pickle.dumps(RuntimeError(f"{type(value).__name__}: {value} ({error})"))
+
+
+@cache
+def _is_below(host: str, process: int) -> bool:
+    import psutil
+
+    above = [parent.pid for parent in psutil.Process().parents()]
+    return socket.gethostname() == host and process in above
 
 
 @cache

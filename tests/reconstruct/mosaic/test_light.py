@@ -220,7 +220,7 @@ def read_rows(path: Path) -> LightSamples:
 
 
 def test_samples_in_files_give_the_light_of_all_at_once(tmp_path):
-    """In parts, each with views of its own, whoever works on them."""
+    """In parts, each with views of its own, for any number of workers."""
     _, found = samples(outliers=0.1)
     cameras = ["left", "right", "left"] * 3
     shown = pattern(NODES_X, NODES_Y)[None, ..., None] + np.full((9, *GRID, 3), 4.2)
