@@ -143,6 +143,25 @@ def pair_depth(
     return PartnerDepth(depth=depth, focal_baseline=pair.focal_px * pair.baseline)
 
 
+def enlarged(depth: Float32, size_px: tuple[int, int]) -> Float32:
+    """Depth, or a standard deviation of it, (H, W) on a picture of a larger size.
+
+    Between four known pixels it is bilinear in the inverse, in which a plane is linear; next to an
+    unknown one it is that of the nearest.
+
+    Args:
+        depth: (H, W) positive, NaN where unknown.
+        size_px: width and height to enlarge to; of the same size it is returned as it is.
+    """
+    if depth.shape[::-1] == size_px:
+        return depth
+    between = cv2.resize(1.0 / depth, size_px, interpolation=cv2.INTER_LINEAR)
+    nearest = cv2.resize(depth, size_px, interpolation=cv2.INTER_NEAREST)
+    known = np.isfinite(between) & np.isfinite(nearest)
+    large: Float32 = np.where(known, np.float32(1.0) / between, nearest)
+    return large
+
+
 def _valid(valid: NDArray[np.bool_], homography: Array, pair: Rectification) -> NDArray[np.bool_]:
     mask = valid.astype(np.uint8) * 255
     warped = warp(mask, homography, pair, cv2.INTER_LINEAR)

@@ -5,6 +5,7 @@ matches, and better ones.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -24,6 +25,9 @@ from reconstruct.views.model import View, scaled_view
 
 LARGEST_PIXELS = 3_000_000
 """Pictures with more pixels are halved for matching, until they have fewer."""
+CELL_PIXELS = 2.5
+"""Side of a cell of the surface in mean ground pixels of views, unless depth is coarser."""
+_LEAST_SCALE = 0.05
 _PROBES = 8
 _SCALES = 3
 _WORTH = 1.15
@@ -35,12 +39,43 @@ _COMPARED = 3
 _SIGMA_LIMITS_PX = (0.15, 1.5)
 
 
-def matching_scale(view: View) -> float:
-    """1, 1/2, 1/4, ...: the largest at which a picture has no more than `LARGEST_PIXELS`."""
-    scale = 1.0
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Factors by which pictures are shrunk."""
+
+    depth: float
+    """For the depth of views, and all that is made of it."""
+    matching: float
+    """For semi-global matching, by which this depth is found before it is refined."""
+
+
+def matching_scale(view: View, finest: float = 1.0) -> float:
+    """A factor, halved until a picture that is shrunk by it has at most `LARGEST_PIXELS`."""
+    scale = finest
     while np.prod(view.pinhole.size_px) * scale * scale > LARGEST_PIXELS:
         scale /= 2.0
     return scale
+
+
+def scale_for_cell(
+    cell: float | None, views: Sequence[View], points_of: Callable[[int], Array]
+) -> float:
+    """Factor at which a cell of the surface has as many pixels of a view as it has by default.
+
+    Args:
+        cell: side of a cell; None for the finest that pictures give.
+        views: of the model.
+        points_of: from the number of a view to the points (N, 3) that bound its depth.
+    """
+    if cell is None:
+        return 1.0
+    footprints = []
+    for number, view in enumerate(views):
+        points = points_of(number)
+        if len(points):
+            depth = view.world_from_cam.inv().apply(points)[:, 2]
+            footprints.append(float(np.median(depth)) / view.pinhole.focal_px)
+    return float(np.clip(CELL_PIXELS * np.median(footprints) / cell, _LEAST_SCALE, 1.0))
 
 
 def probed(partners: Sequence[Sequence[int]]) -> list[int]:
@@ -49,20 +84,24 @@ def probed(partners: Sequence[Sequence[int]]) -> list[int]:
     return able[:: max(1, len(able) // _PROBES)][:_PROBES]
 
 
-def find_scale(
+def find_scales(
     workspace: Path,
     views: Sequence[View],
     partners: Sequence[Sequence[int]],
     points_of: Callable[[int], Array],
+    finest: float,
     executor: Executor,
-) -> float:
-    """Factor by which pictures are shrunk for matching, from a few views.
+) -> Scales:
+    """At which scale to match, and whether detail that is finer than that is worth refining.
+
+    Where a few views find more depths at a lower resolution, what is finer is noise.
 
     Args:
         workspace: with the pictures.
         views: of the model.
         partners: of every view, best first.
         points_of: from the number of a view to the points (N, 3) that bound its depth.
+        finest: scale of depth where pictures are clear.
         executor: where tasks run.
     """
     chosen = probed(partners)
@@ -70,7 +109,7 @@ def find_scale(
         ((views[number], *(views[n] for n in partners[number])), points_of(number))
         for number in chosen
     ]
-    largest = min(matching_scale(views[number]) for number in chosen)
+    largest = min(matching_scale(views[number], finest) for number in chosen)
     scales = [largest * 0.5**n for n in range(_SCALES)]
     shares: list[float] = []
     for tried in (scales[:2], scales[2:]):  # the third is asked only where the second is better
@@ -81,7 +120,7 @@ def find_scale(
             best += 1
         if best + 1 < len(shares):
             break
-    return scales[best]
+    return Scales(depth=scales[best] if best else finest, matching=scales[best])
 
 
 def match_sigma(spreads: Sequence[float]) -> float:
@@ -95,12 +134,13 @@ def shrunk(
     pictures: Pictures, image: str, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colour and validity of a picture at a size (width, height)."""
-    return _resized(pictures.colour(image), pictures.valid(image), size_px)
+    return resized(pictures.colour(image), pictures.valid(image), size_px)
 
 
-def _resized(
+def resized(
     colour: NDArray[np.uint8], valid: NDArray[np.bool_], size_px: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A picture and its validity at a size (width, height), no larger: valid where all of it is."""
     if colour.shape[1::-1] == size_px:
         return colour, valid
     small = cv2.resize(valid.astype(np.uint8) * 255, size_px, interpolation=cv2.INTER_AREA)
@@ -141,7 +181,7 @@ def _looks(workspace: Path, view: View, scales: Sequence[float]) -> list[Look]:
     found = []
     for scale in scales:
         small = scaled_view(view, scale)
-        part, usable = _resized(colour, valid, small.pinhole.size_px)
+        part, usable = resized(colour, valid, small.pinhole.size_px)
         found.append((normalise(part), usable))
     return found
 

@@ -22,6 +22,7 @@ from reconstruct.dense.dem import (
     slope_deg,
     without_strays,
 )
+from reconstruct.dense.matching_trial import CELL_PIXELS
 from reconstruct.dense.pose_part import ErrorsOfPoses
 from reconstruct.dense.surface_tiles import (
     FuseSetup,
@@ -46,8 +47,6 @@ from reconstruct.raster import (
 )
 from reconstruct.views.model import SparseModel, WorldFrame
 
-CELL_PIXELS = 2.5
-"""Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
 _TILE_CELLS = 256
 _RIM = FILL_CELLS + STRAY_CELLS
 
@@ -58,7 +57,7 @@ class Confirmed:
 
     store: ViewStore
     model: SparseModel
-    """Views as matched, in the world."""
+    """Views at the size of their depth, in the world."""
     sigma_factor: float
     """On the standard deviations of refined depths."""
     shared: float

@@ -18,7 +18,13 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.plane_settings import parse_planes
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.dem import FILL_CELLS
-from reconstruct.dense.matching_trial import find_scale, probed
+from reconstruct.dense.matching_trial import (
+    Scales,
+    find_scales,
+    matching_scale,
+    probed,
+    scale_for_cell,
+)
 from reconstruct.dense.moving import COMPARED, clear_moving, keep_look, mask_moving, show_moving
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
@@ -43,7 +49,7 @@ from reconstruct.dense.views import (
 )
 from reconstruct.light.solve import solve_light, write_light
 from reconstruct.planes import chosen_planes
-from reconstruct.views.model import read_model, scaled_view
+from reconstruct.views.model import SparseModel, read_model, scaled_view
 
 _WITNESSES = 8
 """Neighbouring views that a view's depth is checked against."""
@@ -64,10 +70,9 @@ def run_dense(
     store.folder.mkdir(parents=True, exist_ok=True)
     partners = choose_partners(model, reconstruct.dense_partners)
     points = PointsInSight(model)
-    scale = reconstruct.dense_scale
-    if scale is None:
-        scale = find_scale(workspace, model.views, partners, points.of, executor)
-    views = [scaled_view(view, scale) for view in model.views]
+    scales = _scales(workspace, model, partners, points, reconstruct, executor)
+    views = [scaled_view(view, scales.depth) for view in model.views]
+    matching = scales.matching / scales.depth
 
     def tasks(others: Sequence[Sequence[int]]) -> list[ViewTask]:
         return [
@@ -79,12 +84,12 @@ def run_dense(
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
     to_match = tasks(partners)
     probes = [(to_match[n], points.of(n)) for n in probed(partners)]
-    match_sigma_px = find_match_sigma(probes, executor)
-    match = partial(view_depth, match_sigma_px)
+    match_sigma_px = find_match_sigma(matching, probes, executor)
+    match = partial(view_depth, matching, match_sigma_px)
     matched = ((task, points.of(task.index)) for task in to_match)
     _drain(executor.map(match, matched, label="match", total=len(views)))
     looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
-    _drain(executor.map(refine_view, tasks(looks), label="refine"))
+    _drain(executor.map(partial(refine_view, matching), tasks(looks), label="refine"))
     checks = tasks(neighbours(model, _WITNESSES))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
@@ -121,7 +126,8 @@ def run_dense(
         {
             "format": "alice-survey surface",
             "version": 1,
-            "matching_scale": scale,
+            "depth_scale": scales.depth,
+            "matching_scale": scales.matching,
             "match_sigma_px": match_sigma_px,
             "refined_with": LOOKS,
             "sigma_factor": round(sigma_factor, 3),
@@ -144,6 +150,22 @@ def run_dense(
         },
     )
     shutil.rmtree(store.folder)
+
+
+def _scales(
+    workspace: Path,
+    model: SparseModel,
+    partners: Sequence[Sequence[int]],
+    points: PointsInSight,
+    reconstruct: ReconstructConfig,
+    executor: Executor,
+) -> Scales:
+    """As settings want them; what they leave open is tried out."""
+    if reconstruct.dense_scale is not None:
+        wanted = reconstruct.dense_scale
+        return Scales(depth=wanted, matching=matching_scale(model.views[0], wanted))
+    finest = scale_for_cell(reconstruct.dem_cell_m, model.views, points.of)
+    return find_scales(workspace, model.views, partners, points.of, finest, executor)
 
 
 def _drain(results: Iterator[None]) -> None:

@@ -4,6 +4,7 @@ Each step takes a task that travels to another process, reads what earlier steps
 and leaves its own there.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -11,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,12 +21,14 @@ from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import (
     GATE_SIGMAS,
+    Look,
     PartnerDepth,
     count_witnesses,
+    enlarged,
     merge_depths,
     pair_depth,
 )
-from reconstruct.dense.matching_trial import match_sigma, shrunk, spread
+from reconstruct.dense.matching_trial import match_sigma, resized, shrunk, spread
 from reconstruct.dense.points import block_bounds
 from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import in_frame
@@ -42,7 +46,7 @@ from reconstruct.light.solve import (
 )
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.views.model import View
+from reconstruct.views.model import View, scaled_view
 from reconstruct.views.range_shift import slopes_of
 
 _BOUND_PERCENT = 0.1
@@ -75,7 +79,7 @@ class ViewTask:
 
 
 def prepare_view(workspace: Path, task: ViewTask) -> None:
-    """Keep a picture's colour and validity at the size of matching."""
+    """Keep a picture's colour and validity at the size of depth."""
     store, view = task.store, task.view
     if store.has(task.index, "low"):
         return
@@ -86,75 +90,98 @@ def prepare_view(workspace: Path, task: ViewTask) -> None:
     store.save(task.index, "low", low_pass(colour, valid))
 
 
-@lru_cache(maxsize=8)
-def _evened(store: ViewStore, index: int) -> NDArray[np.uint8]:
-    """A picture of even light and contrast."""
-    return normalise(store.load_bright(index))
+Size = tuple[int, int]
+"""Width and height of a picture."""
+
+
+def _shown(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
+    """Brightness of a picture and which of its pixels may be used, at a size."""
+    valid = store.load_mask(index, "valid", kept_px[0])
+    return resized(store.load_bright(index), valid, size_px)
 
 
 @lru_cache(maxsize=8)
-def _look(store: ViewStore, index: int, width: int) -> tuple[NDArray[Any], ...]:
-    """Contrast, spline and validity of a picture."""
-    return prepared(store.load_bright(index), store.load_mask(index, "valid", width))
+def _evened(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
+    """A picture of even light and contrast, at a size."""
+    bright, valid = _shown(store, index, kept_px, size_px)
+    return normalise(bright), valid
 
 
-def find_match_sigma(probes: Sequence[tuple[ViewTask, Array]], executor: Executor) -> float:
+@lru_cache(maxsize=8)
+def _look(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> tuple[NDArray[Any], ...]:
+    """Contrast, spline and validity of a picture, at a size."""
+    return prepared(*_shown(store, index, kept_px, size_px))
+
+
+def find_match_sigma(
+    scale: float, probes: Sequence[tuple[ViewTask, Array]], executor: Executor
+) -> float:
     """Standard deviation of a match in pixels as matched.
 
     How far depths from different partners differ, in units of what a match of `MATCH_SIGMA_PX`
     would give, shows the true precision: noise, calibration and poses together.
 
     Args:
+        scale: of matching, a factor on the size of the views.
         probes: some views with their partners, and points (N, 3) that bound their depth; what
             partners find stays for `view_depth`.
         executor: where tasks run.
     """
-    return match_sigma(list(executor.map(match_apart, probes, label="compare partners")))
+    match = partial(match_apart, scale)
+    return match_sigma(list(executor.map(match, probes, label="compare partners")))
 
 
-def match_apart(matched: tuple[ViewTask, Array]) -> float:
+def match_apart(scale: float, matched: tuple[ViewTask, Array]) -> float:
     """Match a view with its partners and keep what each finds; return the `spread` of that.
 
     Args:
+        scale: of matching.
         matched: the view with its partners, and points (N, 3) that bound its depth.
     """
     task, points_world = matched
-    depths = _pair_depths(task, points_world)
-    shape = (0, *task.view.pinhole.size_px[::-1])
+    depths = _pair_depths(scale, task, points_world)
+    shape = (0, *scaled_view(task.view, scale).pinhole.size_px[::-1])
     task.store.save(task.index, "apart", np.array([d.depth for d in depths] or np.empty(shape)))
     scales = np.array([d.focal_baseline for d in depths])
     task.store.save(task.index, "apart.scales", scales)
     return spread(depths)
 
 
-def _pair_depths(task: ViewTask, points_world: Array) -> list[PartnerDepth]:
-    """Depth of a view from each partner with which it can be rectified."""
-    store, width = task.store, task.view.pinhole.width_px
+def _pair_depths(scale: float, task: ViewTask, points_world: Array) -> list[PartnerDepth]:
+    """Depth of a view, shrunk by a factor, from each partner with which it can be rectified."""
+    store = task.store
     if store.has(task.index, "apart.scales"):
         scales = store.load(task.index, "apart.scales").tolist()
         kept = zip(store.load(task.index, "apart"), scales, strict=True)
         return [PartnerDepth(depth=depth, focal_baseline=scale) for depth, scale in kept]
-    look = _evened(store, task.index), store.load_mask(task.index, "valid", width)
-    found = []
-    for number, partner in task.others:
-        valid = store.load_mask(number, "valid", partner.pinhole.width_px)
-        looks = look, (_evened(store, number), valid)
-        found.append(pair_depth((task.view, partner), looks, points_world))
+    every = [
+        (number, view, scaled_view(view, scale))
+        for number, view in ((task.index, task.view), *task.others)
+    ]
+    looks = (
+        _evened(store, number, view.pinhole.size_px, small.pinhole.size_px)
+        for number, view, small in every
+    )
+    look, reference = next(looks), every[0][2]
+    partners = zip((small for *_, small in every[1:]), looks, strict=True)
+    found = [pair_depth((reference, small), (look, other), points_world)
+             for small, other in partners]  # fmt: skip
     return [depth for depth in found if depth is not None]
 
 
-def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
+def view_depth(scale: float, match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     """Match a view with its partners and merge what they find.
 
     Args:
-        match_sigma_px: standard deviation of a match.
+        scale: of matching, a factor on the size of the views: the depth has this size.
+        match_sigma_px: standard deviation of a match, in pixels as matched.
         matched: the view with its partners, and points (N, 3) that bound its depth.
     """
     task, points_world = matched
     store = task.store
     if store.has(task.index, "agreeing") or store.has(task.index, "fine"):
         return
-    depths = _pair_depths(task, points_world)
+    depths = _pair_depths(scale, task, points_world)
     if depths:
         depth, sigma, agreeing = merge_depths(
             np.stack([one.depth for one in depths]),
@@ -162,7 +189,7 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
             GATE_SIGMAS,
         )
     else:
-        shape = task.view.pinhole.size_px[::-1]
+        shape = scaled_view(task.view, scale).pinhole.size_px[::-1]
         depth = np.full(shape, np.nan, np.float32)
         sigma, agreeing = depth, np.zeros(shape, np.uint8)
     store.save_depth(task.index, "depth", depth, sigma)
@@ -171,34 +198,56 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     store.drop(task.index, "apart.scales")
 
 
-def refine_view(task: ViewTask) -> None:
+def refining_scales(scale: float) -> list[float]:
+    """Factors on the size of a view at which a depth that was matched at one of them is refined.
+
+    Each is twice the one before, so that an error of matching is within the reach of the
+    refinement; the last is 1.
+    """
+    octaves = max(1, math.ceil(-math.log2(scale)))
+    return [0.5**n for n in reversed(range(octaves))]
+
+
+def refine_view(scale: float, task: ViewTask) -> None:
     """Make a view's depth exact by its best neighbours at once.
 
     Pictures of its own station serve where no other station sees, or where there is hardly one.
+
+    Args:
+        scale: at which the depth was matched.
+        task: the view, and the neighbours to refine with.
     """
-    store = task.store
+    store, full_px = task.store, task.view.pinhole.size_px
     if store.has(task.index, "fine"):
         return
-
-    def look(number: int, view: View) -> ComparedView:
-        contrast, spline, valid = _look(store, number, view.pinhole.width_px)
-        return ComparedView(view=view, contrast=contrast, spline=spline, valid=valid)
-
     apart = [other for other in task.others if other[1].station != task.view.station]
     rig = [other for other in task.others if other[1].station == task.view.station]
     first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
     depth, sigma = store.load_depth(task.index, "depth")
-    refined = refine(
-        look(task.index, task.view),
-        depth,
-        sigma,
-        [look(*other) for other in first],
-        [look(*other) for other in spare],
-    )
+    for factor in refining_scales(scale):
+
+        def look(number: int, view: View, factor: float = factor) -> ComparedView:
+            small = scaled_view(view, factor)
+            shown = _look(store, number, view.pinhole.size_px, small.pinhole.size_px)
+            contrast, spline, valid = shown
+            return ComparedView(view=small, contrast=contrast, spline=spline, valid=valid)
+
+        reference = look(task.index, task.view)
+        depth, sigma = (enlarged(of, reference.view.pinhole.size_px) for of in (depth, sigma))
+        start = depth
+        refined = refine(
+            reference,
+            depth,
+            sigma,
+            [look(*other) for other in first],
+            [look(*other) for other in spare],
+        )
+        depth, sigma = refined.depth, refined.sigma
     agreeing = np.asarray(store.load(task.index, "agreeing"))
-    support = np.where(np.isfinite(depth), np.maximum(agreeing, refined.seen), refined.seen)
+    agreeing = cv2.resize(agreeing, full_px, interpolation=cv2.INTER_NEAREST)
+    support = np.where(np.isfinite(start), np.maximum(agreeing, refined.seen), refined.seen)
     store.save(task.index, "seen", support.astype(np.uint8))
-    store.save_depth(task.index, "fine", refined.depth, refined.sigma)
+    store.save_depth(task.index, "fine", depth, sigma)
     store.drop(task.index, "agreeing")
     store.drop(task.index, "depth")
     store.drop(task.index, "depth.sigma")

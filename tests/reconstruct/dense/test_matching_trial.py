@@ -7,13 +7,23 @@ import pytest
 
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.frames import Array
-from reconstruct.dense.matching_trial import find_scale, matching_scale
+from alice_survey.base.robust import MAD_TO_SIGMA
+from reconstruct.dense import matching_trial
+from reconstruct.dense.depth import enlarged
+from reconstruct.dense.matching_trial import Scales, find_scales, matching_scale, scale_for_cell
 from reconstruct.dense.stereo_pairs import choose_partners
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.dense.views import ViewTask, find_match_sigma, prepare_view, view_depth
+from reconstruct.dense.views import (
+    ViewTask,
+    find_match_sigma,
+    prepare_view,
+    refine_view,
+    view_depth,
+)
 from reconstruct.views.model import points_of_views, scaled_view
 from tests.oracles_dense import (
     Scene,
+    hits,
     sloped_with_step,
     sparse_model,
     speckle,
@@ -34,8 +44,10 @@ def survey(tmp_path_factory: pytest.TempPathFactory):
 def conditions(workspace: Path, model, folder: Path) -> tuple[float, float]:
     """Scale, and the standard deviation of a match."""
     partners, points = choose_partners(model, 3), points_of_views(model)
-    scale = find_scale(workspace, model.views, partners, points.__getitem__, SERIAL)
-    return scale, find_match_sigma(matched(workspace, model, scale, folder)[:2], SERIAL)
+    scales = find_scales(workspace, model.views, partners, points.__getitem__, 1.0, SERIAL)
+    assert scales.matching == scales.depth
+    tasks = matched(workspace, model, scales.depth, folder)
+    return scales.depth, find_match_sigma(1.0, tasks[:2], SERIAL)
 
 
 def matched(workspace: Path, model, scale: float, folder: Path) -> list[tuple[ViewTask, Array]]:
@@ -58,15 +70,65 @@ def test_clear_pictures_are_matched_as_they_are_and_better_than_assumed(survey, 
     assert 0.15 <= sigma_px < 0.3
 
 
+def test_depth_matched_in_smaller_pictures_is_as_exact_once_it_is_refined(survey, tmp_path):
+    workspace, model = survey
+    shares, errors = [], []
+    for scale in (1.0, 0.5, 0.25):
+        tasks = matched(workspace, model, 1.0, tmp_path / f"{scale}")
+        store, view = tasks[0][0].store, model.views[0]
+        view_depth(scale, 0.3, tasks[0])
+        assert store.load(0, "depth").shape == scaled_view(view, scale).pinhole.size_px[::-1]
+        refine_view(scale, tasks[0][0])
+        depth, sigma = store.load_depth(0, "fine")
+        points = view.world_from_cam.inv().apply(hits(view, SCENE).reshape(-1, 3))
+        error = (depth - points[:, 2].reshape(depth.shape)) / sigma
+        shares.append(np.isfinite(depth).mean())
+        errors.append(MAD_TO_SIGMA * np.median(np.abs(error[np.isfinite(error)])))
+    assert min(shares) > 0.9 * shares[0] > 0.3
+    assert 0.5 < min(errors) <= max(errors) < 1.5 < 4 * errors[0]
+
+
+def test_enlarged_depth_of_a_plane_is_that_plane_and_unknown_stays_unknown():
+    rows, columns = np.mgrid[:60, :80] + 0.5
+    small = (1 / (0.4 + 0.001 * columns - 0.0007 * rows)).astype(np.float32)
+    small[20:30, 30:50] = np.nan
+    large = enlarged(small, (160, 120))
+    rows, columns = (np.mgrid[:120, :160] + 0.5) / 2
+    plane = 1 / (0.4 + 0.001 * columns - 0.0007 * rows)
+    unknown = np.isnan(large)
+    np.testing.assert_array_equal(unknown, np.repeat(np.repeat(np.isnan(small), 2, 0), 2, 1))
+    inside = (slice(1, -1), slice(1, -1))
+    away = ~cv2.dilate(unknown.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    np.testing.assert_allclose(large[inside][away[inside]], plane[inside][away[inside]], rtol=2e-6)
+    np.testing.assert_allclose(large[~unknown], plane[~unknown], rtol=0.002)
+    assert enlarged(small, (80, 60)) is small
+
+
+@pytest.mark.parametrize(("cell", "scale"), [(None, 1.0), (0.01, 1.0), (0.1, None), (9.0, 0.05)])
+def test_scale_follows_from_the_cell_that_is_wanted(survey, cell, scale):
+    model = survey[1]
+    found = scale_for_cell(cell, model.views, points_of_views(model).__getitem__)
+    pixel = 2.0 / model.views[0].pinhole.focal_px
+    assert found == pytest.approx(2.5 * pixel / 0.1 if scale is None else scale, rel=0.1)
+
+
+def test_detail_below_the_scale_of_matching_is_kept_where_pictures_are_clear(survey, monkeypatch):
+    workspace, model = survey
+    monkeypatch.setattr(matching_trial, "LARGEST_PIXELS", 30_000)
+    partners, points = choose_partners(model, 3), points_of_views(model).__getitem__
+    found = find_scales(workspace, model.views, partners, points, 1.0, SERIAL)
+    assert found == Scales(depth=1.0, matching=0.5)
+
+
 def test_views_in_which_partners_were_compared_get_the_depth_of_any_other(survey, tmp_path):
     workspace, model = survey
     depths = []
     for chosen in ([0], []):
         found = matched(workspace, model, 1.0, tmp_path / f"store{len(chosen)}")
-        find_match_sigma([found[n] for n in chosen], SERIAL)
+        find_match_sigma(1.0, [found[n] for n in chosen], SERIAL)
         store = found[0][0].store
         assert store.has(0, "apart") == bool(chosen)
-        view_depth(0.25, found[0])
+        view_depth(1.0, 0.25, found[0])
         assert not store.has(0, "apart") and not store.has(0, "apart.scales")
         depths.append(store.load_depth(0, "depth"))
     assert np.isfinite(depths[0][0]).mean() > 0.3
