@@ -10,7 +10,7 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.view_store import WHOLE, Part
 from reconstruct.views.model import View, enu_from_cam
-from reconstruct.views.range_shift import FAST, KernelLens, slopes_of
+from reconstruct.views.range_shift import FAST, KernelLens, line_of, slopes_of
 
 Float32 = NDArray[np.float32]
 
@@ -115,23 +115,47 @@ def points_in_box(
     )
 
 
-def block_bounds(
-    shape: tuple[int, int], rows: NDArray[np.int64], columns: NDArray[np.int64], world: Array
-) -> Float32:
+def points_of_pixels(view: View, depth: Float32, chosen: NDArray[np.bool_]) -> Array:
+    """World points (N, 3) that a view shows at chosen pixels (H, W) of its depth, row by row."""
+    transform = np.ascontiguousarray(view.world_from_cam.as_matrix()[:3])
+    found = np.empty((np.count_nonzero(chosen), 3))
+    _place(depth, chosen, view.kernel_lens, transform, found)
+    return found
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _place(
+    depth: Float32, chosen: NDArray[np.bool_], lens: KernelLens, transform: Array, found: Array
+) -> None:
+    pinhole, field, inverse_working = lens
+    count = 0
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            if chosen[row, column]:
+                line = line_of(pinhole, field, inverse_working, column + 0.5, row + 0.5)
+                z = np.float64(depth[row, column])
+                x, y = z * line[0] + line[2], z * line[1] + line[3]
+                for k in range(3):
+                    found[count, k] = (
+                        transform[k, 0] * x + transform[k, 1] * y + transform[k, 2] * z
+                    ) + transform[k, 3]
+                count += 1
+
+
+def block_bounds(chosen: NDArray[np.bool_], world: Array) -> Float32:
     """Between which coordinates the points of each block of pixels lie.
 
     Args:
-        shape: (H, W) of the picture.
-        rows: (N,) of pixels.
-        columns: (N,) of the same pixels.
-        world: (N, 3) their points: north, east, down.
+        chosen: (H, W) pixels of a picture.
+        world: (N, 3) their points, row by row: north, east, down.
 
     Returns:
         (h, w, 4) west, east, south, north, a little wide; west beyond east in an empty block.
     """
-    bounds = np.empty((-(-shape[0] // _BLOCK), -(-shape[1] // _BLOCK), 4))
+    height, width = chosen.shape
+    bounds = np.empty((-(-height // _BLOCK), -(-width // _BLOCK), 4))
     bounds[..., 0::2], bounds[..., 1::2] = np.inf, -np.inf
-    _widen(bounds, rows, columns, world)
+    _widen(bounds, chosen, world)
     margin = _ROUNDING * float(np.abs(world[:, :2]).max(initial=1.0))
     wide: Float32 = (bounds + margin * np.array([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)
     return wide
@@ -150,14 +174,16 @@ def _meeting(
 
 
 @compiled
-def _widen(
-    bounds: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], world: Array
-) -> None:
+def _widen(bounds: Array, chosen: NDArray[np.bool_], world: Array) -> None:
     """Widen blocks' bounds by points, in place."""
-    for i in range(rows.shape[0]):
-        block = bounds[rows[i] // _BLOCK, columns[i] // _BLOCK]
-        block[0], block[1] = min(block[0], world[i, 1]), max(block[1], world[i, 1])
-        block[2], block[3] = min(block[2], world[i, 0]), max(block[3], world[i, 0])
+    i = 0
+    for row in range(chosen.shape[0]):
+        for column in range(chosen.shape[1]):
+            if chosen[row, column]:
+                block = bounds[row // _BLOCK, column // _BLOCK]
+                block[0], block[1] = min(block[0], world[i, 1]), max(block[1], world[i, 1])
+                block[2], block[3] = min(block[2], world[i, 0]), max(block[3], world[i, 0])
+                i += 1
 
 
 def joined(parts: list[Points]) -> Points:

@@ -75,10 +75,9 @@ def fuse_surface(
     Returns:
         (M,) records of `SURFACE_POINT`.
     """
-    known = points.part(np.isfinite(points.normals[:, 0]))
     return np.concatenate(
         [
-            _fuse_along(known, stations, cell, origin, shared, axis, sign)
+            _fuse_along(points, stations, cell, origin, shared, axis, sign)
             for axis in (2, 0, 1)
             for sign in (1.0, -1.0)
         ]
@@ -94,13 +93,15 @@ def _fuse_along(
     axis: int,
     sign: float,
 ) -> NDArray[Any]:
-    facing = points.part(sign * points.normals[:, axis] >= _LEAST_ALONG)
-    if not len(facing.enu):
+    facing = np.flatnonzero(sign * points.normals[:, axis] >= _LEAST_ALONG)
+    if not len(facing):
         return np.empty(0, SURFACE_POINT)
     across = [k for k in range(3) if k != axis]
-    at = np.floor((facing.enu[:, across] - origin[across]) / cell).astype(np.int64)
-    order = np.lexsort((at[:, 1], at[:, 0])).astype(np.int64)
-    at, ranked = at[order], facing.part(order)
+    at = np.floor((points.enu[facing][:, across] - origin[across]) / cell).astype(np.int64)
+    order = np.arange(len(at))
+    for k in (1, 0):
+        order = order[stable_order(at[order, k])]
+    at, ranked = at[order], points.part(facing[order])
     starts = np.flatnonzero(np.any(np.diff(at, axis=0, prepend=at[:1] - 1), axis=1))
     found = fuse_cells(
         np.append(starts, len(at)), origin[across] + (at[starts] + 0.5) * cell, ranked.enu,
@@ -112,6 +113,24 @@ def _fuse_along(
     for name, values in zip(names, found, strict=True):
         records[name] = values
     return records
+
+
+@compiled
+def stable_order(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) that sorts keys (N,) and keeps the order of equal ones.
+
+    It counts, in time and memory of N plus the range of the keys.
+    """
+    least = keys.min()
+    starts = np.zeros(keys.max() - least + 2, np.int64)
+    for key in keys:
+        starts[key - least + 1] += 1
+    starts = np.cumsum(starts)
+    order = np.empty_like(keys)
+    for i, key in enumerate(keys):
+        order[starts[key - least]] = i
+        starts[key - least] += 1
+    return order
 
 
 @compiled

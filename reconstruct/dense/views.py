@@ -29,7 +29,7 @@ from reconstruct.dense.depth import (
     pair_depth,
 )
 from reconstruct.dense.matching_trial import match_sigma, resized, shrunk, spread
-from reconstruct.dense.points import block_bounds
+from reconstruct.dense.points import block_bounds, points_of_pixels
 from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.surface_tiles import ViewSummary
@@ -272,7 +272,7 @@ def disagreement(task: ViewTask) -> float:
     chosen = slice(_COMPARED_STEP_PX // 2, None, _COMPARED_STEP_PX)
     lattice[chosen, chosen] = True
     rows, columns = np.nonzero(lattice & np.isfinite(depth))
-    points = _world_points(task.view, depth, rows, columns)
+    points = points_of_pixels(task.view, depth, lattice & np.isfinite(depth))
     parts = []
     for number, other in task.others:
         level, share, depths, shares = task.store.stored_depth(number, "fine")
@@ -331,15 +331,10 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
         supported += seen
         refuted += through
     kept = np.isfinite(depth) & (alike + supported >= 2) & (refuted <= supported)
-    rows, columns = np.nonzero(kept)
-    nodes = at_nodes(np.asarray(store.load(task.index, "low")))
-    if len(rows) < _LEAST_PIXELS:
-        store.save_mask(task.index, "kept", np.zeros_like(kept))
-        store.save(task.index, LIGHT, as_rows(joined_samples([])))
-        return nodes, 0
+    kept &= np.count_nonzero(kept) >= _LEAST_PIXELS
     store.save_mask(task.index, "kept", kept)
-    points = _world_points(view, depth, rows, columns)
-    light = as_rows(_shared_light(task, points, rows, columns))
+    nodes = at_nodes(np.asarray(store.load(task.index, "low")))
+    light = as_rows(_shared_light(task, depth, kept))
     store.save(task.index, LIGHT, light)
     return nodes, len(light)
 
@@ -377,15 +372,14 @@ def lay_out_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
     depth, sigma = store.load_depth(task.index, "fine")
     sigma *= np.float32(sigma_factor)
     kept = store.load_mask(task.index, "kept", view.pinhole.width_px)
-    rows, columns = np.nonzero(kept)
-    if len(rows) < _LEAST_PIXELS:
+    if not kept.any():
         return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, sigma=np.nan)
-    points = _world_points(view, depth, rows, columns)
-    low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
-    beyond = (points[:, :2] < low) | (points[:, :2] > high)
-    kept[rows, columns] = ~beyond.any(axis=1)
+    points = points_of_pixels(view, depth, kept)
+    store.save(task.index, "blocks", block_bounds(kept, points))
+    ends = [_BOUND_PERCENT, 100 - _BOUND_PERCENT]
+    low, high = np.transpose([np.percentile(points[:, k].copy(), ends) for k in range(2)])
+    kept[kept] = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
     store.save_mask(task.index, "inside", kept)
-    store.save(task.index, "blocks", block_bounds(kept.shape, rows, columns, points))
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),
@@ -395,13 +389,14 @@ def lay_out_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
 
 
 def _shared_light(
-    task: ViewTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    task: ViewTask, depth: NDArray[np.float32], kept: NDArray[np.bool_]
 ) -> LightSamples:
     """Compare the light of a view and its neighbours on a lattice of its pixels."""
     step = max(1, task.view.pinhole.width_px // _LIGHT_LATTICE)
-    chosen = (rows % step == 0) & (columns % step == 0)
-    spots = points[chosen]
-    here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / task.view.pinhole.size_px
+    chosen = np.zeros_like(kept)
+    chosen[::step, ::step] = kept[::step, ::step]
+    spots = points_of_pixels(task.view, depth, chosen)
+    here = (np.argwhere(chosen)[:, ::-1] + 0.5) / task.view.pinhole.size_px
     own = np.asarray(task.store.load(task.index, "low"))
     parts = []
     for number, other in task.others:
@@ -415,10 +410,3 @@ def _shared_light(
             )
         )
     return joined_samples(parts)
-
-
-def _world_points(
-    view: View, depth: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64]
-) -> Array:
-    pixels: Array = np.column_stack([columns, rows]).astype(np.float64) + 0.5
-    return view.at_depth(pixels, depth[rows, columns].astype(np.float64))

@@ -4,7 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import block_bounds, joined, part_in_box, points_in_box
+from reconstruct.dense.points import (
+    block_bounds,
+    joined,
+    part_in_box,
+    points_in_box,
+    points_of_pixels,
+)
 from reconstruct.dense.view_store import WHOLE, ViewStore
 from reconstruct.views.model import enu_from_cam
 from reconstruct.views.range_shift import no_shift
@@ -35,20 +41,18 @@ def gathered(view, box=EVERYWHERE, factors=None, depth=None):
     depth = depth_of(view) if depth is None else depth
     colour = np.zeros((*depth.shape, 3), np.uint8)
     colour[...] = (100, 50, 20)
-    rows, columns = np.nonzero(np.isfinite(depth))
-    pixels = np.column_stack([columns, rows]) + 0.5
-    world = view.at_depth(pixels, depth[rows, columns].astype(float))
+    known = np.isfinite(depth)
     return points_in_box(
         view,
         7,
         depth,
         np.full_like(depth, 0.01),
-        np.isfinite(depth),
+        known,
         colour,
         np.ones((2, 2, 3), np.float32) if factors is None else factors,
         OFFSET,
         box,
-        block_bounds(depth.shape, rows, columns, world),
+        block_bounds(known, points_of_pixels(view, depth, known)),
     )
 
 
@@ -174,10 +178,12 @@ def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp
     store.save_depth(7, "fine", depth, np.full_like(depth, 0.01))
     store.save_mask(7, "inside", rng.random(depth.shape) > 0.1)
     store.save_colour(7, colour)
-    rows, columns = np.nonzero(np.isfinite(depth))
+    chosen = np.isfinite(depth) & (rng.random(depth.shape) > 0.3)
+    rows, columns = np.nonzero(chosen)
     pixels = np.column_stack([columns, rows]) + 0.5
     world = view.at_depth(pixels, depth[rows, columns].astype(float))
-    blocks = block_bounds(depth.shape, rows, columns, world)
+    np.testing.assert_allclose(points_of_pixels(view, depth, chosen), world, rtol=0, atol=1e-11)
+    blocks = block_bounds(np.isfinite(depth), points_of_pixels(view, depth, np.isfinite(depth)))
     east, north = world[:, 1] - OFFSET[0], world[:, 0] - OFFSET[1]
     factors = rng.uniform(0.5, 1.5, (5, 6, 3)).astype(np.float32)
 
