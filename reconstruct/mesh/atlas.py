@@ -1,12 +1,12 @@
 """Where every patch of a mesh lies in the pages of its texture."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.mesh.labels import Charts
@@ -160,44 +160,60 @@ def pack(boxes: NDArray[np.int64], side: int) -> tuple[NDArray[np.int32], NDArra
     Returns:
         Page (C,) and corner (C, 2) of every box; no two of a page overlap.
     """
-    page = np.zeros(len(boxes), np.int32)
-    corner = np.zeros((len(boxes), 2), np.int64)
-    skylines: list[list[tuple[int, int]]] = []
-    for box in np.lexsort((np.arange(len(boxes)), -boxes[:, 0], -boxes[:, 1])):
-        width, height = int(boxes[box, 0]), int(boxes[box, 1])
-        for number in range(len(skylines) + 1):
-            if number == len(skylines):
-                skylines.append([(0, 0)])
-            found = _lowest(skylines[number], width, side)
-            if found is not None and found[1] + height <= side:
-                x, y = found
-                page[box], corner[box] = number, (x, y)
-                skylines[number] = _raised(skylines[number], x, x + width, y + height)
-                break
+    left = np.lexsort((np.arange(len(boxes)), -boxes[:, 0], -boxes[:, 1]))
+    page, corner = np.zeros(len(boxes), np.int32), np.zeros((len(boxes), 2), np.int64)
+    number = 0
+    while len(left):  # each page takes what fits, in order
+        at = _fill_page(boxes[left].astype(np.int64), side)
+        taken = at[:, 0] >= 0
+        page[left[taken]], corner[left[taken]] = number, at[taken]
+        left, number = left[~taken], number + 1
     return page, corner
 
 
-def _lowest(skyline: Sequence[tuple[int, int]], width: int, side: int) -> tuple[int, int] | None:
-    """Leftmost of the lowest places for a width; a skyline lists where steps start, and levels."""
-    best: tuple[int, int] | None = None
-    for first, (x, _) in enumerate(skyline):
+@compiled
+def _fill_page(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
+    """Corners (C, 2) of boxes (C, 2), taken in their order; -1 of those that do not fit."""
+    corner = np.full(boxes.shape, -1, np.int64)
+    skyline, steps = np.zeros((min(side, 2 * len(boxes)) + 3, 2), np.int64), 1
+    for box in range(len(boxes)):
+        width, height = boxes[box, 0], boxes[box, 1]
+        x, y = _lowest(skyline[:steps], width, side)
+        if x >= 0 and y + height <= side:
+            corner[box, 0], corner[box, 1] = x, y
+            steps = _raise(skyline, steps, x, x + width, y + height)
+    return corner
+
+
+@compiled
+def _lowest(skyline: NDArray[np.int64], width: int, side: int) -> tuple[int, int]:
+    """Leftmost of the lowest places for a width, and its level; -1 where none is wide enough."""
+    best, lowest = -1, 0
+    for first in range(len(skyline)):
+        x = skyline[first, 0]
         if x + width > side:
             break
         level = 0
-        for start, y in skyline[first:]:
-            if start >= x + width:
+        for step in range(first, len(skyline)):
+            if skyline[step, 0] >= x + width:
                 break
-            level = max(level, y)
-        if best is None or level < best[1]:
-            best = (x, level)
-    return best
+            level = max(level, skyline[step, 1])
+        if best < 0 or level < lowest:
+            best, lowest = x, level
+    return best, lowest
 
 
-def _raised(
-    skyline: Sequence[tuple[int, int]], west: int, east: int, level: int
-) -> list[tuple[int, int]]:
-    """The skyline once what is between two places stands at a level."""
-    under = [y for x, y in skyline if x <= east][-1]
-    kept = [(x, y) for x, y in skyline if x < west]
-    beyond = [(x, y) for x, y in skyline if x > east]
-    return [*kept, (west, level), (east, under), *beyond]
+@compiled
+def _raise(skyline: NDArray[np.int64], steps: int, west: int, east: int, level: int) -> int:
+    """Bring what is between two places to a level, in place; how many steps there are then."""
+    first = 0
+    while skyline[first, 0] < west:
+        first += 1
+    last, under = first, skyline[first, 1]
+    while last < steps and skyline[last, 0] <= east:
+        under = skyline[last, 1]
+        last += 1
+    skyline[first + 2 : first + 2 + steps - last] = skyline[last:steps].copy()
+    skyline[first, 0], skyline[first, 1] = west, level
+    skyline[first + 1, 0], skyline[first + 1, 1] = east, under
+    return first + 2 + steps - last
