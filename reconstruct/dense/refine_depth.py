@@ -15,6 +15,7 @@ the noise that remains between pictures.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -51,8 +52,12 @@ _LEAST_SHARE = 0.4
 """Share of a window's weight that a neighbour must see."""
 _OUTLYING = 2.5
 """Deviations beyond which a pixel counts less than half."""
+_BAND_PIXELS = 500_000
+"""Pixels of a picture that are worked on at once; they take some 0.1 kB each."""
+_MARGIN_ROWS = 16
+"""Rows around them that their windows reach: twice 5 for sums, and 4 around what moves far."""
 _LEAST_UNSEEN = 0.005
-"""Share of a view that no other station sees, from which its own station's pictures are asked."""
+"""Share of a band that no other station sees, from which its own station's pictures are asked."""
 _LONGEST_STEP_PX = 1.0
 """Longest step of a round, along the epipolar line of the neighbour that moves most."""
 
@@ -94,8 +99,8 @@ def _blur(picture: Float32, sigma_px: float) -> Float32:
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def pixel_lines(lens: KernelLens, height: int, width: int) -> Float32:
-    """Lines on which the spots of a view's pixels lie, (H, W, 4).
+def pixel_lines(lens: KernelLens, height: int, width: int, top: int = 0) -> Float32:
+    """Lines on which the spots of a view's pixels lie, (H, W, 4), from a row of it on.
 
     Slopes x/z, y/z at an inverse depth of zero, and how they change with it.
     """
@@ -103,7 +108,7 @@ def pixel_lines(lens: KernelLens, height: int, width: int) -> Float32:
     lines = np.empty((height, width, 4), np.float32)
     for row in range(height):
         for column in range(width):
-            line = line_of(pinhole, field, inverse_working, column + 0.5, row + 0.5)
+            line = line_of(pinhole, field, inverse_working, column + 0.5, top + row + 0.5)
             for k in range(4):
                 lines[row, column, k] = line[k]
     return lines
@@ -222,7 +227,8 @@ def refine(
     """Correct a depth map by all neighbours at once.
 
     A window that holds a step of the surface has no single correction: there the depth and its
-    deviation stay as they were.
+    deviation stay as they were. Rows are worked on in bands, so that memory does not grow with the
+    picture.
 
     Args:
         reference: whose depth it is.
@@ -231,6 +237,40 @@ def refine(
         others: neighbours to compare with.
         spare: those to compare with where none of the others sees the spot.
     """
+    height, width = depth.shape
+    count = -(-height * width // _BAND_PIXELS)
+    ends = np.linspace(0, height, count + 1).astype(int).tolist()
+    bands = []
+    for first, last in pairwise(ends):
+        part = slice(max(first - _MARGIN_ROWS, 0), last + _MARGIN_ROWS)
+        inner = slice(first - part.start, last - part.start)
+        band = _refine_band(
+            _Band(view=reference.view, top=part.start, contrast=reference.contrast[part],
+                  valid=reference.valid[part]),
+            depth[part], sigma[part], others, spare,
+        )  # fmt: skip
+        bands.append([one[inner] for one in (band.depth, band.sigma, band.seen)])
+    joined = [np.concatenate(parts) for parts in zip(*bands, strict=True)]
+    return RefinedDepth(depth=joined[0], sigma=joined[1], seen=joined[2])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Band:
+    """Rows of a picture."""
+
+    view: View
+    top: int
+    contrast: Float32
+    valid: NDArray[np.bool_]
+
+
+def _refine_band(
+    reference: _Band,
+    depth: Float32,
+    sigma: Float32,
+    others: Sequence[ComparedView],
+    spare: Sequence[ComparedView],
+) -> RefinedDepth:
     inverse = (1.0 / depth).astype(np.float32)
     first = _sums_of(reference, inverse, others, spare)
     moved, step_px = _stepped(inverse, first)
@@ -282,7 +322,7 @@ def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
 
 
 def _sums_of(
-    reference: ComparedView,
+    reference: _Band,
     inverse: Float32,
     others: Sequence[ComparedView],
     spare: Sequence[ComparedView],
@@ -296,13 +336,11 @@ def _sums_of(
     return _chosen(unseen, alone, sums)
 
 
-def _sums(
-    reference: ComparedView, inverse: Float32, others: Sequence[ComparedView]
-) -> _NeighbourSums:
+def _sums(reference: _Band, inverse: Float32, others: Sequence[ComparedView]) -> _NeighbourSums:
     shape = inverse.shape
     pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
     likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    lines = pixel_lines(reference.view.kernel_lens, *shape)
+    lines = pixel_lines(reference.view.kernel_lens, *shape, reference.top)
     samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
     mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
     spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean

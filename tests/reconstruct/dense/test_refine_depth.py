@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from reconstruct.dense import refine_depth
 from reconstruct.dense.refine_depth import ComparedView, compare, pixel_lines, prepared, refine
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
@@ -82,6 +83,22 @@ def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
     assert before > 0.004
     assert 1e-4 < after < 0.4 * before  # 1.5 mm, rims that one neighbour sees included
     assert 0.3 < 1.4826 * np.median(np.abs(error / found.sigma[known])) < 3.0
+
+
+def test_bands_of_rows_are_refined_as_the_whole_picture_is(monkeypatch):
+    """But for the noise, which is measured in each band: the seams must not show."""
+    true = true_depth()
+    start = (true + 0.006 * np.sin(np.arange(true.shape[1]) / 9)).astype(np.float32)
+    sigma = np.full_like(start, 0.004)
+    whole = refine(looks()[0], start, sigma, looks()[1:])
+    monkeypatch.setattr(refine_depth, "_BAND_PIXELS", start.size // 5)
+    bands = refine(looks()[0], start, sigma, looks()[1:])
+    assert (np.isfinite(whole.depth) != np.isfinite(bands.depth)).mean() < 1e-3
+    apart = np.abs(bands.depth - whole.depth) / whole.sigma
+    assert 0.0 < np.nanpercentile(apart, 99.9) < 0.3
+    ends = np.linspace(0, start.shape[0], 6).astype(int)[1:-1]
+    at_seams = np.concatenate([np.arange(end - 3, end + 3) for end in ends])
+    assert np.nanmean(apart[at_seams]) < 1.5 * np.nanmean(apart)
 
 
 def test_windows_across_a_step_keep_what_they_had():
