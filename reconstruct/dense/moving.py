@@ -81,7 +81,7 @@ class Look:
     step: int
     """Pixels of the view to a cell, each way."""
     light: Float32
-    """(h, w, 3) logarithm of even light, BGR."""
+    """(h, w, 3, 3) logarithm of even light in BGR, and its least and most in 3 x 3 cells."""
     usable: Mask
     """(h, w) where it shows something that may be used."""
     depth: Float32
@@ -195,7 +195,7 @@ def keep_look(task: ViewTask) -> None:
     middle = slice(step // 2, h * step, step), slice(step // 2, w * step, step)
     shown = cv2.resize(_LOGARITHMS[colour[part]], (w, h), interpolation=cv2.INTER_AREA)
     usable = cv2.resize(valid[part].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA) > 0
-    store.save(index, "look.light", shown + np.log(factors[middle]))
+    store.save(index, "look.light", with_bounds(shown + np.log(factors[middle])))
     store.save(index, "look.usable", usable)
     store.save(index, "look.depth", np.ascontiguousarray(depth[middle]))
 
@@ -235,28 +235,36 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     pixels = (pixels + 0.5) * look.step
     points = look.view.at_depth(pixels, still[rows, columns].astype(np.float64))
     own = look.light[rows, columns]
-    shown, stations, sigmas = [], [], []
+    places = pixels / look.view.pinhole.size_px
+    shown = np.empty((len(others), *own.shape), np.float32)
+    stations: list[int] = []
+    sigmas: list[Array] = []
     for other in others:
-        there, ranges = _shown_at(other, points)
-        known = np.isfinite(there[:, 0, 0])
-        if known.sum() < _LEAST_CELLS:
+        cells, log_ratio = cells_at(
+            points,
+            still[rows, columns],
+            np.ascontiguousarray(other.view.world_from_cam.inv().as_matrix()[:3]),
+            other.view.kernel_lens,
+            float(other.step),
+            other.depth,
+            other.usable,
+        )
+        known = np.flatnonzero(cells >= 0)
+        if len(known) < _LEAST_CELLS:
             continue
-        features = _smooth(pixels / look.view.pinhole.size_px,
-                           np.log(still[rows, columns] / ranges))  # fmt: skip
-        fit, sigma = _smooth_difference(features[known], (own - there[:, 0])[known])
-        shown.append(there + (features @ fit)[:, None].astype(np.float32))
+        chosen = known[:: max(1, len(known) // _FITTED_CELLS)]
+        there = other.light.reshape(-1, 3, 3)[cells[chosen], 0]
+        fit, sigma = _smooth_difference(
+            _smooth(places[chosen], log_ratio[chosen]), own[chosen, 0] - there
+        )
+        adapt(other.light, cells, places, log_ratio, fit, shown[len(stations)])
         sigmas.append(sigma)
         stations.append(other.view.station)
     if len(set(stations)) < 2:
         return nothing, 0.0
     sigma = np.median(sigmas, axis=0).astype(np.float32)
-    low, high = _box(look.light)
     misfit, votes = odd_ones(
-        np.stack([own, low[rows, columns], high[rows, columns]], axis=1),
-        np.stack(shown),
-        np.array(stations, np.int64),
-        sigma,
-        _GROWN,
+        own, shown[: len(stations)], np.array(stations, np.int64), sigma, _GROWN
     )
     field = np.full(shape, np.nan, np.float32)
     field[rows, columns] = np.where(votes >= 2, misfit, np.nan)
@@ -357,38 +365,25 @@ def agreed(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Flo
     return found
 
 
-def _shown_at(look: Look, points: Array) -> tuple[Float32, Float32]:
-    """What a view shows of points (N, 3): light (N, 3, 3) with bounds around, and depth; or NaN."""
-    cells, ranges = cells_at(
-        points,
-        np.ascontiguousarray(look.view.world_from_cam.inv().as_matrix()[:3]),
-        look.view.kernel_lens,
-        float(look.step),
-        look.depth,
-        look.usable,
-    )
-    low, high = _box(look.light)
-    shown = np.stack([one.reshape(-1, 3)[cells] for one in (look.light, low, high)], axis=1)
-    shown[cells < 0] = np.nan
-    return shown, ranges
-
-
 @compiled(error_model="numpy", fastmath=FAST)
 def cells_at(
     points: Array,
+    depth_here: Float32,
     cam_from_world: Array,
     lens: KernelLens,
     step: float,
     depth: Float32,
     usable: Mask,
-) -> tuple[NDArray[np.int64], Float32]:
-    """Cells (N,) of a view that show points (N, 3), counted by rows; -1 where none shows one.
+) -> tuple[NDArray[np.int64], Array]:
+    """Cells of a view that show points (N, 3) which have some depth (N,) in another.
 
-    Also (N,) the depth of the points; 1 where no cell shows them.
+    Returns:
+        (N,) cells, counted by rows, -1 where none shows the point; and (N,) the logarithm of the
+        point's depth in the other view over that in this one.
     """
     height, width = depth.shape
     cells = np.full(len(points), -1, np.int64)
-    ranges = np.ones(len(points), np.float32)
+    log_ratio = np.zeros(len(points))
     t = cam_from_world
     for n in range(len(points)):
         e, m, d = points[n, 0], points[n, 1], points[n, 2]
@@ -402,14 +397,47 @@ def cells_at(
         if column < 0 or row < 0 or column >= width or row >= height or not usable[row, column]:
             continue
         if abs(depth[row, column] - z) <= _SAME_DEPTH * z:
-            cells[n], ranges[n] = row * width + column, z
-    return cells, ranges
+            cells[n], log_ratio[n] = row * width + column, math.log(depth_here[n] / z)
+    return cells, log_ratio
 
 
-def _box(light: Float32) -> tuple[Float32, Float32]:
-    """Lowest and highest light in the 3 x 3 cells around each."""
+def with_bounds(light: Float32) -> Float32:
+    """Light (h, w, 3) with its lowest and highest in the 3 x 3 cells around, (h, w, 3, 3)."""
     kernel = np.ones((3, 3), np.uint8)
-    return cv2.erode(light, kernel), cv2.dilate(light, kernel)
+    return np.stack([light, cv2.erode(light, kernel), cv2.dilate(light, kernel)], axis=2)
+
+
+@compiled
+def adapt(
+    light: Float32,
+    cells: NDArray[np.int64],
+    places: Array,
+    log_ratio: Array,
+    fit: Array,
+    shown: Float32,
+) -> None:
+    """Write what a view shows as another would see it, (N, 3, 3); NaN where it shows nothing.
+
+    Args:
+        light: (h, w, 3, 3) of the view.
+        cells: (N,) of the view, see `cells_at`.
+        places: (N, 2) in the other, as shares of its size.
+        log_ratio: (N,) see `cells_at`.
+        fit: (7, 3) coefficients of `_smooth`.
+        shown: to write to.
+    """
+    width = light.shape[1]
+    for n in range(len(cells)):
+        if cells[n] < 0:
+            shown[n] = np.nan
+            continue
+        row, column = cells[n] // width, cells[n] % width
+        x, y = places[n, 0] - 0.5, places[n, 1] - 0.5
+        for c in range(3):
+            change = fit[0, c] + x * fit[1, c] + y * fit[2, c] + log_ratio[n] * fit[6, c]
+            change += x * x * fit[3, c] + x * y * fit[4, c] + y * y * fit[5, c]
+            for kind in range(3):
+                shown[n, kind, c] = light[row, column, kind, c] + change
 
 
 def _smooth(places: Array, log_ratio: Array) -> Array:
@@ -420,8 +448,7 @@ def _smooth(places: Array, log_ratio: Array) -> Array:
 
 def _smooth_difference(features: Array, apart: Float32) -> tuple[Array, Array]:
     """Fit differences of light (N, 3) robustly; coefficients (7, 3), and sigma (3,) of the rest."""
-    chosen = slice(None, None, max(1, len(features) // _FITTED_CELLS))
-    a, b = features[chosen], apart[chosen].astype(np.float64)
+    a, b = features, apart.astype(np.float64)
     fit = np.zeros((a.shape[1], 3))
     fit[0] = np.median(b, axis=0)
     ridge = 1e-3 * len(a) * np.eye(a.shape[1])

@@ -11,7 +11,7 @@ from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
-from reconstruct.dense.moving import agreed, cells_at, draw, odd_ones
+from reconstruct.dense.moving import adapt, agreed, cells_at, draw, odd_ones, with_bounds
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 from tests.oracles_dense import (
@@ -235,7 +235,8 @@ def test_cells_show_points_that_lie_at_their_depth():
     z = rng.uniform(1.1, 1.3, len(pixels))
     points = one.at_depth(pixels, z)
     to_cam = np.ascontiguousarray(one.world_from_cam.inv().as_matrix()[:3])
-    cells, ranges = cells_at(points, to_cam, one.kernel_lens, float(step), depth, usable)
+    here = (1.5 + 0.001 * np.arange(len(points))).astype(np.float32)
+    cells, log_ratio = cells_at(points, here, to_cam, one.kernel_lens, float(step), depth, usable)
 
     columns, rows = np.floor(pixels / step).astype(int).T
     inside = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0])
@@ -245,8 +246,23 @@ def test_cells_show_points_that_lie_at_their_depth():
     assert 0.1 < inside.mean() < 0.5
     assert (cells == expected).mean() > 0.998
     shown = (cells == expected) & inside
-    np.testing.assert_allclose(ranges[shown], z[shown], rtol=1e-6)
-    assert (ranges[cells < 0] == 1).all()
+    np.testing.assert_allclose(log_ratio[shown], np.log(here / z)[shown], atol=1e-6)
+
+
+def test_light_is_adapted_as_the_fitted_polynomial_says():
+    rng = np.random.default_rng(2)
+    light = with_bounds(rng.normal(size=(9, 11, 3)).astype(np.float32))
+    np.testing.assert_array_equal(light[4, 5, 1], light[3:6, 4:7, 0].min(axis=(0, 1)))
+    np.testing.assert_array_equal(light[4, 5, 2], light[3:6, 4:7, 0].max(axis=(0, 1)))
+    cells, places = rng.integers(-1, 99, 40), rng.random((40, 2))
+    log_ratio, fit = rng.normal(size=40), rng.normal(size=(7, 3))
+    shown = np.empty((40, 3, 3), np.float32)
+    adapt(light, cells, places, log_ratio, fit, shown)
+    x, y = places.T - 0.5
+    change = np.stack([x**0, x, y, x * x, x * y, y * y, log_ratio], axis=1) @ fit
+    expected = light.reshape(-1, 3, 3)[cells] + change[:, None]
+    expected[cells < 0] = np.nan
+    np.testing.assert_allclose(shown, expected, atol=1e-5)
 
 
 def test_a_cell_is_odd_where_others_agree_on_something_else():
