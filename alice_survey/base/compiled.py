@@ -8,18 +8,25 @@ enough for a package that is installed and not edited.
 """
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from tempfile import gettempdir
 from types import CodeType, ModuleType
 from typing import Any, ParamSpec, TypeVar, overload
 
 import numpy as np
+from filelock import FileLock, Timeout
 from numba import njit
+from numba.core.compiler_lock import global_compiler_lock
 
 from alice_survey.base.errors import note
 
 BLOCK = 128
 """Points at a time: loops over a block that do not branch become vector instructions."""
+_LONGEST_WAIT_S = 120.0
+"""For another process that compiles the same kernel."""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)
@@ -51,6 +58,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         if hasattr(index, "_source_stamp"):
             index._source_stamp = _Stamp(kernel)
             index._load_index = _readable(index._load_index)
+            kernel.compile = _once_a_machine(kernel)
         return kernel
 
     return decorated if function is None else decorated(function)
@@ -106,6 +114,31 @@ def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]
             return {}
 
     return loaded
+
+
+def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
+    """What compiles a kernel for a signature, or loads what is kept.
+
+    It does so while no other process of this machine compiles that kernel, so that of processes
+    that start together one compiles and the others load.
+    """
+    compile_it, cache = kernel.compile, kernel._cache
+    index = cache._cache_file
+    name = hashlib.blake2b(index._index_path.encode(), digest_size=16).hexdigest()
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    path = Path(gettempdir()) / f"alice-survey-kernels-{user}" / f"{name}.lock"
+
+    def compiled_once(signature: Any) -> Any:
+        if cache._index_key(signature, kernel.targetctx.codegen()) in index._load_index():
+            return compile_it(signature)
+        with ExitStack() as held:
+            held.enter_context(global_compiler_lock)  # first: other threads may hold it
+            with suppress(OSError, Timeout):  # then it is compiled once more
+                path.parent.mkdir(mode=0o700, exist_ok=True)
+                held.enter_context(FileLock(path, timeout=_LONGEST_WAIT_S))
+            return compile_it(signature)
+
+    return compiled_once
 
 
 class _Stamp:

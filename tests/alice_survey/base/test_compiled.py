@@ -49,13 +49,18 @@ def write(
     (folder / "numbers_used.py").write_text(f"FACTOR = {factor}\nUNUSED = 1\n")
 
 
-def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
-    environment = {
+def asking(folder: Path) -> dict[str, str]:
+    """Environment of a process that imports from a folder and keeps its kernels there."""
+    return {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[3])]),
         "NUMBA_CACHE_DIR": str(folder / "kept"),
         "PYTHONDONTWRITEBYTECODE": "1",  # which an edit in the same second would leave
     }
+
+
+def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
+    environment = asking(folder)
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
@@ -143,3 +148,23 @@ def test_recursion_ends() -> None:
         return int(down(n - 1) + 1)
 
     assert closure_digest(down) == closure_digest(down)
+
+
+def test_processes_that_start_together_compile_a_kernel_once(tmp_path):
+    write(tmp_path)
+    (tmp_path / "outer.py").write_text(OUTER)
+    code = (
+        "import pathlib, time, outer\n"
+        "from inner import once\n"
+        f"pathlib.Path({str(tmp_path / 'ready')!r} + str(__import__('os').getpid())).touch()\n"
+        f"while len(list(pathlib.Path({str(tmp_path)!r}).glob('ready*'))) < 3: time.sleep(0.01)\n"
+        "print(outer.twice(3.0), *[sum(k.stats.cache_misses.values()) for k in (outer.twice, once)])"
+    )
+    environment = asking(tmp_path)
+    started = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE)
+        for _ in range(3)
+    ]
+    found = [process.communicate(timeout=120)[0].split() for process in started]
+    assert [float(answer) for answer, *_ in found] == [8.0] * 3
+    assert [sum(int(row[k]) for row in found) for k in (1, 2)] == [1, 1]
