@@ -1,7 +1,7 @@
 """Scaling of a reconstruction on a cluster, measured with one and two workers and modelled beyond.
 
     python -m benchmarks.cluster --work FOLDER [--survey WORKSPACE] [--events FILE]
-        [--pictures N] [--quick] [--json FILE]
+        [--pictures N] [--smaller WORKSPACE EVENTS] [--quick] [--json FILE]
 
 The survey (a small one of its own, if none is given) is reconstructed on a cluster of one local
 worker and of two. The events of the first give the computing and the transfers of every task, and
@@ -10,8 +10,8 @@ tenth. Then the model says how long N times as many pictures take on up to 128 w
 of these works (efficiency), and which steps hold the others up. `--events` skips the runs and takes
 the events of a reconstruction that was made before, by whatever executor.
 
-Tasks and serial work grow with the pictures; where the serial part is less than that (a sum over
-the survey, a cap), the model is pessimistic.
+Tasks and serial work grow with the pictures. `--smaller` names a recorded survey of another size:
+what is the same in both (a sum over the survey, a start, a cap) then does not grow.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from pathlib import Path
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.manifest import read_manifest
 from alice_survey.stages import names, spec
-from benchmarks.cluster_model import Network, RecordedStage, makespan, recorded
+from benchmarks.cluster_model import Network, RecordedStage, Recording, makespan, recorded
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 
@@ -52,6 +52,11 @@ def pictures_in(work: Path, survey: Path | None) -> Path:
         return made
     shutil.copytree(survey, made, ignore=shutil.ignore_patterns(*_STAGES, "*.partial", ".lock"))
     return made
+
+
+def pictures_of(survey: Path) -> int:
+    """How many a workspace has."""
+    return len(read_manifest(survey / "images" / "manifest.csv"))
 
 
 @contextlib.contextmanager
@@ -154,8 +159,11 @@ def main() -> None:
             )  # fmt: skip
     stages = recorded(events, _STAGES)
     if options.pictures is not None:
-        known = len(read_manifest(survey / "images" / "manifest.csv"))
-        stages = [stage.scaled(options.pictures / known) for stage in stages]
+        known, smaller = pictures_of(survey), None
+        if options.smaller is not None:
+            other, file = options.smaller
+            smaller = Recording(pictures=pictures_of(other), stages=recorded(file, _STAGES))
+        stages = [stage.scaled(options.pictures, known, smaller) for stage in stages]
         print(f"{known} pictures recorded, {options.pictures} modelled")
     figures += report_scaling(stages, network)
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures))))
@@ -167,6 +175,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--survey", type=Path, help="a workspace with calibrated pictures")
     parser.add_argument("--events", type=Path, help="of a reconstruction that was made before")
     parser.add_argument("--pictures", type=int, help="of the survey that is modelled")
+    parser.add_argument(
+        "--smaller", type=Path, nargs=2, metavar=("WORKSPACE", "EVENTS"),
+        help="a reconstruction of another size",
+    )  # fmt: skip
     add_options(parser, quick="nothing: the demo is the smallest survey")
     options = parser.parse_args()
     if options.events is not None and options.pictures is not None and options.survey is None:

@@ -11,7 +11,7 @@ import heapq
 import json
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,18 +57,41 @@ class RecordedStage:
         """How long it takes."""
         return self.serial_s + sum(makespan(step, workers, network) for step in self.steps)
 
-    def scaled(self, factor: float) -> "RecordedStage":
-        """The stage of a survey with so many times the pictures."""
-        steps = [
-            RecordedStep(
-                label=step.label,
-                task_s=np.resize(step.task_s, max(1, round(factor * len(step.task_s)))),
-                sent_bytes=step.sent_bytes,
-                received_bytes=step.received_bytes,
-            )
-            for step in self.steps
-        ]
-        return RecordedStage(name=self.name, serial_s=factor * self.serial_s, steps=steps)
+    def scaled(self, pictures: float, known: float, smaller: "Recording | None") -> "RecordedStage":
+        """The stage of a survey with so many pictures.
+
+        Args:
+            pictures: wanted.
+            known: of this stage.
+            smaller: a survey of another size, which tells what does not grow; without it all grows
+                with the pictures.
+        """
+        before = smaller.stage(self.name) if smaller else RecordedStage(name=self.name, serial_s=0)
+        share = (pictures - known) / (known - (smaller.pictures if smaller else 0))
+        steps = []
+        for step in self.steps:
+            fewer = before.tasks(step.label)
+            count = round(len(step.task_s) + share * max(0, len(step.task_s) - fewer))
+            steps.append(replace(step, task_s=np.resize(step.task_s, max(1, count))))
+        grown = max(0.0, self.serial_s - before.serial_s)
+        serial_s = self.serial_s + share * grown
+        return RecordedStage(name=self.name, serial_s=serial_s, steps=steps)
+
+    def tasks(self, label: str) -> int:
+        """How many tasks a step has, 0 of one that was not made."""
+        return sum(len(step.task_s) for step in self.steps if step.label == label)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A recorded reconstruction."""
+
+    pictures: int
+    stages: list[RecordedStage]
+
+    def stage(self, name: str) -> RecordedStage:
+        """One of its stages."""
+        return next(stage for stage in self.stages if stage.name == name)
 
 
 def makespan(step: RecordedStep, workers: int, network: Network) -> float:

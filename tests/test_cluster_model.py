@@ -9,7 +9,14 @@ from alice_survey.base.cluster.engine import most_in_flight
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.run import progress
 from alice_survey.base.run.events import EventFile
-from benchmarks.cluster_model import Network, RecordedStage, RecordedStep, makespan, recorded
+from benchmarks.cluster_model import (
+    Network,
+    RecordedStage,
+    RecordedStep,
+    Recording,
+    makespan,
+    recorded,
+)
 
 FREE = Network(task_s=0.0, latency_s=0.0, bytes_per_s=1e30)
 
@@ -59,9 +66,18 @@ def test_serial_work_bounds_what_workers_gain() -> None:
     stage = RecordedStage(name="stage", serial_s=10.0, steps=[step([1.0] * 90)])
     assert stage.times(1, FREE) == pytest.approx(100.0)
     assert stage.times(90, FREE) == pytest.approx(11.0)
-    twice = stage.scaled(2.0)
+    twice = stage.scaled(60, 30, None)
     assert twice.times(1, FREE) == pytest.approx(200.0)
     assert twice.times(90, FREE) == pytest.approx(22.0)
+
+
+def test_what_a_smaller_survey_has_too_does_not_grow() -> None:
+    stage = RecordedStage(name="stage", serial_s=10.0, steps=[step([1.0] * 90)])
+    less = RecordedStage(name="stage", serial_s=8.0, steps=[step([1.0] * 50)])
+    smaller = Recording(pictures=20, stages=[less])
+    larger = stage.scaled(130, 30, smaller)
+    assert larger.serial_s == pytest.approx(8.0 + 11 * 2.0)
+    assert larger.tasks("step") == 50 + 11 * 40
 
 
 def _work(number: int) -> int:
