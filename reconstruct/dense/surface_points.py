@@ -93,18 +93,15 @@ def _fuse_along(
     axis: int,
     sign: float,
 ) -> NDArray[Any]:
-    facing = np.flatnonzero(sign * points.normals[:, axis] >= _LEAST_ALONG)
-    if not len(facing):
-        return np.empty(0, SURFACE_POINT)
     across = [k for k in range(3) if k != axis]
-    at = np.floor((points.enu[facing][:, across] - origin[across]) / cell).astype(np.int64)
-    order = np.arange(len(at))
-    for k in (1, 0):
-        order = order[stable_order(at[order, k])]
-    at, ranked = at[order], points.part(facing[order])
-    starts = np.flatnonzero(np.any(np.diff(at, axis=0, prepend=at[:1] - 1), axis=1))
+    order, starts, cells = by_cell(
+        points.enu, points.normals, (across[0], across[1], axis), sign, origin[across], cell
+    )
+    if not len(order):
+        return np.empty(0, SURFACE_POINT)
+    ranked = points.part(order)
     found = fuse_cells(
-        np.append(starts, len(at)), origin[across] + (at[starts] + 0.5) * cell, ranked.enu,
+        starts, origin[across] + (cells + 0.5) * cell, ranked.enu,
         ranked.normals, ranked.colours, ranked.sigmas, ranked.views, stations, cell,
         (across[0], across[1], axis), sign, _GATE, shared,
     )  # fmt: skip
@@ -113,6 +110,54 @@ def _fuse_along(
     for name, values in zip(names, found, strict=True):
         records[name] = values
     return records
+
+
+@compiled
+def by_cell(
+    enu: Float32,
+    normals: Float32,
+    axes: tuple[int, int, int],
+    sign: float,
+    origin: Array,
+    cell: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Sort the points that face a direction by the cells that they lie in across it.
+
+    Args:
+        enu: (N, 3) places.
+        normals: (N, 3); NaN where unknown.
+        axes: the two axes of the cells, and that of the direction.
+        sign: 1 or -1, of the direction along its axis.
+        origin: (2,) of the cells.
+        cell: side of a cell.
+
+    Returns:
+        (M,) numbers of the points, by cell and in their order, (C + 1,) where each cell starts in
+        these, and (C, 2) numbers of the cells.
+    """
+    first, second, along = axes
+    order = np.empty(len(enu), np.int64)
+    at = np.empty((2, len(enu)), np.int64)
+    count = 0
+    for i in range(len(enu)):
+        if sign * normals[i, along] >= _LEAST_ALONG:
+            order[count] = i
+            at[0, count] = math.floor((enu[i, first] - origin[0]) / cell)
+            at[1, count] = math.floor((enu[i, second] - origin[1]) / cell)
+            count += 1
+    order, at = order[:count], at[:, :count]
+    if count == 0:
+        return order, np.zeros(1, np.int64), np.empty((0, 2), np.int64)
+    for k in (1, 0):
+        sort = stable_order(at[k])
+        order, at = order[sort], at[:, sort]
+    starts, cells, found = np.empty(count + 1, np.int64), np.empty((count, 2), np.int64), 0
+    for i in range(count):
+        if i == 0 or at[0, i] != at[0, i - 1] or at[1, i] != at[1, i - 1]:
+            starts[found], cells[found, 0], cells[found, 1] = i, at[0, i], at[1, i]
+            found += 1
+    starts[found] = count
+    return order, starts[: found + 1], cells[:found]
 
 
 @compiled

@@ -158,7 +158,8 @@ def test_processes_that_start_together_compile_a_kernel_once(tmp_path):
         "from inner import once\n"
         f"pathlib.Path({str(tmp_path / 'ready')!r} + str(__import__('os').getpid())).touch()\n"
         f"while len(list(pathlib.Path({str(tmp_path)!r}).glob('ready*'))) < 3: time.sleep(0.01)\n"
-        "print(outer.twice(3.0), *[sum(k.stats.cache_misses.values()) for k in (outer.twice, once)])"
+        "kernels = outer.twice, once\n"
+        "print(outer.twice(3.0), *[sum(k.stats.cache_misses.values()) for k in kernels])"
     )
     environment = asking(tmp_path)
     started = [
