@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from reconstruct.dense.view_store import WHOLE, Part
+from reconstruct.pictures.undistorted import WHOLE, Part
 from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, slopes_of
 

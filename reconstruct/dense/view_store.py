@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import atomic_path
+from reconstruct.pictures.undistorted import WHOLE, Part
 
 _DEPTH_STEP = 2e-5
 """Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7. Where those of
@@ -27,9 +28,6 @@ _SIGMA_LEAST = 1e-6
 """Relative to the depth; 254 steps of 5 % reach a third of the depth."""
 
 
-Part = tuple[slice, slice]
-"""Rows and columns of a picture; of colours the first of either is even."""
-WHOLE: Part = (slice(None), slice(None))
 StoredDepth = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
 """(H, W) codes of depth, (H, W) codes of its relative deviation, and what the codes of either mean:
 NaN for 0. Kernels that look at few pixels take it as it is."""
@@ -110,7 +108,11 @@ class ViewStore:
         return np.asarray(self.load(view, "bright")[part])
 
     def load_colour(self, view: int, part: Part = WHOLE) -> NDArray[np.uint8]:
-        """A picture (H, W, 3) BGR; of a part the outermost pixels have the tint of those inside."""
+        """A picture (H, W, 3) BGR.
+
+        A part starts with an even row and column; its outermost pixels have the tint of those
+        inside.
+        """
         bright = self.load_bright(view, part)
         first = tuple((side.start or 0) // 2 for side in part)
         half = tuple(slice(a, a + (n + 1) // 2) for a, n in zip(first, bright.shape, strict=True))

@@ -6,6 +6,7 @@ seam show the same and the corrections change as little as they can within a pat
 Ivanov 2007, eq. 5; Waechter et al. 2014, "Let there be color!", eq. 3).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +29,7 @@ from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_pages, make_w
 from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles, edges_of
 from reconstruct.mesh.visibility import to_world
-from reconstruct.pictures.undistorted import Pictures
+from reconstruct.pictures.undistorted import WHOLE, Part, Pictures
 from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
@@ -191,19 +192,28 @@ def wedge_pixels(
     return pixels
 
 
-def even_colour(pictures: Pictures, view: View, light: LightModel) -> Float32:
-    """A view's picture under even light, (H, W, 3) BGR."""
-    colour = pictures.colour(view.image)
+def even_colour(pictures: Pictures, view: View, light: LightModel, part: Part = WHOLE) -> Float32:
+    """A view's picture, or a part of it, under even light, (H, W, 3) BGR."""
+    colour = pictures.colour(view.image, part)
     factors = light.factors(view.camera, view.image)
-    rows, columns = factors.shape[:2]
-    height, width = colour.shape[:2]
-    x, y = np.meshgrid(
-        ((np.arange(width) + 0.5) / width * (columns - 1)).astype(np.float32),
-        ((np.arange(height) + 0.5) / height * (rows - 1)).astype(np.float32),
+    x, y = (
+        ((np.arange(size)[along] + 0.5) / size * (nodes - 1)).astype(np.float32)
+        for size, nodes, along in zip(
+            view.pinhole.size_px, factors.shape[1::-1], part[::-1], strict=True
+        )
     )
-    lift = cv2.remap(factors, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    at = np.meshgrid(x, y)
+    lift = cv2.remap(factors, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     even: Float32 = colour.astype(np.float32) * lift
     return even
+
+
+def _part_around(view: View, low: Array, high: Array, margin: int) -> Part:
+    """The part of a view between two pixels (2,) and a margin around, of one pixel at least."""
+    size = np.array(view.pinhole.size_px)
+    first = np.clip(np.floor(low) - margin, 0, size - 1).astype(int).tolist()
+    last = np.clip(np.ceil(high) + margin, np.add(first, 1), size).astype(int).tolist()
+    return slice(first[1], last[1]), slice(first[0], last[0])
 
 
 def seam_colours(workspace: Path, light: LightModel, task: tuple[View, Array]) -> Float32:
@@ -216,13 +226,17 @@ def seam_colours(workspace: Path, light: LightModel, task: tuple[View, Array]) -
     """
     view, pixels = task
     pictures = Pictures.still(workspace)
-    even = even_colour(pictures, view, light)
-    weight = pictures.valid(view.image).astype(np.float32)
+    margin = math.ceil(5 * _SEAM_SIGMA_PX)
+    part = _part_around(view, np.nanmin(pixels, axis=0), np.nanmax(pixels, axis=0), margin)
+    even = even_colour(pictures, view, light, part)
+    weight = pictures.valid(view.image, part).astype(np.float32)
     even *= weight[..., None]
     total = cv2.GaussianBlur(even, (0, 0), _SEAM_SIGMA_PX)
     share = cv2.GaussianBlur(weight, (0, 0), _SEAM_SIGMA_PX)
     sums, shares = (
-        remapped(picture, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        remapped(
+            picture, pixels - (part[1].start, part[0].start), cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+        )
         for picture in (total, share)
     )
     found: Float32 = np.where(
@@ -380,10 +394,14 @@ def paint_view(
     ]
     picture = np.zeros((1, 1, 3), np.float32)
     valid = np.ones((1, 1), np.uint8)
+    part = WHOLE
     if task.view is not None:
         pictures = Pictures.still(workspace)
-        picture = even_colour(pictures, task.view, light)
-        valid = pictures.valid(task.view.image).astype(np.uint8)
+        if atlas.scale == 1.0:
+            ends = atlas.source.min(axis=0), (atlas.source + atlas.box).max(axis=0)
+            part = _part_around(task.view, *ends, 0)
+        picture = even_colour(pictures, task.view, light, part)
+        valid = pictures.valid(task.view.image, part).astype(np.uint8)
         if atlas.scale < 1.0:
             size = (
                 max(1, round(picture.shape[1] * atlas.scale)),
@@ -395,6 +413,7 @@ def paint_view(
         zip(task.pixels, task.corrections, task.triangles, strict=True)
     ):
         (width, height), (x, y) = atlas.box[i], atlas.source[i]
+        x, y = x - (part[1].start or 0), y - (part[0].start or 0)
         columns = np.clip(np.arange(x, x + width), 0, picture.shape[1] - 1)
         rows = np.clip(np.arange(y, y + height), 0, picture.shape[0] - 1)
         crop = picture[np.ix_(rows, columns)]

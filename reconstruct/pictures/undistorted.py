@@ -18,6 +18,9 @@ from reconstruct.pictures.normalise import Grey, normalise
 
 Colour = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Part = tuple[slice, slice]
+"""Rows and columns of a picture."""
+WHOLE: Part = (slice(None), slice(None))
 MOVING = "moving"
 """Folder in `dense` with masks of what moves."""
 _ROWS = 256
@@ -206,29 +209,33 @@ class Pictures:
         """Where each pixel of a picture's pinhole lies in it as taken; see `undistortion_maps`."""
         return self._maps(self._cameras[image])
 
-    def colour(self, image: str) -> Colour:
+    def colour(self, image: str, part: Part = WHOLE) -> Colour:
         """A picture as its pinhole sees it, (H, W, 3) BGR; black where there is nothing.
+
+        Args:
+            image: its name.
+            part: rows and columns of the pinhole's picture.
 
         Raises:
             ImageError: the file is missing, cannot be decoded or is of another size.
         """
         taken = self.taken(image)
-        x, y = self._maps(self._cameras[image])
+        x, y = (axis[part] for axis in self._maps(self._cameras[image]))
         # OpenCV's cubic kernel misplaces fine texture by up to 0.045 px, Lanczos' by 0.009
         warped: Colour = cv2.remap(taken, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-        return np.where(self._inside(self._cameras[image])[..., None], warped, np.uint8(0))
+        return np.where(self._inside(self._cameras[image])[part][..., None], warped, np.uint8(0))
 
     def grey(self, image: str) -> Grey:
         """A picture as its pinhole sees it, (H, W), of even light and contrast."""
         return normalise(self.colour(image))
 
-    def valid(self, image: str) -> Mask:
+    def valid(self, image: str, part: Part = WHOLE) -> Mask:
         """Where `colour` shows something that may be used, (H, W)."""
-        inside: Mask = self._inside(self._cameras[image])
+        inside: Mask = self._inside(self._cameras[image])[part]
         taken = self.usable(image)
         if taken is None:
             return inside.copy()
-        x, y = self._maps(self._cameras[image])
+        x, y = (axis[part] for axis in self._maps(self._cameras[image]))
         warped = cv2.remap(taken.astype(np.uint8), x, y, cv2.INTER_NEAREST)
         mask: Mask = inside & (warped > 0)
         return mask
