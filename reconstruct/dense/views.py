@@ -171,7 +171,7 @@ def view_depth(match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
     store.drop(task.index, "apart.scales")
 
 
-def refine_view(task: ViewTask) -> None:
+def refine_view(task: ViewTask, *, on_gpu: bool = False) -> None:
     """Make a view's depth exact by its best neighbours at once.
 
     Pictures of its own station serve where no other station sees, or where there is hardly one.
@@ -188,7 +188,11 @@ def refine_view(task: ViewTask) -> None:
     rig = [other for other in task.others if other[1].station == task.view.station]
     first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
     depth, sigma = store.load_depth(task.index, "depth")
-    refined = refine(
+    if on_gpu:
+        from reconstruct.dense.refine_gpu import refine_on_gpu as refined_by
+    else:
+        refined_by = refine
+    refined = refined_by(
         look(task.index, task.view),
         depth,
         sigma,
