@@ -88,7 +88,7 @@ def executor_on(
         yield replace(executor_of(threads), uses_gpu=is_gpu_chosen(device))
         return
     if device == "gpu":
-        raise typer.BadParameter("--device gpu is for this machine: a cluster has no use for it")
+        raise typer.BadParameter("--device gpu is for this machine: a cluster uses processors")
     if scheduler is not None and cluster is not None:
         raise typer.BadParameter("give --scheduler or --cluster, not both")
     if threads is not None:

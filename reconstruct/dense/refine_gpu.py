@@ -94,7 +94,7 @@ def launched(kernel: Callable[..., None]) -> Any:
     """A kernel that takes a share of the pixels, for the GPU: each thread has its own.
 
     It is compiled without the options of the processor's, which numba-cuda would take as leave to
-    ignore NaN.
+    ignore NaN; the functions that it calls keep them, and get finite numbers alone.
     """
     work = cuda.jit(device=True)(getattr(kernel, "py_func", kernel))
 

@@ -4,7 +4,14 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reconstruct.dense.refine_depth import ComparedView, compare, pixel_lines, prepared, refine
+from reconstruct.dense.refine_depth import (
+    ALL,
+    ComparedView,
+    compare,
+    pixel_lines,
+    prepared,
+    refine,
+)
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
@@ -36,7 +43,9 @@ def test_compare_equals_its_slow_twin():
     one, other = looks()[0], looks()[1]
     depth = true_depth()
     move = other.view.world_from_cam.inv() * one.view.world_from_cam
-    rest, slope, speed = compare(
+    rest, slope, speed = (np.empty(depth.shape, np.float32) for _ in range(3))
+    compare(
+        ALL,
         (1 / depth).astype(np.float32),
         one.contrast,
         pixel_lines(one.view.kernel_lens, *depth.shape),
@@ -44,6 +53,9 @@ def test_compare_equals_its_slow_twin():
         other.valid,
         other.view.kernel_lens,
         np.ascontiguousarray(move.as_matrix()[:3]),
+        rest,
+        slope,
+        speed,
     )
     rows, columns = np.nonzero(np.isfinite(rest))
     assert len(rows) > 0.5 * rest.size

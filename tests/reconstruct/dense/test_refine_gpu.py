@@ -4,12 +4,12 @@ The simulator runs kernels in plain Python. It shows that they, launches and tra
 not that they compile; the last test shows that, where NVVM is installed.
 """
 
-import importlib.util
 import os
 import pickle
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +162,8 @@ def test_without_memory_of_the_gpu_the_processor_does_it_and_says_so(
 
 
 @pytest.mark.skipif(
-    importlib.util.find_spec("nvidia") is None, reason="the extra gpu, with NVVM, is not installed"
+    not find_spec("nvidia") or not find_spec("nvidia.cuda_nvcc"),
+    reason="the extra gpu, which has NVVM, is not installed",
 )
 def test_kernels_compile_for_a_gpu_without_short_cuts_in_divisions() -> None:
     done = subprocess.run(
