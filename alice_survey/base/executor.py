@@ -58,6 +58,8 @@ class Executor:
     """How many tasks run at once; with one and no pool they run in this process."""
     pool: Pool | None = None
     """An engine that is running; without one, local processes start where there are tasks."""
+    uses_gpu: bool = False
+    """Whether tasks may use the GPU of this machine."""
 
     @property
     def local_cores(self) -> int:

@@ -15,6 +15,7 @@ from alice_survey.cli.options import (
     WORK,
     AsJson,
     ClusterFile,
+    Device,
     RigCamera,
     Scale,
     Scheduler,
@@ -386,6 +387,7 @@ def run_all(
     threads: Threads = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
+    device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
     """Do the whole loop.
@@ -396,7 +398,7 @@ def run_all(
     from alice_survey.stages import names
     from alice_survey.survey import run
 
-    with executor_on(workspace, threads, scheduler, cluster) as executor:
+    with executor_on(workspace, threads, scheduler, cluster, device) as executor:
         result = run(names(), workspace, survey, scale, executor)
     print_result(*result, as_json)
 

@@ -6,8 +6,9 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 from typer.models import ArgumentInfo
@@ -36,6 +37,10 @@ Scheduler = Annotated[
 ClusterFile = Annotated[
     Path | None,
     typer.Option("--cluster", metavar="FILE", help="Run tasks on the Dask cluster of this file."),
+]
+Device = Annotated[
+    Literal["auto", "cpu", "gpu"],
+    typer.Option(help="What refines depth: auto takes an NVIDIA GPU if one can be used."),
 ]
 Scale = Annotated[
     int | None,
@@ -70,12 +75,20 @@ def executor_of(threads: int | None) -> "Executor":
 
 @contextlib.contextmanager
 def executor_on(
-    workspace: Path, threads: int | None, scheduler: str | None, cluster: Path | None
+    workspace: Path,
+    threads: int | None,
+    scheduler: str | None,
+    cluster: Path | None,
+    device: Literal["auto", "cpu", "gpu"] = "cpu",
 ) -> "Iterator[Executor]":
     """Within this block, where a command runs its tasks: on a cluster if one is given."""
     if scheduler is None and cluster is None:
-        yield executor_of(threads)
+        from alice_survey.base.device import is_gpu_chosen
+
+        yield replace(executor_of(threads), uses_gpu=is_gpu_chosen(device))
         return
+    if device == "gpu":
+        raise typer.BadParameter("--device gpu is for this machine: a cluster uses processors")
     if scheduler is not None and cluster is not None:
         raise typer.BadParameter("give --scheduler or --cluster, not both")
     if threads is not None:

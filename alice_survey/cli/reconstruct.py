@@ -10,6 +10,7 @@ from alice_survey.cli.options import (
     WORK,
     AsJson,
     ClusterFile,
+    Device,
     Scheduler,
     SurveyFile,
     Threads,
@@ -66,6 +67,7 @@ def reconstruct(
     threads: Threads = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
+    device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
     """Turn pictures into a model.
@@ -77,7 +79,7 @@ def reconstruct(
         from alice_survey.survey import run
 
         stages = names("calibrate", "reconstruct")
-        with executor_on(workspace, threads, scheduler, cluster) as executor:
+        with executor_on(workspace, threads, scheduler, cluster, device) as executor:
             text, values = run(stages, workspace, survey, None, executor, planes=plane)
             if export is not None:
                 from reconstruct.export.undistorted import export_undistorted

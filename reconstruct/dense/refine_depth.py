@@ -13,9 +13,10 @@ the noise that remains between pictures.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -30,12 +31,15 @@ from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at
 
 Float32 = NDArray[np.float32]
+Share = tuple[int, int, int, int]
+"""The pixels that a kernel works on: first row, step to the next, first column, step."""
+ALL: Share = (0, 1, 0, 1)
 
 _CONTRAST_SIGMA_PX = 8.0
 """Sigma of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
 _LEAST_CONTRAST = 1.5
 """Grey levels of noise that are not blown up to full contrast."""
-_WINDOW_SIGMA_PX = 1.25
+WINDOW_SIGMA_PX = 1.25
 """Sigma of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are
 noisier; the noise is averaged when views are fused, the blur is not."""
 _CONVERGED_PX = 0.5
@@ -52,10 +56,8 @@ _LEAST_SHARE = 0.4
 """Share of a window's weight that a neighbour must see."""
 _OUTLYING = 2.5
 """Deviations beyond which a pixel counts less than half."""
-_BAND_PIXELS = 500_000
-"""Pixels of a picture that are worked on at once; they take some 0.1 kB each."""
 _MARGIN_ROWS = 16
-"""Rows around them that their windows reach: twice 5 for sums, and 4 around what moves far."""
+"""Rows around a band that its windows reach: twice 5 for sums, and 4 around what moves far."""
 _LEAST_UNSEEN = 0.005
 """Share of a band that no other station sees, from which its own station's pictures are asked."""
 _LONGEST_STEP_PX = 1.0
@@ -116,6 +118,7 @@ def pixel_lines(lens: KernelLens, height: int, width: int, top: int = 0) -> Floa
 
 @compiled(error_model="numpy", fastmath=FAST)
 def compare(
+    share: Share,
     inverse_depth: Float32,
     reference: Float32,
     lines: Float32,
@@ -123,10 +126,14 @@ def compare(
     valid: NDArray[np.bool_],
     other_lens: KernelLens,
     other_from_ref: Array,
-) -> tuple[Float32, Float32, Float32]:
+    rest: Float32,
+    slope: Float32,
+    speed: Float32,
+) -> None:
     """Warp a neighbour onto the reference through its depth.
 
     Args:
+        share: which pixels.
         inverse_depth: (H, W) along the reference's axis, NaN where unknown.
         reference: (H, W) contrast.
         lines: (H, W, 4) of the reference, see `pixel_lines`.
@@ -134,20 +141,18 @@ def compare(
         valid: (h, w) of the neighbour.
         other_lens: of the neighbour.
         other_from_ref: (3, 4) transform of points.
-
-    Returns:
-        (H, W) reference minus warped neighbour; the warped neighbour's change per unit of inverse
-        depth; and how many of its pixels one unit moves. NaN where it does not see the spot.
+        rest: (H, W), to be filled with reference minus warped neighbour, NaN where it does not see
+            the spot.
+        slope: (H, W), with the warped neighbour's change per unit of inverse depth.
+        speed: (H, W), with how many of its pixels one unit moves.
     """
     height, width = inverse_depth.shape
     rows, columns = spline.shape
-    rest = np.full((height, width), np.nan, np.float32)
-    slope = np.full((height, width), np.nan, np.float32)
-    speed = np.full((height, width), np.nan, np.float32)
     pinhole, field, inverse_working = other_lens
     t = other_from_ref
-    for row in range(height):
-        for column in range(width):
+    for row in range(share[0], height, share[1]):
+        for column in range(share[2], width, share[3]):
+            rest[row, column] = slope[row, column] = speed[row, column] = np.float32(np.nan)
             w = inverse_depth[row, column]
             if not w > 0.0:
                 continue
@@ -165,7 +170,7 @@ def compare(
             u, v = warped_at(field, inverse_working, u, v, w * inverse)
             u -= 0.5
             v -= 0.5
-            j, i = math.floor(u), math.floor(v)
+            j, i = int(math.floor(u)), int(math.floor(v))  # noqa: RUF046 (a float on a GPU)
             if j < 1 or i < 1 or j >= columns - 2 or i >= rows - 2:
                 continue
             if not (valid[i, j] and valid[i + 1, j + 1] and valid[i, j + 1] and valid[i + 1, j]):
@@ -189,7 +194,6 @@ def compare(
             rest[row, column] = reference[row, column] - value
             slope[row, column] = right * du + down * dv
             speed[row, column] = math.sqrt(du * du + dv * dv)
-    return rest, slope, speed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,12 +221,91 @@ class _NeighbourSums:
     seen: NDArray[np.uint8]
 
 
+class Device(Protocol):
+    """What works on all pixels of a view, with arrays of its own (of type `Any` here)."""
+
+    band_pixels: int
+    """Pixels of a picture that are worked on at once."""
+
+    def put(self, values: Any) -> Any:
+        """An array, or a tuple of arrays, numbers and tuples, as the device takes it."""
+
+    def get(self, array: Any) -> NDArray[Any]:
+        """An array of the device."""
+
+    def empty(self, *shape: int) -> Any:
+        """An array of 32-bit floats."""
+
+    def run(self, kernel: Callable[..., None], shape: tuple[int, ...], *arguments: Any) -> None:
+        """Run a kernel that takes its share of (H, W) pixels, then these arguments."""
+
+    def blurred(self, planes: Any, sigma_px: float) -> Any:
+        """Planes (N, H, W), each as `_blur` gives it."""
+
+
+class _Processor:
+    """The device that this code runs on."""
+
+    band_pixels = 500_000
+    """They take some 0.1 kB each, and bands of them stay in the cache."""
+
+    def put(self, values: Any) -> Any:
+        return values
+
+    def get(self, array: Any) -> NDArray[Any]:
+        return np.asarray(array)
+
+    def empty(self, *shape: int) -> Any:
+        return np.empty(shape, np.float32)
+
+    def run(self, kernel: Callable[..., None], _: tuple[int, ...], *arguments: Any) -> None:
+        kernel(ALL, *arguments)
+
+    def blurred(self, planes: Any, sigma_px: float) -> Any:
+        for plane in planes:
+            plane[:] = _blur(plane, sigma_px)
+        return planes
+
+
+PROCESSOR = _Processor()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Reference:
+    """Rows of a reference, with what all comparisons share as arrays of the device."""
+
+    view: View
+    valid: NDArray[np.bool_]
+    device: Device
+    contrast: Any
+    lines: Any
+    spread: Any
+    """Variance of the contrast in a window."""
+
+
+def _reference(reference: ComparedView, rows: slice, device: Device) -> _Reference:
+    contrast = reference.contrast[rows]
+    lines = pixel_lines(reference.view.kernel_lens, *contrast.shape, rows.start)
+    mean = _blur(contrast, WINDOW_SIGMA_PX)
+    spread = _blur(contrast * contrast, WINDOW_SIGMA_PX) - mean * mean
+    contrast, lines, spread = device.put((contrast, lines, spread))
+    return _Reference(
+        view=reference.view,
+        valid=reference.valid[rows],
+        device=device,
+        contrast=contrast,
+        lines=lines,
+        spread=spread,
+    )
+
+
 def refine(
     reference: ComparedView,
     depth: Float32,
     sigma: Float32,
     others: Sequence[ComparedView],
     spare: Sequence[ComparedView] = (),
+    device: Device = PROCESSOR,
 ) -> RefinedDepth:
     """Correct a depth map by all neighbours at once.
 
@@ -236,50 +319,38 @@ def refine(
         sigma: (H, W) of the depth.
         others: neighbours to compare with.
         spare: those to compare with where none of the others sees the spot.
+        device: what compares them.
     """
     height, width = depth.shape
-    count = -(-height * width // _BAND_PIXELS)
+    count = -(-height * width // device.band_pixels)
     ends = np.linspace(0, height, count + 1).astype(int).tolist()
     bands = []
     for first, last in pairwise(ends):
         part = slice(max(first - _MARGIN_ROWS, 0), last + _MARGIN_ROWS)
         inner = slice(first - part.start, last - part.start)
-        band = _refine_band(
-            _Band(view=reference.view, top=part.start, contrast=reference.contrast[part],
-                  valid=reference.valid[part]),
-            depth[part], sigma[part], others, spare,
-        )  # fmt: skip
+        rows = _reference(reference, part, device)
+        band = _refine_band(rows, depth[part], sigma[part], others, spare)
         bands.append([one[inner] for one in (band.depth, band.sigma, band.seen)])
     joined = [np.concatenate(parts) for parts in zip(*bands, strict=True)]
     return RefinedDepth(depth=joined[0], sigma=joined[1], seen=joined[2])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Band:
-    """Rows of a picture."""
-
-    view: View
-    top: int
-    contrast: Float32
-    valid: NDArray[np.bool_]
-
-
 def _refine_band(
-    reference: _Band,
+    one: _Reference,
     depth: Float32,
     sigma: Float32,
     others: Sequence[ComparedView],
     spare: Sequence[ComparedView],
 ) -> RefinedDepth:
     inverse = (1.0 / depth).astype(np.float32)
-    first = _sums_of(reference, inverse, others, spare)
+    first = _sums_of(one, inverse, others, spare)
     moved, step_px = _stepped(inverse, first)
     sums = first
     far = (step_px > _CONVERGED_PX).astype(np.uint8)
     if far.any():  # elsewhere a second round would change little
         window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
         part = np.where(cv2.dilate(far, window) > 0, moved, np.float32(np.nan))
-        second = _sums_of(reference, part, others, spare)
+        second = _sums_of(one, part, others, spare)
         again = np.isfinite(part) & (second.curvature > 0)
         sums = _chosen(again, second, first)
         moved = np.where(again, _stepped(part, second)[0], moved)
@@ -322,107 +393,132 @@ def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
 
 
 def _sums_of(
-    reference: _Band,
+    one: _Reference,
     inverse: Float32,
     others: Sequence[ComparedView],
     spare: Sequence[ComparedView],
 ) -> _NeighbourSums:
     """What the others say, and where none of them sees a spot what the spare ones say."""
-    sums = _sums(reference, inverse, others)
+    sums = _sums(one, inverse, others)
     unseen = np.isfinite(inverse) & ~(sums.curvature > 0)
     if not spare or unseen.mean() < _LEAST_UNSEEN:
         return sums
-    alone = _sums(reference, np.where(unseen, inverse, np.float32(np.nan)), spare)
+    alone = _sums(one, np.where(unseen, inverse, np.float32(np.nan)), spare)
     return _chosen(unseen, alone, sums)
 
 
-def _sums(reference: _Band, inverse: Float32, others: Sequence[ComparedView]) -> _NeighbourSums:
-    shape = inverse.shape
-    pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
-    likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    lines = pixel_lines(reference.view.kernel_lens, *shape, reference.top)
-    samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
-    mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
-    spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean
+def _sums(one: _Reference, inverse: Float32, others: Sequence[ComparedView]) -> _NeighbourSums:
+    device, shape = one.device, inverse.shape
+    totals = device.put((*np.zeros((4, *shape), np.float32), np.zeros(shape, np.uint8)))
+    depths = device.put(inverse)
+    samples = np.float32(4.0 * np.pi * WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
     for other in others:
-        other_from_ref = other.view.world_from_cam.inv() * reference.view.world_from_cam
-        rest, slope, fast = compare(
-            inverse,
-            reference.contrast,
-            lines,
-            other.spline,
-            other.valid,
-            other.view.kernel_lens,
-            np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
-        )
-        known = np.isfinite(rest) & reference.valid
+        other_from_ref = other.view.world_from_cam.inv() * one.view.world_from_cam
+        move = np.ascontiguousarray(other_from_ref.as_matrix()[:3])
+        looks = device.put((other.spline, other.valid, other.view.kernel_lens, move))
+        there, slope, fast = (device.empty(*shape) for _ in range(3))
+        shared = depths, one.contrast, one.lines
+        device.run(compare, shape, *shared, *looks, there, slope, fast)
+        rest = device.get(there)
+        known = np.isfinite(rest) & one.valid
         sample = rest[::3, ::3][known[::3, ::3]]
         if sample.size == 0:
             continue
         noise = max(np.float32(MAD_TO_SIGMA * np.median(np.abs(sample))), np.float32(1e-3))
-        products = _products(rest, slope, known, noise * np.float32(_OUTLYING))
-        weight, r, g, rg, gg, rr = (_blur(product, _WINDOW_SIGMA_PX) for product in products)
-        _add(
-            (weight, r, g, rg, gg, rr), spread, fast, known, noise, samples,
-            (pull, curvature, speed, likeness, seen),
-        )  # fmt: skip
+        used = device.put(known)
+        products, outlying = device.empty(6, *shape), noise * np.float32(_OUTLYING)
+        device.run(weigh, shape, there, slope, used, outlying, products)
+        products = device.blurred(products, WINDOW_SIGMA_PX)
+        device.run(add, shape, products, one.spread, fast, used, noise, samples, *totals)
+    pull, curvature, speed, likeness, seen = map(device.get, totals)
     with np.errstate(invalid="ignore"):
         likeness = likeness / curvature
     return _NeighbourSums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _products(
-    rest: Float32, slope: Float32, known: NDArray[np.bool_], outlying: float
-) -> tuple[Float32, Float32, Float32, Float32, Float32, Float32]:
-    """Weights, falling with the square of what is left (Cauchy), and weighted products."""
-    shape = rest.shape
-    weight, r = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    g, rg = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    gg, rr = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            if not known[i, j]:
-                continue
-            a, b = rest[i, j], slope[i, j]
-            w = 1.0 / (1.0 + (a / outlying) ** 2)
-            weight[i, j] = w
-            r[i, j], g[i, j] = w * a, w * b
-            rg[i, j], gg[i, j], rr[i, j] = w * a * b, w * b * b, w * a * a
-    return weight, r, g, rg, gg, rr
+def weigh(
+    share: Share,
+    rest: Float32,
+    slope: Float32,
+    known: NDArray[np.bool_],
+    outlying: float,
+    products: Float32,
+) -> None:
+    """Weights, falling with the square of what is left (Cauchy), and weighted products.
+
+    Args:
+        share: which pixels.
+        rest: (H, W) what is left.
+        slope: (H, W) change per unit of inverse depth.
+        known: (H, W) where these are known.
+        outlying: what is left at which the weight is one half.
+        products: (6, H, W), to be filled with the weight and, each times it, rest, slope,
+            rest x slope, slope squared, rest squared; zero where unknown.
+    """
+    height, width = rest.shape
+    for row in range(share[0], height, share[1]):
+        for column in range(share[2], width, share[3]):
+            w, a, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            if known[row, column]:
+                a, b = rest[row, column], slope[row, column]
+                w = 1.0 / (1.0 + (a / outlying) ** 2)
+            products[0, row, column] = w
+            products[1, row, column], products[2, row, column] = w * a, w * b
+            products[3, row, column], products[4, row, column] = w * a * b, w * b * b
+            products[5, row, column] = w * a * a
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _add(
-    sums: tuple[Float32, Float32, Float32, Float32, Float32, Float32],
+def add(
+    share: Share,
+    products: Float32,
     spread: Float32,
     fast: Float32,
     known: NDArray[np.bool_],
     noise: float,
     samples: float,
-    totals: tuple[Float32, Float32, Float32, Float32, NDArray[np.uint8]],
+    pull: Float32,
+    curvature: Float32,
+    speed: Float32,
+    likeness: Float32,
+    seen: NDArray[np.uint8],
 ) -> None:
     """Add one neighbour's normal equations to the totals, each over the variance it leaves.
 
     Means over the window are taken out, so that brightness does not count; a window that hardly
     looks alike (occluded, moved) counts little.
+
+    Args:
+        share: which pixels.
+        products: (6, H, W) of `weigh`, blurred.
+        spread: (H, W) variance of the reference's contrast in the window.
+        fast: (H, W) pixels per unit of inverse depth.
+        known: (H, W) where the neighbour sees the spot.
+        noise: standard deviation of what is left.
+        samples: independent pixels in the window.
+        pull: (H, W) total; this and the next are added to.
+        curvature: (H, W) total.
+        speed: (H, W) largest.
+        likeness: (H, W) total.
+        seen: (H, W) total.
     """
-    weight, r, g, rg, gg, rr = sums
-    pull, curvature, speed, likeness, seen = totals
-    for i in range(known.shape[0]):
-        for j in range(known.shape[1]):
-            share = weight[i, j]
-            if not known[i, j] or share < _LEAST_SHARE:
+    height, width = known.shape
+    for row in range(share[0], height, share[1]):
+        for column in range(share[2], width, share[3]):
+            weight = products[0, row, column]
+            if not known[row, column] or weight < _LEAST_SHARE:
                 continue
-            cross = rg[i, j] - r[i, j] * g[i, j] / share
-            square = gg[i, j] - g[i, j] * g[i, j] / share
-            misfit = rr[i, j] / share - (r[i, j] / share) ** 2
-            alike = 1.0 - 0.5 * misfit / max(spread[i, j], 1e-3)
+            r, g, rg = products[1, row, column], products[2, row, column], products[3, row, column]
+            cross = rg - r * g / weight
+            square = products[4, row, column] - g * g / weight
+            misfit = products[5, row, column] / weight - (r / weight) ** 2
+            alike = 1.0 - 0.5 * misfit / max(spread[row, column], 1e-3)
             trust = min(max(alike, 0.05), 1.0)
             certainty = samples * trust * trust / max(misfit, 0.1 * noise * noise)
-            pull[i, j] += certainty * cross
-            curvature[i, j] += certainty * square
-            likeness[i, j] += certainty * square * alike
-            speed[i, j] = max(speed[i, j], fast[i, j])
+            pull[row, column] += certainty * cross
+            curvature[row, column] += certainty * square
+            likeness[row, column] += certainty * square * alike
+            speed[row, column] = max(speed[row, column], fast[row, column])
             if alike >= _ALIKE:
-                seen[i, j] += 1
+                seen[row, column] += 1

@@ -89,7 +89,8 @@ def run_dense(
     matched = ((task, points.of(task.index)) for task in to_match)
     _drain(executor.map(match, matched, label="match", total=len(views)))
     looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
-    _drain(executor.map(partial(refine_view, matching), tasks(looks), label="refine"))
+    refine = partial(refine_view, matching, on_gpu=executor.uses_gpu)
+    _drain(executor.map(refine, tasks(looks), label="refine"))
     checks = tasks(neighbours(model, _WITNESSES))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)

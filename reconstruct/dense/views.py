@@ -208,7 +208,7 @@ def refining_scales(scale: float) -> list[float]:
     return [0.5**n for n in reversed(range(octaves))]
 
 
-def refine_view(scale: float, task: ViewTask) -> None:
+def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
     """Make a view's depth exact by its best neighbours at once.
 
     Pictures of its own station serve where no other station sees, or where there is hardly one.
@@ -216,6 +216,7 @@ def refine_view(scale: float, task: ViewTask) -> None:
     Args:
         scale: at which the depth was matched.
         task: the view, and the neighbours to refine with.
+        on_gpu: whether a GPU does it.
     """
     store, full_px = task.store, task.view.pinhole.size_px
     if store.has(task.index, "fine"):
@@ -224,6 +225,10 @@ def refine_view(scale: float, task: ViewTask) -> None:
     rig = [other for other in task.others if other[1].station == task.view.station]
     first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
     depth, sigma = store.load_depth(task.index, "depth")
+    if on_gpu:
+        from reconstruct.dense.refine_gpu import refine_on_gpu as refined_by
+    else:
+        refined_by = refine
     for factor in refining_scales(scale):
 
         def look(number: int, view: View, factor: float = factor) -> ComparedView:
@@ -235,7 +240,7 @@ def refine_view(scale: float, task: ViewTask) -> None:
         reference = look(task.index, task.view)
         depth, sigma = (enlarged(of, reference.view.pinhole.size_px) for of in (depth, sigma))
         start = depth
-        refined = refine(
+        refined = refined_by(
             reference,
             depth,
             sigma,

@@ -4,8 +4,15 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reconstruct.dense import refine_depth
-from reconstruct.dense.refine_depth import ComparedView, compare, pixel_lines, prepared, refine
+from reconstruct.dense.refine_depth import (
+    ALL,
+    PROCESSOR,
+    ComparedView,
+    compare,
+    pixel_lines,
+    prepared,
+    refine,
+)
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
@@ -37,7 +44,9 @@ def test_compare_equals_its_slow_twin():
     one, other = looks()[0], looks()[1]
     depth = true_depth()
     move = other.view.world_from_cam.inv() * one.view.world_from_cam
-    rest, slope, speed = compare(
+    rest, slope, speed = (np.empty(depth.shape, np.float32) for _ in range(3))
+    compare(
+        ALL,
         (1 / depth).astype(np.float32),
         one.contrast,
         pixel_lines(one.view.kernel_lens, *depth.shape),
@@ -45,6 +54,9 @@ def test_compare_equals_its_slow_twin():
         other.valid,
         other.view.kernel_lens,
         np.ascontiguousarray(move.as_matrix()[:3]),
+        rest,
+        slope,
+        speed,
     )
     rows, columns = np.nonzero(np.isfinite(rest))
     assert len(rows) > 0.5 * rest.size
@@ -91,7 +103,7 @@ def test_bands_of_rows_are_refined_as_the_whole_picture_is(monkeypatch):
     start = (true + 0.006 * np.sin(np.arange(true.shape[1]) / 9)).astype(np.float32)
     sigma = np.full_like(start, 0.004)
     whole = refine(looks()[0], start, sigma, looks()[1:])
-    monkeypatch.setattr(refine_depth, "_BAND_PIXELS", start.size // 5)
+    monkeypatch.setattr(PROCESSOR, "band_pixels", start.size // 5)
     bands = refine(looks()[0], start, sigma, looks()[1:])
     assert (np.isfinite(whole.depth) != np.isfinite(bands.depth)).mean() < 1e-3
     apart = np.abs(bands.depth - whole.depth) / whole.sigma

@@ -1,0 +1,133 @@
+"""Depth refined on an NVIDIA GPU: the kernels of `refine_depth`, a thread for each pixel.
+
+A reference of N pixels and a neighbour of n take 106 N + 5 n bytes of the device at most: of the
+reference contrast (4 N), lines (16), spread (4), inverse depth (4) and totals (17); what comparing
+gives (12), where it is known (1), products (24) and those blurred along rows (24); of the neighbour
+spline (4 n) and validity (1). At 9.2 megapixels that is 1.0 GB, besides the few hundred MB that
+CUDA takes for each process.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from filelock import FileLock
+from numba import cuda
+from numba.cuda.cudadrv.driver import CudaAPIError
+from numpy.typing import NDArray
+
+from alice_survey.base.errors import warn
+from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, refine
+
+_BLOCK = (32, 8)
+"""Threads along a row, and rows: a warp reads neighbouring pixels."""
+_REACH_SIGMAS = 4
+"""OpenCV cuts the Gaussian of 32-bit pictures off there."""
+
+
+def refine_on_gpu(
+    reference: ComparedView,
+    depth: Float32,
+    sigma: Float32,
+    others: Sequence[ComparedView],
+    spare: Sequence[ComparedView] = (),
+) -> RefinedDepth:
+    """As `refine`, one process of a user at a time; on the processor where memory does not suffice.
+
+    Depths differ from those of the processor by rounding.
+    """
+    lock = Path(tempfile.gettempdir()) / f"alice-survey-gpu-{os.getuid()}.lock"
+    try:
+        with FileLock(lock):
+            return refine(reference, depth, sigma, others, spare, _Gpu())
+    except CudaAPIError as error:
+        if "OUT_OF_MEMORY" not in str(error):
+            raise
+    warn(
+        f"{reference.view.image}: the GPU's memory does not suffice: refined by the processor; "
+        "fewer --threads or a smaller dense_scale take less"
+    )
+    return refine(reference, depth, sigma, others, spare)
+
+
+class _Gpu:
+    """The device of `refine` on the GPU that CUDA names first."""
+
+    band_pixels = 100_000_000
+
+    def put(self, values: Any) -> Any:
+        if isinstance(values, tuple):
+            return tuple(map(self.put, values))
+        is_array = isinstance(values, np.ndarray)
+        return cuda.to_device(np.ascontiguousarray(values)) if is_array else values
+
+    def get(self, array: Any) -> NDArray[Any]:
+        found: NDArray[Any] = array.copy_to_host()
+        return found
+
+    def empty(self, *shape: int) -> Any:
+        return cuda.device_array(shape, np.float32)
+
+    def run(self, kernel: Callable[..., None], shape: tuple[int, ...], *arguments: Any) -> None:
+        launched(kernel)[grid_of(shape)](arguments)
+
+    def blurred(self, planes: Any, sigma_px: float) -> Any:
+        side = 2 * round(_REACH_SIGMAS * sigma_px) + 1
+        weights = cuda.to_device(cv2.getGaussianKernel(side, sigma_px, cv2.CV_32F)[:, 0])
+        between = cuda.device_array_like(planes)
+        self.run(blur, planes.shape[1:], planes, weights, (0, 1), between)
+        self.run(blur, planes.shape[1:], between, weights, (1, 0), planes)
+        return planes
+
+
+def grid_of(shape: tuple[int, ...]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Blocks, and threads of each, of a launch for (H, W) pixels."""
+    height, width = shape
+    return (-(-width // _BLOCK[0]), -(-height // _BLOCK[1])), _BLOCK
+
+
+@cache
+def launched(kernel: Callable[..., None]) -> Any:
+    """A kernel that takes a share of the pixels, for the GPU: each thread has its own.
+
+    It is compiled without the options of the processor's, which numba-cuda would take as leave to
+    ignore NaN; the functions that it calls keep them, and get finite numbers alone.
+    """
+    work = cuda.jit(device=True)(getattr(kernel, "py_func", kernel))
+
+    @cuda.jit
+    def launch(arguments):  # type: ignore[no-untyped-def]
+        columns, rows = cuda.gridsize(2)
+        column, row = cuda.grid(2)
+        work((row, rows, column, columns), *arguments)
+
+    return launch
+
+
+def blur(share, planes, weights, step, blurred):  # type: ignore[no-untyped-def]
+    """Take the weighted mean along rows or columns, mirrored at the edges with the edge doubled.
+
+    Args:
+        share: which pixels, see `refine_depth.Share`.
+        planes: (N, H, W), of half as many pixels as there are weights or more.
+        weights: of an odd number of pixels, in a sum of one.
+        step: rows and columns to the next pixel of the mean.
+        blurred: (N, H, W), to be filled.
+    """
+    count, height, width = planes.shape
+    for row in range(share[0], height, share[1]):
+        for column in range(share[2], width, share[3]):
+            for plane in range(count):
+                total = np.float32(0.0)
+                for k in range(len(weights)):
+                    i = row + (k - len(weights) // 2) * step[0]
+                    j = column + (k - len(weights) // 2) * step[1]
+                    i = min(max(i, -1 - i), 2 * height - 1 - max(i, -1 - i))
+                    j = min(max(j, -1 - j), 2 * width - 1 - max(j, -1 - j))
+                    total += weights[k] * planes[plane, i, j]
+                blurred[plane, row, column] = total
