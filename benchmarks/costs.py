@@ -1,0 +1,368 @@
+"""Measure what stages cost, and write the coefficients of `alice_survey/computing.toml`.
+
+    python -m benchmarks.costs --work FOLDER [--survey WORKSPACE EVENTS ...]
+        [--held WORKSPACE EVENTS ...] [--compare]
+
+Runs small rendered surveys in FOLDER with one to four workers (those that are done are not run
+again; about an hour of computing), reads them and any finished workspaces with the events of their
+run (`alice-survey run --events EVENTS`, any number of `--survey`), and fits. `--held` are surveys
+that the fit must not see: for these, predicted and measured costs are printed. To fit again after
+code has changed, with a survey of full resolution among the others:
+
+    alice-survey run -w full --events full.jsonl
+    python -m benchmarks.costs --work FOLDER --survey full full.jsonl
+
+Coefficients are non-negative least squares of relative errors, so that small and large surveys
+count alike.
+"""
+
+import argparse
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import nnls
+
+from alice_survey import computing
+from alice_survey.base.artefacts import read_stage
+from alice_survey.base.run.resources import processor
+from alice_survey.computing import PREDICTED, Prediction, SurveySize, workspace_size
+from alice_survey.stages import spec
+from alice_survey.survey import settings
+from benchmarks.cluster_model import recorded
+
+DATA = Path(computing.__file__).with_suffix(".toml")
+_WATCH_S = 1.0
+_MATCHING = ("try matching", "compare partners", "match")
+_COMPUTING: dict[str, Sequence[str]] = {
+    "pool": ("once", "board_pictures", "board_mpx"),
+    "image": ("once", "floor_cells", "pictures", "rendered_mpx"),
+    "calibrate": ("once", "board_pictures", "board_mpx"),
+    "mapping": ("once", "pictures", "feature_mpx", "kilofeatures", "compared"),
+    "placing": ("once", "pictures", "kilofeatures"),
+    "dense": ("once", "pictures", "refined_mpx", "cells"),
+    "mosaic": ("once", "pictures", "taken_mpx", "mosaic_mpx"),
+    "mesh": ("once", "pictures", "taken_mpx", "cells"),
+}
+"""What may drive the computing of a stage."""
+_PROCESS = ("once", "pictures", "cells")
+_WORKER = dict.fromkeys(PREDICTED, ("once", "picture_mpx")) | {
+    "dense": ("once", "refined_picture_mpx")
+}
+_PRODUCT: dict[str, Sequence[str]] = {
+    "pool": ("board_pictures", "board_mpx"),
+    "image": ("pictures", "taken_mpx", "floor_cells"),
+    "calibrate": ("once", "board_pictures"),
+    "mapping": ("kilofeatures",),
+    "placing": ("kilofeatures",),
+    "dense": ("refined_mpx", "cells"),
+    "mosaic": ("pictures", "mosaic_mpx"),
+    "mesh": ("taken_mpx", "cells"),
+}
+_SCRATCH: dict[str, Sequence[str]] = {
+    "mapping": ("kilofeatures", "taken_mpx"),
+    "dense": ("refined_mpx",),
+    "mosaic": ("taken_mpx", "mosaic_mpx"),
+    "mesh": ("taken_mpx", "cells"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """A small rendered survey to measure."""
+
+    name: str
+    sides_m: tuple[float, float]
+    scale: int
+    """By which the camera's resolution is divided."""
+    seed: int
+    features: int = 8000
+    relief_m: float = 0.3
+    cross: bool = True
+    workers: int = 1
+
+    @property
+    def text(self) -> str:
+        """Its settings."""
+        lines = "" if self.cross else "cross_lines = 0\nclosing_line = false\n"
+        return (
+            f'name = "{self.name}"\nseed = {self.seed}\n'
+            f"[area]\nlength_m = {self.sides_m[0]}\nwidth_m = {self.sides_m[1]}\n"
+            f"[plan]\nside_overlap = 0.3\n{lines}"
+            f"[seafloor]\nrelief_m = {self.relief_m}\n"
+            f"[imaging]\nscale = {self.scale}\npool_views = 12\n"
+            f"[reconstruct]\nmax_features = {self.features}\n"
+        )
+
+
+SURVEYS = (
+    Survey(name="s8small", sides_m=(1.0, 1.0), scale=8, seed=11),
+    Survey(name="s8big", sides_m=(4.5, 3.7), scale=8, seed=5, features=2000),
+    Survey(name="s6mid", sides_m=(2.5, 2.4), scale=6, seed=6, features=2000, relief_m=0.2),
+    Survey(name="s4small", sides_m=(1.2, 1.0), scale=4, seed=8, features=3000),
+    Survey(name="s3small", sides_m=(1.2, 1.6), scale=3, seed=10, relief_m=0.35),
+    Survey(name="s2tiny", sides_m=(1.6, 0.8), scale=2, seed=9, cross=False),
+    Survey(name="s8two", sides_m=(1.0, 1.0), scale=8, seed=12, workers=2),
+    Survey(name="s5three", sides_m=(1.8, 1.6), scale=5, seed=14, features=3000, workers=3),
+    Survey(name="s3four", sides_m=(1.2, 0.8), scale=3, seed=13, workers=4),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageRun:
+    """What a stage has cost."""
+
+    size: SurveySize
+    workers: int
+    cpu_s: float
+    tasks_s: Mapping[str, float]
+    """Of each step."""
+    peak_mib: float
+    product_mb: float
+    scratch_mb: float | None
+    """None where nobody looked."""
+
+    @property
+    def serial_s(self) -> float:
+        """Computing outside of tasks."""
+        return max(0.0, self.cpu_s - sum(self.tasks_s.values()))
+
+
+def run_survey(survey: Survey, work: Path) -> tuple[Path, Path]:
+    """Run a survey unless it is done; return its workspace and its events.
+
+    Raises:
+        CalledProcessError: it failed.
+    """
+    workspace, events = work / survey.name, work / f"{survey.name}.jsonl"
+    if read_stage(workspace / "report") is not None:
+        return workspace, events
+    shutil.rmtree(workspace, ignore_errors=True)
+    events.unlink(missing_ok=True)
+    workspace.mkdir(parents=True)
+    (workspace / "survey.toml").write_text(survey.text, encoding="utf-8")
+    command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
+    command += ["--threads", str(survey.workers), "--events", str(events), "--quiet"]
+    most_mb: dict[str, float] = {}
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            for folder in workspace.glob("*.partial"):
+                most_mb[folder.stem] = max(most_mb.get(folder.stem, 0.0), folder_mb(folder))
+            time.sleep(_WATCH_S)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    events.with_suffix(".scratch.json").write_text(json.dumps(most_mb))
+    return workspace, events
+
+
+def stage_runs(workspace: Path, events: Path) -> dict[str, StageRun]:
+    """What the finished stages of a workspace have cost, by name."""
+    config = settings(workspace, None, needed=False)
+    size = workspace_size(
+        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
+    )
+    if size is None:
+        raise SystemExit(f"{workspace}: neither a plan nor pictures")
+    text = events.read_text(encoding="utf-8")
+    finished = set(re.findall(r'"stage_finished", "stage": "(\w+)"', text))
+    looked = events.with_suffix(".scratch.json")
+    scratch = json.loads(looked.read_text()) if looked.is_file() else {}
+    found: dict[str, StageRun] = {}
+    for name in PREDICTED:
+        folder = spec(name).folder
+        record = read_stage(workspace / folder)
+        if record is None or folder not in finished:
+            continue
+        (stage,) = recorded(events, [folder])
+        tasks_s: dict[str, float] = {}
+        for step in stage.steps:
+            tasks_s[step.label] = tasks_s.get(step.label, 0.0) + float(step.task_s.sum())
+        product_mb = folder_mb(workspace / folder)
+        found[name] = StageRun(
+            size=size,
+            workers=_workers(text),
+            cpu_s=stage.serial_s + sum(tasks_s.values()),
+            tasks_s=tasks_s,
+            peak_mib=record.peak_mib or 0.0,
+            product_mb=product_mb,
+            scratch_mb=max(0.0, scratch[folder] - product_mb) if folder in scratch else None,
+        )
+    return found
+
+
+def _workers(events: str) -> int:
+    """How many workers the command of an events file had: as given, else all cores here."""
+    given = re.search(r"--threads (\d+)", events)
+    return int(given[1]) if given else computing.default_threads()
+
+
+def folder_mb(folder: Path) -> float:
+    """Size of all files of a folder that may change meanwhile."""
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.lstat().st_size if path.is_file() else 0
+        except OSError:
+            continue
+    return total / 1e6
+
+
+def fitted(rows: Sequence[Mapping[str, float]], values: Sequence[float]) -> dict[str, float]:
+    """Non-negative coefficients of least relative errors.
+
+    Args:
+        rows: what may drive each value, by the same names.
+        values: measured; those of 0 do not count.
+    """
+    used = [n for n, value in enumerate(values) if value > 0]
+    if not used:
+        return {}
+    names = list(rows[0])
+    matrix = np.array([[rows[n][name] / values[n] for name in names] for n in used])
+    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
+    found, _ = nnls(matrix / scale, np.ones(len(used)))
+    return {name: float(x) for name, x in zip(names, found / scale, strict=True) if x > 0}
+
+
+def coefficients(runs: Sequence[Mapping[str, StageRun]]) -> dict[str, dict[str, Any]]:
+    """Coefficients of all stages, as `computing.toml` holds them, from what surveys have cost."""
+    return {name: _of_stage(name, [run[name] for run in runs if name in run]) for name in PREDICTED}
+
+
+def _of_stage(name: str, runs: Sequence[StageRun]) -> dict[str, dict[str, float]]:
+    def rows(names: Sequence[str]) -> list[dict[str, float]]:
+        return [{key: run.size.drivers[key] for key in names} for run in runs]
+
+    def matching(run: StageRun) -> float:
+        return sum(run.tasks_s.get(step, 0.0) for step in _MATCHING if name == "dense")
+
+    usual = rows(_COMPUTING[name])
+    tasks_s = fitted(usual, [sum(run.tasks_s.values()) - matching(run) for run in runs])
+    matched = fitted(rows(("pictures", "matched_mpx")), [matching(run) for run in runs])
+    for key, value in matched.items():
+        tasks_s[key] = tasks_s.get(key, 0.0) + value
+    memory_rows = [
+        {f"process {key}": run.size.drivers[key] for key in _PROCESS}
+        | {
+            f"worker {key}": min(run.workers, run.size.pictures) * run.size.drivers[key]
+            for key in _WORKER[name]
+        }
+        for run in runs
+    ]
+    memory = fitted(memory_rows, [run.peak_mib for run in runs])
+    looked = [n for n, run in enumerate(runs) if run.scratch_mb is not None]
+    scratch_rows = rows(_SCRATCH.get(name, ()))
+    return {
+        "serial_s": fitted(usual, [run.serial_s for run in runs]),
+        "tasks_s": tasks_s,
+        "process_mib": _part(memory, "process"),
+        "worker_mib": _part(memory, "worker"),
+        "product_mb": fitted(rows(_PRODUCT[name]), [run.product_mb for run in runs]),
+        "scratch_mb": fitted(
+            [scratch_rows[n] for n in looked], [runs[n].scratch_mb or 0.0 for n in looked]
+        )
+        if name in _SCRATCH
+        else {},
+    }
+
+
+def _part(values: Mapping[str, float], prefix: str) -> dict[str, float]:
+    return {
+        key.removeprefix(f"{prefix} "): value
+        for key, value in values.items()
+        if key.startswith(prefix)
+    }
+
+
+def written(stages: Mapping[str, Any], probe_s: float, machine: str) -> str:
+    """The text of `computing.toml`."""
+    lines = [
+        "# What stages cost, measured by `python -m benchmarks.costs`; computing.py says what the",
+        "# coefficients are multiplied by.",
+        "",
+        f"processor = {json.dumps(machine)}",
+        f"probe_s = {probe_s:.4f}",
+    ]
+    for stage, parts in stages.items():
+        lines += ["", f"[stages.{stage}]"]
+        for part, values in parts.items():
+            inner = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
+            lines.append(f"{part} = {{ {inner} }}" if inner else f"{part} = {{}}")
+    return "\n".join(lines) + "\n"
+
+
+def comparison(name: str, runs: Mapping[str, StageRun], measured: Mapping[str, Any]) -> list[str]:
+    """Rows of a table: predicted, measured and their ratio, of imaging and of reconstruction.
+
+    Args:
+        name: of the survey.
+        runs: what its stages have cost on the machine of the coefficients.
+        measured: the coefficients.
+    """
+    rows = []
+    for group, stages in computing.GROUPS.items():
+        done = {stage: runs[stage] for stage in stages if stage in runs}
+        if not done:
+            continue
+        one = next(iter(done.values()))
+        costs = computing.stage_costs(one.size, 1.0, measured)
+        found = Prediction(stages={stage: costs[stage] for stage in done}, workers=one.workers)
+        pairs = {
+            "computing, s": (found.cpu_s, sum(run.cpu_s for run in done.values())),
+            "not in tasks, s": (
+                sum(cost.serial_s for cost in found.stages.values()),
+                sum(run.serial_s for run in done.values()),
+            ),
+            "memory, MiB": (
+                found.memory_mib(one.workers), max(run.peak_mib for run in done.values())
+            ),
+            "products, MB": (
+                sum(cost.product_mb for cost in found.stages.values()),
+                sum(run.product_mb for run in done.values()),
+            ),
+        }  # fmt: skip
+        rows += [
+            f"| {name} | {group} | {what} | {ours:.0f} | {true:.0f} | {ours / true:.2f} |"
+            for what, (ours, true) in pairs.items()
+        ]
+        rows += [
+            f"|   | {stage} | computing, s | {costs[stage].cpu_s:.1f} | {run.cpu_s:.1f} | "
+            f"{costs[stage].cpu_s / run.cpu_s:.2f} |"
+            for stage, run in done.items()
+        ]
+    return rows
+
+
+def main() -> None:
+    """Measure, fit, write, and compare."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--work", type=Path, required=True, help="folder for the small surveys")
+    for option, what in (("--survey", "to learn from"), ("--held", "to compare with")):
+        parser.add_argument(
+            option, type=Path, nargs=2, action="append", default=[],
+            metavar=("WORKSPACE", "EVENTS"), help=f"a finished survey {what}",
+        )  # fmt: skip
+    parser.add_argument("--compare", action="store_true", help="fit nothing, compare alone")
+    options = parser.parse_args()
+    if not options.compare:
+        found = [run_survey(survey, options.work) for survey in SURVEYS]
+        runs = [stage_runs(*one) for one in [*found, *options.survey]]
+        text = written(coefficients(runs), computing.probe_s(), processor())
+        DATA.write_text(text, encoding="utf-8")
+        print(f"wrote {DATA}")
+    print("| survey | of | what | predicted | measured | ratio |\n|---|---|---|---|---|---|")
+    for workspace, events in options.held:
+        runs_of_it = stage_runs(workspace, events)
+        print("\n".join(comparison(workspace.name, runs_of_it, computing.model())))
+
+
+if __name__ == "__main__":
+    main()
