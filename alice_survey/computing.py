@@ -69,6 +69,8 @@ class SurveySize:
     mosaic_mpx: float
     floor_cells: float = 0.0
     """Of a sea floor to render."""
+    rig_known: bool = True
+    """Whether the cameras are calibrated."""
     board_pictures: int = 0
     samples: int = 2
     """Rays for a rendered pixel, along each side."""
@@ -88,6 +90,7 @@ class SurveySize:
             "board_mpx": self.board_pictures * self.mpx,
             "floor_cells": self.floor_cells,
             "pictures": self.pictures,
+            "uncalibrated_pictures": 0 if self.rig_known else self.pictures,
             "rendered_mpx": self.pictures * self.mpx * rays,
             "taken_mpx": self.pictures * self.mpx,
             "feature_mpx": self.pictures * self.feature_mpx,
@@ -144,7 +147,7 @@ def size_of(
         cells = area_m2 / cell_m**2 / 1e6
         mosaic_mpx = area_m2 / (reconstruct.mosaic_pixel_m or pixel_m) ** 2 / 1e6
     return SurveySize(
-        pictures=pictures, mpx=mpx, feature_mpx=feature_mpx,
+        pictures=pictures, mpx=mpx, rig_known=rig_known, feature_mpx=feature_mpx,
         features=min(most, _FOUND_PER_MPX * feature_mpx),
         matched_mpx=matched_mpx, refined_mpx=refined_mpx, partners=reconstruct.dense_partners,
         cells=cells, mosaic_mpx=mosaic_mpx, pixel_m=pixel_m, cell_m=cell_m, **others,

@@ -1,13 +1,13 @@
 """Measure what stages cost, and write the coefficients of `alice_survey/computing.toml`.
 
     python -m benchmarks.costs --work FOLDER [--survey WORKSPACE EVENTS ...]
-        [--held WORKSPACE EVENTS ...] [--compare]
+        [--held WORKSPACE WORKERS ...] [--compare]
 
 Runs small rendered surveys in FOLDER with one to four workers (those that are done are not run
 again; about an hour of computing), reads them and any finished workspaces with the events of their
 run (`alice-survey run --events EVENTS`, any number of `--survey`), and fits. `--held` are surveys
-that the fit must not see: for these, predicted and measured costs are printed. To fit again after
-code has changed, with a survey of full resolution among the others:
+that the fit must not see, with the workers that made them: for these, predicted and measured costs
+are printed. To fit again after code has changed, with a survey of full resolution among the others:
 
     alice-survey run -w full --events full.jsonl
     python -m benchmarks.costs --work FOLDER --survey full full.jsonl
@@ -33,9 +33,10 @@ from scipy.optimize import nnls
 
 from alice_survey import computing
 from alice_survey.base.artefacts import read_stage
+from alice_survey.base.executor import default_threads
 from alice_survey.base.run.resources import processor
 from alice_survey.computing import PREDICTED, Prediction, SurveySize, workspace_size
-from alice_survey.stages import spec
+from alice_survey.stages import is_imported, spec
 from alice_survey.survey import settings
 from benchmarks.cluster_model import recorded
 
@@ -46,12 +47,14 @@ _COMPUTING: dict[str, Sequence[str]] = {
     "pool": ("once", "board_pictures", "board_mpx"),
     "image": ("once", "floor_cells", "pictures", "rendered_mpx"),
     "calibrate": ("once", "board_pictures", "board_mpx"),
-    "mapping": ("once", "pictures", "feature_mpx", "kilofeatures", "compared"),
+    "mapping": (
+        "once", "pictures", "feature_mpx", "kilofeatures", "compared", "uncalibrated_pictures"
+    ),
     "placing": ("once", "pictures", "kilofeatures"),
     "dense": ("once", "pictures", "refined_mpx", "cells"),
     "mosaic": ("once", "pictures", "taken_mpx", "mosaic_mpx"),
     "mesh": ("once", "pictures", "taken_mpx", "cells"),
-}
+}  # fmt: skip
 """What may drive the computing of a stage."""
 _PROCESS = ("once", "pictures", "cells")
 _WORKER = dict.fromkeys(PREDICTED, ("once", "picture_mpx")) | {
@@ -88,6 +91,8 @@ class Survey:
     relief_m: float = 0.3
     cross: bool = True
     workers: int = 1
+    pictures_of: str = ""
+    """Name of another one, whose pictures it takes as they are, without rig and navigation."""
 
     @property
     def text(self) -> str:
@@ -109,6 +114,7 @@ SURVEYS = (
     Survey(name="s6mid", sides_m=(2.5, 2.4), scale=6, seed=6, features=2000, relief_m=0.2),
     Survey(name="s4small", sides_m=(1.2, 1.0), scale=4, seed=8, features=3000),
     Survey(name="s3small", sides_m=(1.2, 1.6), scale=3, seed=10, relief_m=0.35),
+    Survey(name="bare", sides_m=(1.2, 1.0), scale=4, seed=8, pictures_of="s4small"),
     Survey(name="s2tiny", sides_m=(1.6, 0.8), scale=2, seed=9, cross=False),
     Survey(name="s8two", sides_m=(1.0, 1.0), scale=8, seed=12, workers=2),
     Survey(name="s5three", sides_m=(1.8, 1.6), scale=5, seed=14, features=3000, workers=3),
@@ -143,14 +149,22 @@ def run_survey(survey: Survey, work: Path) -> tuple[Path, Path]:
         CalledProcessError: it failed.
     """
     workspace, events = work / survey.name, work / f"{survey.name}.jsonl"
-    if read_stage(workspace / "report") is not None:
+    if read_stage(workspace / "mesh") is not None:
         return workspace, events
     shutil.rmtree(workspace, ignore_errors=True)
     events.unlink(missing_ok=True)
-    workspace.mkdir(parents=True)
-    (workspace / "survey.toml").write_text(survey.text, encoding="utf-8")
-    command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
-    command += ["--threads", str(survey.workers), "--events", str(events), "--quiet"]
+    program = [sys.executable, "-m", "alice_survey"]
+    stages = "run"
+    if survey.pictures_of:
+        stages = "reconstruct"
+        images = work / survey.pictures_of / "images"
+        folders = ["--left", str(images / "left"), "--right", str(images / "right")]
+        subprocess.run([*program, "import-images", *folders, "-w", str(workspace)], check=True)
+    else:
+        workspace.mkdir(parents=True)
+        (workspace / "survey.toml").write_text(survey.text, encoding="utf-8")
+    command = [*program, stages, "-w", str(workspace), "--threads", str(survey.workers)]
+    command += ["--events", str(events), "--quiet"]
     most_mb: dict[str, float] = {}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         while process.poll() is None:
@@ -165,12 +179,7 @@ def run_survey(survey: Survey, work: Path) -> tuple[Path, Path]:
 
 def stage_runs(workspace: Path, events: Path) -> dict[str, StageRun]:
     """What the finished stages of a workspace have cost, by name."""
-    config = settings(workspace, None, needed=False)
-    size = workspace_size(
-        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
-    )
-    if size is None:
-        raise SystemExit(f"{workspace}: neither a plan nor pictures")
+    size = _size(workspace)
     text = events.read_text(encoding="utf-8")
     finished = set(re.findall(r'"stage_finished", "stage": "(\w+)"', text))
     looked = events.with_suffix(".scratch.json")
@@ -179,7 +188,7 @@ def stage_runs(workspace: Path, events: Path) -> dict[str, StageRun]:
     for name in PREDICTED:
         folder = spec(name).folder
         record = read_stage(workspace / folder)
-        if record is None or folder not in finished:
+        if record is None or folder not in finished:  # imported pictures have no such event
             continue
         (stage,) = recorded(events, [folder])
         tasks_s: dict[str, float] = {}
@@ -201,7 +210,7 @@ def stage_runs(workspace: Path, events: Path) -> dict[str, StageRun]:
 def _workers(events: str) -> int:
     """How many workers the command of an events file had: as given, else all cores here."""
     given = re.search(r"--threads (\d+)", events)
-    return int(given[1]) if given else computing.default_threads()
+    return int(given[1]) if given else default_threads()
 
 
 def folder_mb(folder: Path) -> float:
@@ -299,57 +308,69 @@ def written(stages: Mapping[str, Any], probe_s: float, machine: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def comparison(name: str, runs: Mapping[str, StageRun], measured: Mapping[str, Any]) -> list[str]:
-    """Rows of a table: predicted, measured and their ratio, of imaging and of reconstruction.
+def comparison(workspace: Path, workers: int, measured: Mapping[str, Any]) -> list[str]:
+    """Rows of a table: predicted and measured cost of a survey, by stage and together.
 
     Args:
-        name: of the survey.
-        runs: what its stages have cost on the machine of the coefficients.
+        workspace: of the survey, made on the machine of the coefficients.
+        workers: how many it was made with.
         measured: the coefficients.
     """
+    size = _size(workspace)
     rows = []
     for group, stages in computing.GROUPS.items():
-        done = {stage: runs[stage] for stage in stages if stage in runs}
-        if not done:
+        folders = {
+            name: workspace / spec(name).folder
+            for name in stages
+            if not (spec(name).simulated and is_imported(workspace))
+        }
+        known = {name: read_stage(folder) for name, folder in folders.items()}
+        records = {n: record for n, record in known.items() if record is not None and record.cpu_s}
+        costs = computing.stage_costs(size, 1.0, measured)
+        found = Prediction(stages={name: costs[name] for name in records}, workers=workers)
+        rows += [
+            _row(workspace.name, name, "computing, s", costs[name].cpu_s, record.cpu_s or 0.0)
+            for name, record in records.items()
+        ]
+        if not records:
             continue
-        one = next(iter(done.values()))
-        costs = computing.stage_costs(one.size, 1.0, measured)
-        found = Prediction(stages={stage: costs[stage] for stage in done}, workers=one.workers)
-        pairs = {
-            "computing, s": (found.cpu_s, sum(run.cpu_s for run in done.values())),
-            "not in tasks, s": (
-                sum(cost.serial_s for cost in found.stages.values()),
-                sum(run.serial_s for run in done.values()),
-            ),
-            "memory, MiB": (
-                found.memory_mib(one.workers), max(run.peak_mib for run in done.values())
-            ),
-            "products, MB": (
-                sum(cost.product_mb for cost in found.stages.values()),
-                sum(run.product_mb for run in done.values()),
-            ),
-        }  # fmt: skip
-        rows += [
-            f"| {name} | {group} | {what} | {ours:.0f} | {true:.0f} | {ours / true:.2f} |"
-            for what, (ours, true) in pairs.items()
-        ]
-        rows += [
-            f"|   | {stage} | computing, s | {costs[stage].cpu_s:.1f} | {run.cpu_s:.1f} | "
-            f"{costs[stage].cpu_s / run.cpu_s:.2f} |"
-            for stage, run in done.items()
-        ]
+        product_mb = sum(folder_mb(folders[name]) for name in records)
+        for what, ours, true in (
+            ("computing, s", found.cpu_s, sum(r.cpu_s or 0.0 for r in records.values())),
+            ("memory, MiB", found.memory_mib, max(r.peak_mib or 0.0 for r in records.values())),
+            ("products, MB", sum(c.product_mb for c in found.stages.values()), product_mb),
+        ):
+            value = ours(workers) if callable(ours) else ours
+            rows.append(_row(workspace.name, group, what, value, true))
     return rows
+
+
+def _row(survey: str, part: str, what: str, ours: float, true: float) -> str:
+    return f"| {survey} | {part} | {what} | {ours:.0f} | {true:.0f} | {ours / true:.2f} |"
+
+
+def _size(workspace: Path) -> SurveySize:
+    config = settings(workspace, None, needed=False)
+    size = workspace_size(
+        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
+    )
+    if size is None:
+        raise SystemExit(f"{workspace}: neither a plan nor pictures")
+    return size
 
 
 def main() -> None:
     """Measure, fit, write, and compare."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--work", type=Path, required=True, help="folder for the small surveys")
-    for option, what in (("--survey", "to learn from"), ("--held", "to compare with")):
-        parser.add_argument(
-            option, type=Path, nargs=2, action="append", default=[],
-            metavar=("WORKSPACE", "EVENTS"), help=f"a finished survey {what}",
-        )  # fmt: skip
+    parser.add_argument(
+        "--survey", type=Path, nargs=2, action="append", default=[],
+        metavar=("WORKSPACE", "EVENTS"), help="a finished survey to learn from",
+    )  # fmt: skip
+    parser.add_argument(
+        "--held", nargs=2, action="append", default=[],
+        metavar=("WORKSPACE", "WORKERS"), help="a finished survey to compare with",
+    )  # fmt: skip
     parser.add_argument("--compare", action="store_true", help="fit nothing, compare alone")
     options = parser.parse_args()
     if not options.compare:
@@ -359,9 +380,8 @@ def main() -> None:
         DATA.write_text(text, encoding="utf-8")
         print(f"wrote {DATA}")
     print("| survey | of | what | predicted | measured | ratio |\n|---|---|---|---|---|---|")
-    for workspace, events in options.held:
-        runs_of_it = stage_runs(workspace, events)
-        print("\n".join(comparison(workspace.name, runs_of_it, computing.model())))
+    for workspace, workers in options.held:
+        print("\n".join(comparison(Path(workspace), int(workers), computing.model())))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from alice_survey.computing import (
     PREDICTED,
     Prediction,
     StageCost,
+    SurveySize,
     correction,
     planned_size,
     size_of,
@@ -136,6 +137,20 @@ def test_a_survey_without_a_scale_has_the_cells_of_one_seen_as_often() -> None:
     scaled = size_of(pictures, 2.0, RIG, pixel_m=pixel_m, area_m2=area_m2)
     assert unscaled.cells == pytest.approx(scaled.cells)
     assert unscaled.mosaic_mpx == pytest.approx(scaled.mosaic_mpx)
+
+
+def test_a_survey_that_was_not_learned_from_costs_what_it_did() -> None:
+    """The survey of `tests/small_survey.py`, computing and products, as run with one worker."""
+    size = SurveySize(
+        pictures=30, mpx=0.2544, feature_mpx=0.12, features=1200, matched_mpx=0.2544,
+        refined_mpx=0.2544, cells=0.1548, mosaic_mpx=0.9674, floor_cells=0.2656, board_pictures=24,
+    )  # fmt: skip
+    costs = stage_costs(size)
+    measured = {"image": (28.9, 30.0), "calibrate and reconstruct": (77.7, 26.0)}
+    for group, (cpu_s, product_mb) in measured.items():
+        found = [costs[stage] for stage in computing.GROUPS[group]]
+        assert 0.7 < sum(cost.cpu_s for cost in found) / cpu_s < 1.3
+        assert 0.7 < sum(cost.product_mb for cost in found) / product_mb < 1.3
 
 
 def test_cost_grows_with_pictures_and_no_faster_than_they_do() -> None:
