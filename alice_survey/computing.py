@@ -73,7 +73,8 @@ class SurveySize:
     """Whether the cameras are calibrated."""
     board_pictures: int = 0
     samples: int = 2
-    """Rays for a rendered pixel, along each side."""
+    board_samples: int = 3
+    """Rays for a pixel rendered of the sea floor and of a board, along each side."""
     pixel_m: float | None = None
     cell_m: float | None = None
     """Sides of a pixel on the ground and of a cell, where they are known."""
@@ -81,13 +82,15 @@ class SurveySize:
     @property
     def drivers(self) -> dict[str, float]:
         """What coefficients are multiplied by, by name."""
-        rays = (self.samples / 2) ** 2
+        rays, board_rays = (self.samples / 2) ** 2, (self.board_samples / 3) ** 2
         return {
             "once": 1.0,
             "picture_mpx": self.mpx,
             "refined_picture_mpx": self.refined_mpx,
             "board_pictures": self.board_pictures,
             "board_mpx": self.board_pictures * self.mpx,
+            "board_rays": self.board_pictures * self.mpx * board_rays,
+            "board_rays_large": self.board_pictures * self.mpx**1.5 * board_rays,
             "floor_cells": self.floor_cells,
             "pictures": self.pictures,
             "uncalibrated_pictures": 0 if self.rig_known else self.pictures,
@@ -190,6 +193,7 @@ def planned_size(
         floor_cells=floor_m2 / seafloor.grid_m**2 / 1e6,
         board_pictures=_CAMERAS * imaging.pool_views,
         samples=imaging.samples,
+        board_samples=imaging.samples + (imaging.scale > 1),
     )
 
 
@@ -237,6 +241,8 @@ class StageCost:
     serial_s: float
     tasks_s: float
     """Computing outside of tasks, and in all of them."""
+    start_s: float = 0.0
+    """For the start of each worker, all at once, where there is more than one."""
     tasks: int
     """How many there are at least: more workers have nothing to do."""
     process_mib: float
@@ -246,14 +252,15 @@ class StageCost:
     scratch_mb: float
     """Disk for good, and what is removed at its end."""
 
-    @property
-    def cpu_s(self) -> float:
+    def cpu_s(self, workers: int) -> float:
         """All computing."""
-        return self.serial_s + self.tasks_s
+        busy = min(workers, self.tasks)
+        return self.serial_s + self.tasks_s + (busy * self.start_s if busy > 1 else 0.0)
 
     def time_s(self, workers: int) -> float:
         """How long it takes with some workers, each on a core of its own."""
-        return self.serial_s + self.tasks_s / min(workers, self.tasks)
+        busy = min(workers, self.tasks)
+        return self.serial_s + self.tasks_s / busy + (self.start_s if busy > 1 else 0.0)
 
     def memory_mib(self, workers: int) -> float:
         """Most memory at once; a single worker is the process itself."""
@@ -261,7 +268,12 @@ class StageCost:
 
     def scaled(self, factor: float) -> "StageCost":
         """The same with more computing."""
-        return replace(self, serial_s=factor * self.serial_s, tasks_s=factor * self.tasks_s)
+        return replace(
+            self,
+            serial_s=factor * self.serial_s,
+            tasks_s=factor * self.tasks_s,
+            start_s=factor * self.start_s,
+        )
 
 
 def model() -> dict[str, Any]:
@@ -292,6 +304,7 @@ def stage_costs(
         found[stage] = StageCost(
             serial_s=slowness * sums["serial_s"],
             tasks_s=slowness * sums["tasks_s"],
+            start_s=slowness * sums["start_s"],
             tasks=max(1, size.board_pictures if stage in BOARD_STAGES else size.pictures),
             process_mib=sums["process_mib"],
             worker_mib=sums["worker_mib"],
@@ -317,10 +330,9 @@ class Prediction:
         """The most that one of them takes."""
         return max(cost.memory_mib(workers) for cost in self.stages.values())
 
-    @property
-    def cpu_s(self) -> float:
+    def cpu_s(self, workers: int) -> float:
         """All computing."""
-        return sum(cost.cpu_s for cost in self.stages.values())
+        return sum(cost.cpu_s(workers) for cost in self.stages.values())
 
     @property
     def disk_mb(self) -> float:
@@ -345,7 +357,7 @@ class Prediction:
         return {
             "stages": list(self.stages),
             "workers": self.workers,
-            "cpu_s": round(self.cpu_s),
+            "cpu_s": round(self.cpu_s(self.workers)),
             "time_s": {str(n): round(self.time_s(n)) for n in workers},
             "memory_mib": {str(n): round(self.memory_mib(n)) for n in workers},
             "disk_mb": round(self.disk_mb),
@@ -353,17 +365,23 @@ class Prediction:
 
 
 def correction(
-    costs: Mapping[str, StageCost], records: Mapping[str, StageRecord], here: str
-) -> tuple[float, list[str]]:
-    """Measured over predicted computing of the stages that have run on a processor.
+    costs: Mapping[str, StageCost], records: Mapping[str, StageRecord], here: str, workers: int
+) -> tuple[float, float, list[str]]:
+    """How much more computing to expect than predicted, from stages that ran on a processor.
+
+    What is wrong with a prediction is in part common to all stages (the machine, the sea floor) and
+    in part each stage's own. Of equal variances, on logarithms, n stages show n / (n + 1) of the
+    common part.
 
     Args:
         costs: as predicted.
         records: of finished stages, by their names.
         here: name of the processor.
+        workers: how many they are taken to have had.
 
     Returns:
-        The ratio, 1 where none has run, and the stages that it is of.
+        Measured over predicted computing of these stages, the factor to expect of others, and
+        their names; 1 and 1 where none has run.
     """
     ran = {
         name: record.cpu_s
@@ -371,8 +389,9 @@ def correction(
         if name in costs and record.processor == here and record.cpu_s
     }
     if not ran:
-        return 1.0, []
-    return sum(ran.values()) / sum(costs[name].cpu_s for name in ran), list(ran)
+        return 1.0, 1.0, []
+    ratio = sum(ran.values()) / sum(costs[name].cpu_s(workers) for name in ran)
+    return ratio, ratio ** (len(ran) / (len(ran) + 1)), list(ran)
 
 
 def slowness() -> float:
@@ -447,19 +466,22 @@ def summary(
         records: of finished stages of this survey, whose measured cost corrects the rest.
     """
     costs = stage_costs(size, slowness())
-    factor, ran = correction(costs, records or {}, processor())
+    cores = default_threads()
+    ratio, factor, ran = correction(costs, records or {}, processor(), cores)
     found: dict[str, Any] = {}
     lines = []
     for name, stages in groups.items():
         chosen = {stage: costs[stage].scaled(factor) for stage in stages}
-        group = Prediction(stages=chosen, workers=workers or default_threads())
+        group = Prediction(stages=chosen, workers=workers or cores)
         found[name] = group.to_json()
         lines.append(f"{name}: {group.text('worker' if workers else 'core')}")
     if lines and size.pixel_m is not None and size.cell_m is not None:
         lines[-1] += f"; {1e3 * size.pixel_m:.2g} mm pixels, {1e3 * size.cell_m:.2g} mm surface"
     if lines and ran:
-        found["measured_over_predicted"] = round(factor, 3)
-        lines[-1] += f"; {', '.join(ran)} took {factor:.2f} of the computing predicted: corrected"
+        found |= {"measured_over_predicted": round(ratio, 3), "corrected_by": round(factor, 3)}
+        lines[-1] += (
+            f"; {', '.join(ran)} took {ratio:.2f} of what was predicted: corrected by {factor:.2f}"
+        )
     if lines and not kernels_are_compiled():
         found["compile_s"] = _COMPILE_S
         lines[-1] += f"; the first run also compiles for about {_COMPILE_S} s"

@@ -1,19 +1,19 @@
 """Measure what stages cost, and write the coefficients of `alice_survey/computing.toml`.
 
     python -m benchmarks.costs --work FOLDER [--survey WORKSPACE EVENTS ...]
-        [--held WORKSPACE WORKERS ...] [--compare]
+        [--held WORKSPACE WORKERS ...] [--done] [--compare]
 
-Runs small rendered surveys in FOLDER with one to four workers (those that are done are not run
-again; about an hour of computing), reads them and any finished workspaces with the events of their
-run (`alice-survey run --events EVENTS`, any number of `--survey`), and fits. `--held` are surveys
+Runs small rendered surveys in FOLDER (those that are done are not run again; half an hour of
+computing), reads them and any finished workspaces with the events of their run (`alice-survey run
+--events EVENTS`, any number of `--survey`), and fits: computing to those of one worker and those
+given, the start of workers to those of several, memory to all. `--held` are surveys
 that the fit must not see, with the workers that made them: for these, predicted and measured costs
 are printed. To fit again after code has changed, with a survey of full resolution among the others:
 
     alice-survey run -w full --events full.jsonl
     python -m benchmarks.costs --work FOLDER --survey full full.jsonl
 
-Coefficients are non-negative least squares of relative errors, so that small and large surveys
-count alike.
+Coefficients are non-negative, and fit logarithms, so that small and large surveys count alike.
 """
 
 import argparse
@@ -35,16 +35,18 @@ from alice_survey import computing
 from alice_survey.base.artefacts import read_stage
 from alice_survey.base.executor import default_threads
 from alice_survey.base.run.resources import processor
-from alice_survey.computing import PREDICTED, Prediction, SurveySize, workspace_size
+from alice_survey.computing import PREDICTED, Prediction, SurveySize, weighed, workspace_size
 from alice_survey.stages import is_imported, spec
 from alice_survey.survey import settings
 from benchmarks.cluster_model import recorded
 
 DATA = Path(computing.__file__).with_suffix(".toml")
 _WATCH_S = 1.0
+_ROUNDS, _STEP = 50, 0.9
+"""Of fits, and the largest residual of a logarithm that counts in full (Huber)."""
 _MATCHING = ("try matching", "compare partners", "match")
 _COMPUTING: dict[str, Sequence[str]] = {
-    "pool": ("once", "board_pictures", "board_mpx"),
+    "pool": ("once", "board_pictures", "board_rays", "board_rays_large"),
     "image": ("once", "floor_cells", "pictures", "rendered_mpx"),
     "calibrate": ("once", "board_pictures", "board_mpx"),
     "mapping": (
@@ -56,7 +58,7 @@ _COMPUTING: dict[str, Sequence[str]] = {
     "mesh": ("once", "pictures", "taken_mpx", "cells"),
 }  # fmt: skip
 """What may drive the computing of a stage."""
-_PROCESS = ("once", "pictures", "cells")
+_PROCESS = ("once",)
 _WORKER = dict.fromkeys(PREDICTED, ("once", "picture_mpx")) | {
     "dense": ("once", "refined_picture_mpx")
 }
@@ -108,17 +110,15 @@ class Survey:
         )
 
 
-SURVEYS = (
+LEARNED_FROM = (
     Survey(name="s8small", sides_m=(1.0, 1.0), scale=8, seed=11),
-    Survey(name="s8big", sides_m=(4.5, 3.7), scale=8, seed=5, features=2000),
     Survey(name="s6mid", sides_m=(2.5, 2.4), scale=6, seed=6, features=2000, relief_m=0.2),
     Survey(name="s4small", sides_m=(1.2, 1.0), scale=4, seed=8, features=3000),
     Survey(name="s3small", sides_m=(1.2, 1.6), scale=3, seed=10, relief_m=0.35),
     Survey(name="bare", sides_m=(1.2, 1.0), scale=4, seed=8, pictures_of="s4small"),
     Survey(name="s2tiny", sides_m=(1.6, 0.8), scale=2, seed=9, cross=False),
     Survey(name="s8two", sides_m=(1.0, 1.0), scale=8, seed=12, workers=2),
-    Survey(name="s5three", sides_m=(1.8, 1.6), scale=5, seed=14, features=3000, workers=3),
-    Survey(name="s3four", sides_m=(1.2, 0.8), scale=3, seed=13, workers=4),
+    Survey(name="s3three", sides_m=(1.6, 0.6), scale=3, seed=13, cross=False, workers=3),
 )
 
 
@@ -142,6 +142,11 @@ class StageRun:
         return max(0.0, self.cpu_s - sum(self.tasks_s.values()))
 
 
+def is_done(workspace: Path) -> bool:
+    """Whether a workspace has all stages whose cost is predicted."""
+    return read_stage(workspace / spec(PREDICTED[-1]).folder) is not None
+
+
 def run_survey(survey: Survey, work: Path) -> tuple[Path, Path]:
     """Run a survey unless it is done; return its workspace and its events.
 
@@ -149,7 +154,7 @@ def run_survey(survey: Survey, work: Path) -> tuple[Path, Path]:
         CalledProcessError: it failed.
     """
     workspace, events = work / survey.name, work / f"{survey.name}.jsonl"
-    if read_stage(workspace / "mesh") is not None:
+    if is_done(workspace):
         return workspace, events
     shutil.rmtree(workspace, ignore_errors=True)
     events.unlink(missing_ok=True)
@@ -225,28 +230,52 @@ def folder_mb(folder: Path) -> float:
 
 
 def fitted(rows: Sequence[Mapping[str, float]], values: Sequence[float]) -> dict[str, float]:
-    """Non-negative coefficients of least relative errors.
+    """Non-negative coefficients that fit values in least squares of their logarithms.
+
+    Squares of relative errors would favour predictions that are too small. Gauss-Newton: for values
+    v predicted as p, log(p / v) is linear in p / p0 about an earlier prediction p0.
 
     Args:
         rows: what may drive each value, by the same names.
         values: measured; those of 0 do not count.
     """
     used = [n for n, value in enumerate(values) if value > 0]
-    if not used:
+    if not used or not rows[0]:
         return {}
     names = list(rows[0])
-    matrix = np.array([[rows[n][name] / values[n] for name in names] for n in used])
-    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
-    found, _ = nnls(matrix / scale, np.ones(len(used)))
+    matrix = np.array([[rows[n][name] for name in names] for n in used])
+    scale = np.maximum(matrix.max(axis=0), 1e-12)
+    measured = np.array([values[n] for n in used])
+    earlier = measured
+    for _ in range(_ROUNDS):
+        wanted = 1.0 + np.clip(np.log(measured / earlier), -_STEP, _STEP)
+        found, _ = nnls(matrix / scale / earlier[:, None], wanted)
+        earlier = np.maximum(matrix / scale @ found, 1e-9 * measured)
     return {name: float(x) for name, x in zip(names, found / scale, strict=True) if x > 0}
 
 
-def coefficients(runs: Sequence[Mapping[str, StageRun]]) -> dict[str, dict[str, Any]]:
-    """Coefficients of all stages, as `computing.toml` holds them, from what surveys have cost."""
-    return {name: _of_stage(name, [run[name] for run in runs if name in run]) for name in PREDICTED}
+def coefficients(
+    computed: Sequence[Mapping[str, StageRun]], every: Sequence[Mapping[str, StageRun]]
+) -> dict[str, dict[str, Any]]:
+    """Coefficients of all stages, as `computing.toml` holds them.
+
+    Args:
+        computed: what the stages of surveys have cost, for computing and disk.
+        every: the same with any number of workers, for memory and the start of workers.
+    """
+    return {
+        name: _of_stage(
+            name,
+            [run[name] for run in computed if name in run],
+            [run[name] for run in every if name in run],
+        )
+        for name in PREDICTED
+    }
 
 
-def _of_stage(name: str, runs: Sequence[StageRun]) -> dict[str, dict[str, float]]:
+def _of_stage(
+    name: str, runs: Sequence[StageRun], every: Sequence[StageRun]
+) -> dict[str, dict[str, float]]:
     def rows(names: Sequence[str]) -> list[dict[str, float]]:
         return [{key: run.size.drivers[key] for key in names} for run in runs]
 
@@ -264,22 +293,24 @@ def _of_stage(name: str, runs: Sequence[StageRun]) -> dict[str, dict[str, float]
             f"worker {key}": min(run.workers, run.size.pictures) * run.size.drivers[key]
             for key in _WORKER[name]
         }
-        for run in runs
+        for run in every
     ]
-    memory = fitted(memory_rows, [run.peak_mib for run in runs])
+    memory = fitted(memory_rows, [run.peak_mib for run in every])
+    shared = [run for run in every if run.workers > 1]
+    serial_s = fitted(usual, [run.serial_s for run in runs])
+    more_s = [run.serial_s - weighed(serial_s, run.size.drivers) for run in shared]
     looked = [n for n, run in enumerate(runs) if run.scratch_mb is not None]
     scratch_rows = rows(_SCRATCH.get(name, ()))
     return {
-        "serial_s": fitted(usual, [run.serial_s for run in runs]),
+        "serial_s": serial_s,
+        "start_s": fitted([{"once": float(run.workers)} for run in shared], more_s),
         "tasks_s": tasks_s,
         "process_mib": _part(memory, "process"),
         "worker_mib": _part(memory, "worker"),
         "product_mb": fitted(rows(_PRODUCT[name]), [run.product_mb for run in runs]),
         "scratch_mb": fitted(
             [scratch_rows[n] for n in looked], [runs[n].scratch_mb or 0.0 for n in looked]
-        )
-        if name in _SCRATCH
-        else {},
+        ),
     }
 
 
@@ -291,12 +322,13 @@ def _part(values: Mapping[str, float], prefix: str) -> dict[str, float]:
     }
 
 
-def written(stages: Mapping[str, Any], probe_s: float, machine: str) -> str:
+def written(stages: Mapping[str, Any], probe_s: float, machine: str, surveys: Sequence[str]) -> str:
     """The text of `computing.toml`."""
     lines = [
         "# What stages cost, measured by `python -m benchmarks.costs`; computing.py says what the",
         "# coefficients are multiplied by.",
         "",
+        f"surveys = {json.dumps(list(surveys))}",
         f"processor = {json.dumps(machine)}",
         f"probe_s = {probe_s:.4f}",
     ]
@@ -325,23 +357,32 @@ def comparison(workspace: Path, workers: int, measured: Mapping[str, Any]) -> li
             if not (spec(name).simulated and is_imported(workspace))
         }
         known = {name: read_stage(folder) for name, folder in folders.items()}
-        records = {n: record for n, record in known.items() if record is not None and record.cpu_s}
-        costs = computing.stage_costs(size, 1.0, measured)
-        found = Prediction(stages={name: costs[name] for name in records}, workers=workers)
-        rows += [
-            _row(workspace.name, name, "computing, s", costs[name].cpu_s, record.cpu_s or 0.0)
-            for name, record in records.items()
-        ]
+        records = {name: record for name, record in known.items() if record is not None}
         if not records:
             continue
+        costs = computing.stage_costs(size, 1.0, measured)
+        found = Prediction(stages={name: costs[name] for name in records}, workers=workers)
+        cpu_s = {name: record.cpu_s or 0.0 for name, record in records.items()}
+        peak_mib = max(record.peak_mib or 0.0 for record in records.values())
         product_mb = sum(folder_mb(folders[name]) for name in records)
-        for what, ours, true in (
-            ("computing, s", found.cpu_s, sum(r.cpu_s or 0.0 for r in records.values())),
-            ("memory, MiB", found.memory_mib, max(r.peak_mib or 0.0 for r in records.values())),
-            ("products, MB", sum(c.product_mb for c in found.stages.values()), product_mb),
-        ):
-            value = ours(workers) if callable(ours) else ours
-            rows.append(_row(workspace.name, group, what, value, true))
+        ours_mb = sum(cost.product_mb for cost in found.stages.values())
+        rows += [
+            _row(workspace.name, name, "computing, s", costs[name].cpu_s(workers), cpu_s[name])
+            for name in records
+        ]
+        rows += [
+            _row(
+                workspace.name,
+                f"**{group}**",
+                "computing, s",
+                found.cpu_s(workers),
+                sum(cpu_s.values()),
+            ),
+            _row(
+                workspace.name, f"**{group}**", "memory, MiB", found.memory_mib(workers), peak_mib
+            ),
+            _row(workspace.name, f"**{group}**", "products, MB", ours_mb, product_mb),
+        ]
     return rows
 
 
@@ -371,12 +412,17 @@ def main() -> None:
         "--held", nargs=2, action="append", default=[],
         metavar=("WORKSPACE", "WORKERS"), help="a finished survey to compare with",
     )  # fmt: skip
+    parser.add_argument("--done", action="store_true", help="run nothing, take what is done")
     parser.add_argument("--compare", action="store_true", help="fit nothing, compare alone")
     options = parser.parse_args()
     if not options.compare:
-        found = [run_survey(survey, options.work) for survey in SURVEYS]
-        runs = [stage_runs(*one) for one in [*found, *options.survey]]
-        text = written(coefficients(runs), computing.probe_s(), processor())
+        made = [one for one in LEARNED_FROM if not options.done or is_done(options.work / one.name)]
+        small = {one.name: stage_runs(*run_survey(one, options.work)) for one in made}
+        given = [stage_runs(*one) for one in options.survey]
+        alone = [small[one.name] for one in made if one.workers == 1]
+        found = coefficients([*alone, *given], [*small.values(), *given])
+        names = [*small, *(one[0].name for one in options.survey)]
+        text = written(found, computing.probe_s(), processor(), names)
         DATA.write_text(text, encoding="utf-8")
         print(f"wrote {DATA}")
     print("| survey | of | what | predicted | measured | ratio |\n|---|---|---|---|---|---|")

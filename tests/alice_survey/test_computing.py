@@ -1,6 +1,7 @@
 """Predicted cost: its arithmetic against closed forms, and against a survey that was run."""
 
 import json
+import math
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -49,10 +50,14 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_tasks_are_shared_out_and_the_rest_is_not() -> None:
-    assert COST.time_s(1) == COST.cpu_s == 90.0
+    assert COST.time_s(1) == COST.cpu_s(1) == COST.cpu_s(9) == 90.0
     assert COST.time_s(2) == 50.0
     assert COST.time_s(1) / 2 < COST.time_s(2) < COST.time_s(1)
     assert COST.time_s(40) == COST.time_s(4000) == 12.0
+    started = replace(COST, start_s=3.0)
+    assert started.time_s(1) == 90.0
+    assert started.time_s(2) == 53.0
+    assert started.cpu_s(4) == 90.0 + 4 * 3.0
 
 
 def test_memory_is_of_the_largest_stage_and_disk_of_all() -> None:
@@ -79,15 +84,17 @@ def test_coefficients_are_recovered_from_what_they_give() -> None:
 
 
 def test_small_surveys_count_like_large_ones() -> None:
-    """A value that is 10 % off is as bad at 1 as at 1000: a constant lies between, in the ratio."""
-    found = fitted([{"once": 1.0}, {"once": 1.0}], [1.0, 1000.0])
-    assert found["once"] == pytest.approx((1 + 1 / 1000) / (1 + 1 / 1000**2))
+    """Of values with one driver the coefficient is the geometric mean of their ratios to it."""
+    sizes, ratios = np.array([3.0, 500.0, 80_000.0]), np.array([10.0, 15.0, 30.0])
+    found = fitted([{"pictures": size} for size in sizes.tolist()], (sizes * ratios).tolist())
+    assert found["pictures"] == pytest.approx(float(np.prod(ratios)) ** (1 / 3), rel=1e-6)
 
 
 def test_what_is_written_is_read_as_it_was() -> None:
     stages = {"dense": {"serial_s": {"once": 2.5}, "tasks_s": {}}}
-    read = tomllib.loads(written(stages, 0.25, 'a "processor"'))
-    assert read == {"processor": 'a "processor"', "probe_s": 0.25, "stages": stages}
+    read = tomllib.loads(written(stages, 0.25, 'a "processor"', ["reef"]))
+    assert read.pop("stages") == stages
+    assert read == {"surveys": ["reef"], "processor": 'a "processor"', "probe_s": 0.25}
 
 
 @pytest.mark.parametrize("mpx", [0.5, 2.9, 3.1, 9.2, 30.0])
@@ -149,25 +156,24 @@ def test_a_survey_that_was_not_learned_from_costs_what_it_did() -> None:
     measured = {"image": (28.9, 30.0), "calibrate and reconstruct": (77.7, 26.0)}
     for group, (cpu_s, product_mb) in measured.items():
         found = [costs[stage] for stage in computing.GROUPS[group]]
-        assert 0.7 < sum(cost.cpu_s for cost in found) / cpu_s < 1.3
+        assert 0.7 < sum(cost.cpu_s(1) for cost in found) / cpu_s < 1.3
         assert 0.7 < sum(cost.product_mb for cost in found) / product_mb < 1.3
 
 
 def test_cost_grows_with_pictures_and_no_faster_than_they_do() -> None:
     once, twice = (stage_costs(size_of(n, 2.0, RIG, board_pictures=24)) for n in (500, 1000))
     for stage in PREDICTED:
-        assert once[stage].cpu_s <= twice[stage].cpu_s <= 2 * once[stage].cpu_s
+        assert once[stage].cpu_s(1) <= twice[stage].cpu_s(1) <= 2 * once[stage].cpu_s(1)
     left = PREDICTED[3:]
-    assert sum(twice[n].cpu_s for n in left) > 1.8 * sum(once[n].cpu_s for n in left)
+    assert sum(twice[n].cpu_s(1) for n in left) > 1.8 * sum(once[n].cpu_s(1) for n in left)
 
 
 def test_a_slower_machine_takes_longer_and_no_more_memory() -> None:
     size = size_of(100, 1.0, RIG, board_pictures=24)
-    for here, there in zip(
-        stage_costs(size, 3.0).values(), stage_costs(size).values(), strict=True
-    ):
-        assert here.cpu_s == pytest.approx(3.0 * there.cpu_s)
-        assert here.memory_mib(4) == there.memory_mib(4)
+    here, there = stage_costs(size, 3.0), stage_costs(size)
+    for stage in PREDICTED:
+        assert here[stage].cpu_s(2) == pytest.approx(3.0 * there[stage].cpu_s(2))
+        assert here[stage].memory_mib(4) == there[stage].memory_mib(4)
 
 
 def test_what_has_run_here_corrects_what_is_left() -> None:
@@ -180,9 +186,13 @@ def test_what_has_run_here_corrects_what_is_left() -> None:
         "dense": StageRecord(cpu_s=900.0, processor="another"),
     }
 
-    assert correction(costs, records, "this") == (1.0, ["image", "mapping"])
-    assert correction(costs, {"image": ran}, "this") == (1.5, ["image"])
-    assert correction(costs, {"image": ran}, "that") == (1.0, [])
+    assert correction(costs, records, "this", 1) == (1.0, 1.0, ["image", "mapping"])
+    assert correction(costs, {"image": ran}, "this", 1) == (1.5, math.sqrt(1.5), ["image"])
+    assert correction(costs, {"image": ran}, "that", 1) == (1.0, 1.0, [])
+    many = dict.fromkeys(PREDICTED[:-1], ran)
+    ratio, factor, names = correction(costs, many, "this", 1)
+    assert ratio == 1.5 > factor > 1.4
+    assert names == [*PREDICTED[:-1]]
     assert COST.scaled(1.5).time_s(2) == 1.5 * COST.time_s(2)
 
 
