@@ -315,7 +315,7 @@ def stage_costs(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prediction:
+class SurveyCost:
     """What some stages of a survey take together."""
 
     stages: Mapping[str, StageCost]
@@ -472,7 +472,7 @@ def summary(
     lines = []
     for name, stages in groups.items():
         chosen = {stage: costs[stage].scaled(factor) for stage in stages}
-        group = Prediction(stages=chosen, workers=workers or cores)
+        group = SurveyCost(stages=chosen, workers=workers or cores)
         found[name] = group.to_json()
         lines.append(f"{name}: {group.text('worker' if workers else 'core')}")
     if lines and size.pixel_m is not None and size.cell_m is not None:

@@ -128,7 +128,7 @@ def plan_report(
     from missions.plan.rows import main_settings
 
     text, found = run(["plan"], workspace, survey)
-    cost, found["cost"] = _predicted(workspace, settings(workspace, survey, needed=True), GROUPS)
+    cost, found["cost"] = _predicted(workspace, survey, GROUPS)
     folder = workspace / "plan"
     if every_setting:
         table = (folder / "settings.txt").read_text(encoding="utf-8")
@@ -139,7 +139,7 @@ def plan_report(
 
 def _predicted(
     workspace: Path,
-    config: SurveyConfig,
+    survey: Path | None,
     groups: Mapping[str, Sequence[str]],
     workers: int | None = None,
     done: Sequence[str] = (),
@@ -147,6 +147,7 @@ def _predicted(
     """What groups of stages of a workspace will take; the stages that are done correct it."""
     from alice_survey.computing import summary, workspace_size
 
+    config = settings(workspace, survey, needed=not is_imported(workspace))
     size = workspace_size(
         workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
     )
@@ -291,8 +292,7 @@ def status_report(
     if not left:
         return text, found
     done = [name for name, state in states.items() if state == "up to date"]
-    config = settings(workspace, survey, needed=False)
-    cost, found["cost"] = _predicted(workspace, config, {"left": left}, workers, done)
+    cost, found["cost"] = _predicted(workspace, survey, {"left": left}, workers, done)
     return "\n".join(filter(None, (text, cost))), found
 
 

@@ -35,7 +35,7 @@ from alice_survey import computing
 from alice_survey.base.artefacts import read_stage
 from alice_survey.base.executor import default_threads
 from alice_survey.base.run.resources import processor
-from alice_survey.computing import PREDICTED, Prediction, SurveySize, weighed, workspace_size
+from alice_survey.computing import PREDICTED, SurveyCost, SurveySize, weighed, workspace_size
 from alice_survey.stages import is_imported, spec
 from alice_survey.survey import settings
 from benchmarks.cluster_model import recorded
@@ -361,7 +361,7 @@ def comparison(workspace: Path, workers: int, measured: Mapping[str, Any]) -> li
         if not records:
             continue
         costs = computing.stage_costs(size, 1.0, measured)
-        found = Prediction(stages={name: costs[name] for name in records}, workers=workers)
+        found = SurveyCost(stages={name: costs[name] for name in records}, workers=workers)
         cpu_s = {name: record.cpu_s or 0.0 for name, record in records.items()}
         peak_mib = max(record.peak_mib or 0.0 for record in records.values())
         product_mb = sum(folder_mb(folders[name]) for name in records)

@@ -18,8 +18,8 @@ from alice_survey.base.config import CameraConfig, ImagingConfig, ReconstructCon
 from alice_survey.cli.main import app
 from alice_survey.computing import (
     PREDICTED,
-    Prediction,
     StageCost,
+    SurveyCost,
     SurveySize,
     correction,
     planned_size,
@@ -63,7 +63,7 @@ def test_tasks_are_shared_out_and_the_rest_is_not() -> None:
 
 def test_memory_is_of_the_largest_stage_and_disk_of_all() -> None:
     other = replace(COST, worker_mib=100.0, process_mib=1500.0, product_mb=100.0, scratch_mb=50.0)
-    both = Prediction(stages={"mapping": COST, "dense": other}, workers=2)
+    both = SurveyCost(stages={"mapping": COST, "dense": other}, workers=2)
 
     assert both.memory_mib(2) == 1700.0
     assert both.memory_mib(16) == 300.0 + 16 * 500.0
