@@ -4,7 +4,7 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -120,16 +120,42 @@ def run(
 def plan_report(
     workspace: Path, survey: Path | None, *, every_setting: bool = False
 ) -> tuple[str, dict[str, Any]]:
-    """Plan a survey, and show its main settings; or every one with its equation and source."""
+    """Plan a survey, and show its main settings; or every one with its equation and source.
+
+    What imaging and reconstruction will take on this machine follows.
+    """
+    from alice_survey.computing import GROUPS
     from missions.plan.rows import main_settings
 
     text, found = run(["plan"], workspace, survey)
+    cost, found["cost"] = _predicted(workspace, survey, GROUPS)
     folder = workspace / "plan"
     if every_setting:
         table = (folder / "settings.txt").read_text(encoding="utf-8")
     else:
         table = main_settings(read_json(folder / "plan.json"))
-    return f"{table}\n{text}", found
+    return f"{table}\n{text}\n{cost}", found
+
+
+def _predicted(
+    workspace: Path,
+    survey: Path | None,
+    groups: Mapping[str, Sequence[str]],
+    workers: int | None = None,
+    done: Sequence[str] = (),
+) -> tuple[str, dict[str, Any]]:
+    """What groups of stages of a workspace will take; the stages that are done correct it."""
+    from alice_survey.computing import summary, workspace_size
+
+    config = settings(workspace, survey, needed=not is_imported(workspace))
+    size = workspace_size(
+        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
+    )
+    if size is None:
+        return "", {}
+    records = {name: read_stage(workspace / spec(name).folder) for name in done}
+    made = {name: record for name, record in records.items() if record is not None}
+    return summary(size, groups, workers=workers, records=made)
 
 
 def settings(
@@ -246,6 +272,28 @@ def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[st
     command = f"alice-survey {spec(pending[0]).command} -w {workspace}" if pending else None
     after = f"next: {command}" if command else "nothing is left to do"
     return "\n".join([*rows, after]), {"stages": states, "next": command}
+
+
+def status_report(
+    workspace: Path, survey: Path | None, workers: int | None = None
+) -> tuple[str, dict[str, Any]]:
+    """State of a workspace, and what the stages that are left will take.
+
+    Args:
+        workspace: folder of the survey.
+        survey: its settings; None looks for survey.toml in the workspace, then here.
+        workers: of a cluster that does them; None for all cores of this machine.
+    """
+    from alice_survey.computing import PREDICTED
+
+    text, found = workspace_status(workspace, survey)
+    states = found["stages"]
+    left = [name for name in PREDICTED if states.get(name, "up to date") != "up to date"]
+    if not left:
+        return text, found
+    done = [name for name, state in states.items() if state == "up to date"]
+    cost, found["cost"] = _predicted(workspace, survey, {"left": left}, workers, done)
+    return "\n".join(filter(None, (text, cost))), found
 
 
 @contextlib.contextmanager

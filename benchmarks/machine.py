@@ -4,22 +4,15 @@ import os
 import platform
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
+
+from alice_survey.base.run.resources import processor
 
 
 def machine(packages: Sequence[str]) -> dict[str, Any]:
     """Processor, cores that may be used, system, load, versions of Python and of packages."""
-    processor = platform.processor() or platform.machine()
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        lines = information.read_text().splitlines()
-        processor = next(
-            (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
-            processor,
-        )
     return {
-        "processor": processor,
+        "processor": processor(),
         "cores": len(os.sched_getaffinity(0)),
         "system": platform.platform(),
         "load": load(),

@@ -24,7 +24,7 @@ from pydantic_core import to_jsonable_python
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import AliceError, NavigationError, WorkspaceError, why
 from alice_survey.base.run import progress
-from alice_survey.base.run.resources import Meter, Spent, versions, watched
+from alice_survey.base.run.resources import Meter, Spent, processor, versions, watched
 
 T = TypeVar("T")
 
@@ -114,6 +114,8 @@ class StageRecord(JsonRecord):
     took_s: float = 0.0
     cpu_s: float | None = None
     peak_mib: float | None = None
+    processor: str = ""
+    """What it was made on; empty where an older version of the program made it."""
     versions: dict[str, str] = Field(default_factory=dict)
     """Versions of the packages that affect results."""
 
@@ -166,6 +168,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
             "inputs": inputs,
             **spent,
             **how,
+            "processor": processor(),
             "versions": versions(),
         }
         write_json(partial / STAGE_FILE, record)

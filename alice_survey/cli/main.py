@@ -416,15 +416,26 @@ def demo(
     print_result(*run_demo(workspace, executor_of(threads)), as_json)
 
 
-@app.command(epilog=examples("status -w reef", "status -w reef --json"))
-def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
+@app.command(
+    epilog=examples("status -w reef", "status -w reef --json", "status -w reef --workers 64")
+)
+def status(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=100_000, help="Of a cluster that does what is left."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Show what a workspace holds.
 
-    What is there, what is stale, and what the next command is.
+    What is there, what is stale, what the next command is, and how much time, memory and disk the
+    stages that are left will take.
     """
-    from alice_survey.survey import workspace_status
+    from alice_survey.survey import status_report
 
-    print_result(*workspace_status(workspace, survey), as_json)
+    print_result(*status_report(workspace, survey, workers), as_json)
 
 
 with_sessions(app)
