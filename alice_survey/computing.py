@@ -35,9 +35,11 @@ BOARD_STAGES = ("pool", "calibrate")
 """Those whose tasks are pictures of a board."""
 OTHER_CORES = 16
 MATCHED_PIXELS = 3_000_000
-"""Pictures with more are halved for dense matching, until they have fewer."""
+"""Depth with more is matched in pictures that are halved until they have fewer."""
 CELL_PIXELS = 2.5
 """Side of a cell of the surface in pixels as refined."""
+LEAST_SCALE = 0.05
+"""Of depth."""
 FEATURE_MPX, PIXELS_PER_FEATURE = 1.5, 100.0
 """Most megapixels in which features are sought, and pixels for each that is wanted, if a rig is
 known."""
@@ -106,12 +108,18 @@ class SurveySize:
         }
 
 
-def depth_mpx(mpx: float, dense_scale: float | None) -> tuple[float, float]:
-    """Megapixels of a picture at which dense matching runs, and at which depth is refined."""
-    scale = dense_scale or 1.0
-    while dense_scale is None and mpx * scale**2 > MATCHED_PIXELS / 1e6:
-        scale /= 2.0
-    return mpx * scale**2, mpx * scale**2
+def depth_mpx(mpx: float, scale: float) -> tuple[float, float]:
+    """Megapixels of a picture at which dense matching runs, and at which depth is refined.
+
+    Args:
+        mpx: of the picture.
+        scale: of depth, as set or as cells need.
+    """
+    refined = mpx * scale**2
+    matched = refined
+    while matched > MATCHED_PIXELS / 1e6:
+        matched /= 4.0
+    return matched, refined
 
 
 def size_of(
@@ -140,8 +148,10 @@ def size_of(
     feature_mpx = min(mpx, FEATURE_MPX, wanted)
     if reconstruct.feature_scale is not None:
         feature_mpx = mpx * reconstruct.feature_scale**2
-    matched_mpx, refined_mpx = depth_mpx(mpx, reconstruct.dense_scale)
-    cell_m = reconstruct.dem_cell_m
+    cell_m, scale = reconstruct.dem_cell_m, reconstruct.dense_scale or 1.0
+    if reconstruct.dense_scale is None and cell_m is not None and pixel_m is not None:
+        scale = min(1.0, max(LEAST_SCALE, CELL_PIXELS * pixel_m / cell_m))
+    matched_mpx, refined_mpx = depth_mpx(mpx, scale)
     cells = pictures * refined_mpx / (_LOOKS * CELL_PIXELS**2)
     mosaic_mpx = pictures * mpx / _LOOKS
     if pixel_m is not None:

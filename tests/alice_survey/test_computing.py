@@ -27,9 +27,9 @@ from alice_survey.computing import (
     stage_costs,
 )
 from benchmarks.costs import fitted, written
-from reconstruct.dense.matching_trial import LARGEST_PIXELS
-from reconstruct.dense.plane_rasters import CELL_PIXELS
+from reconstruct.dense.matching_trial import matching_scale, scale_for_cell
 from reconstruct.matching.features import detection_scales
+from tests.oracles_dense import stereo_views
 
 COST = StageCost(
     serial_s=10.0,
@@ -100,12 +100,20 @@ def test_what_is_written_is_read_as_it_was() -> None:
 
 @pytest.mark.parametrize("mpx", [0.5, 2.9, 3.1, 9.2, 30.0])
 def test_pictures_are_halved_as_the_stages_do(mpx: float) -> None:
-    matched, refined = computing.depth_mpx(mpx, None)
-    halvings = max(0, int(np.ceil(np.log(mpx * 1e6 / LARGEST_PIXELS) / np.log(4))))
-    assert matched == refined == pytest.approx(mpx / 4**halvings)
-    assert computing.depth_mpx(mpx, 0.5)[1] == pytest.approx(mpx / 4)
-    assert computing.CELL_PIXELS == CELL_PIXELS
     side = int(np.sqrt(mpx * 1e6))
+    view = stereo_views(np.zeros(1), np.zeros(1))[0]
+    view = replace(view, pinhole=view.pinhole.resized(side, side))
+    for scale in (1.0, 0.4):
+        matched, refined = computing.depth_mpx(mpx, scale)
+        assert refined == pytest.approx(mpx * scale**2)
+        assert matched == pytest.approx(mpx * matching_scale(view, scale) ** 2)
+    pixel_m = 2.0 / view.pinhole.focal_px
+    points = view.world_from_cam.apply(np.array([[0.0, 0.0, 2.0]]))
+    for cell_m in (None, 2 * pixel_m, 5 * pixel_m, 100 * pixel_m):
+        wanted = ReconstructConfig(dem_cell_m=cell_m)
+        scale = scale_for_cell(cell_m, [view], [points].__getitem__)
+        found = size_of(10, mpx, wanted, pixel_m=pixel_m).refined_mpx
+        assert found == pytest.approx(mpx * scale**2)
     for most in (1000, 8000):
         reconstruct = ReconstructConfig(max_features=most)
         scales = detection_scales((side, side), most)
