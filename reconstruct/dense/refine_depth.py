@@ -56,6 +56,8 @@ _LEAST_SHARE = 0.4
 """Share of a window's weight that a neighbour must see."""
 _OUTLYING = 2.5
 """Deviations beyond which a pixel counts less than half."""
+_BAND_PIXELS = 500_000
+"""Pixels of a picture that are worked on at once: they take some 0.1 kB each."""
 _MARGIN_ROWS = 16
 """Rows around a band that its windows reach: twice 5 for sums, and 4 around what moves far."""
 _LEAST_UNSEEN = 0.005
@@ -224,9 +226,6 @@ class _NeighbourSums:
 class Device(Protocol):
     """What works on all pixels of a view, with arrays of its own (of type `Any` here)."""
 
-    band_pixels: int
-    """Pixels of a picture that are worked on at once."""
-
     def put(self, values: Any) -> Any:
         """An array, or a tuple of arrays, numbers and tuples, as the device takes it."""
 
@@ -245,9 +244,6 @@ class Device(Protocol):
 
 class _Processor:
     """The device that this code runs on."""
-
-    band_pixels = 500_000
-    """They take some 0.1 kB each, and bands of them stay in the cache."""
 
     def put(self, values: Any) -> Any:
         return values
@@ -268,6 +264,14 @@ class _Processor:
 
 
 PROCESSOR = _Processor()
+
+
+_Look = tuple[View, Any]
+"""A neighbour, and its spline, its validity and its lens as arrays of the device."""
+
+
+def _look(other: ComparedView, device: Device) -> _Look:
+    return other.view, device.put((other.spline, other.valid, other.view.kernel_lens))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -322,14 +326,15 @@ def refine(
         device: what compares them.
     """
     height, width = depth.shape
-    count = -(-height * width // device.band_pixels)
+    count = -(-height * width // _BAND_PIXELS)
     ends = np.linspace(0, height, count + 1).astype(int).tolist()
+    looks, more = ([_look(other, device) for other in views] for views in (others, spare))
     bands = []
     for first, last in pairwise(ends):
         part = slice(max(first - _MARGIN_ROWS, 0), last + _MARGIN_ROWS)
         inner = slice(first - part.start, last - part.start)
         rows = _reference(reference, part, device)
-        band = _refine_band(rows, depth[part], sigma[part], others, spare)
+        band = _refine_band(rows, depth[part], sigma[part], looks, more)
         bands.append([one[inner] for one in (band.depth, band.sigma, band.seen)])
     joined = [np.concatenate(parts) for parts in zip(*bands, strict=True)]
     return RefinedDepth(depth=joined[0], sigma=joined[1], seen=joined[2])
@@ -339,8 +344,8 @@ def _refine_band(
     one: _Reference,
     depth: Float32,
     sigma: Float32,
-    others: Sequence[ComparedView],
-    spare: Sequence[ComparedView],
+    others: Sequence[_Look],
+    spare: Sequence[_Look],
 ) -> RefinedDepth:
     inverse = (1.0 / depth).astype(np.float32)
     first = _sums_of(one, inverse, others, spare)
@@ -395,8 +400,8 @@ def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
 def _sums_of(
     one: _Reference,
     inverse: Float32,
-    others: Sequence[ComparedView],
-    spare: Sequence[ComparedView],
+    others: Sequence[_Look],
+    spare: Sequence[_Look],
 ) -> _NeighbourSums:
     """What the others say, and where none of them sees a spot what the spare ones say."""
     sums = _sums(one, inverse, others)
@@ -407,18 +412,17 @@ def _sums_of(
     return _chosen(unseen, alone, sums)
 
 
-def _sums(one: _Reference, inverse: Float32, others: Sequence[ComparedView]) -> _NeighbourSums:
+def _sums(one: _Reference, inverse: Float32, others: Sequence[_Look]) -> _NeighbourSums:
     device, shape = one.device, inverse.shape
     totals = device.put((*np.zeros((4, *shape), np.float32), np.zeros(shape, np.uint8)))
     depths = device.put(inverse)
     samples = np.float32(4.0 * np.pi * WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
-    for other in others:
-        other_from_ref = other.view.world_from_cam.inv() * one.view.world_from_cam
-        move = np.ascontiguousarray(other_from_ref.as_matrix()[:3])
-        looks = device.put((other.spline, other.valid, other.view.kernel_lens, move))
+    for view, look in others:
+        other_from_ref = view.world_from_cam.inv() * one.view.world_from_cam
+        move = device.put(np.ascontiguousarray(other_from_ref.as_matrix()[:3]))
         there, slope, fast = (device.empty(*shape) for _ in range(3))
         shared = depths, one.contrast, one.lines
-        device.run(compare, shape, *shared, *looks, there, slope, fast)
+        device.run(compare, shape, *shared, *look, move, there, slope, fast)
         rest = device.get(there)
         known = np.isfinite(rest) & one.valid
         sample = rest[::3, ::3][known[::3, ::3]]

@@ -1,10 +1,10 @@
 """Depth refined on an NVIDIA GPU: the kernels of `refine_depth`, a thread for each pixel.
 
-A reference of N pixels and a neighbour of n take 106 N + 5 n bytes of the device at most: of the
-reference contrast (4 N), lines (16), spread (4), inverse depth (4) and totals (17); what comparing
-gives (12), where it is known (1), products (24) and those blurred along rows (24); of the neighbour
-spline (4 n) and validity (1). At 9.2 megapixels that is 1.0 GB, besides the few hundred MB that
-CUDA takes for each process.
+A band of N pixels and neighbours of n pixels together take 106 N + 5 n bytes of the device at most:
+of the reference contrast (4 N), lines (16), spread (4), inverse depth (4) and totals (17); what
+comparing gives (12), where it is known (1), products (24) and those blurred along rows (24); of the
+neighbours spline (4 n) and validity (1). With six neighbours of 9.2 megapixels that is 0.35 GB,
+besides the few hundred MB that CUDA takes for each process.
 """
 
 import os
@@ -57,8 +57,6 @@ def refine_on_gpu(
 
 class _Gpu:
     """The device of `refine` on the GPU that CUDA names first."""
-
-    band_pixels = 100_000_000
 
     def put(self, values: Any) -> Any:
         if isinstance(values, tuple):

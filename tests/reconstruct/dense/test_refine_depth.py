@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from reconstruct.dense import refine_depth
 from reconstruct.dense.refine_depth import (
     ALL,
-    PROCESSOR,
     ComparedView,
     compare,
     pixel_lines,
@@ -103,7 +103,7 @@ def test_bands_of_rows_are_refined_as_the_whole_picture_is(monkeypatch):
     start = (true + 0.006 * np.sin(np.arange(true.shape[1]) / 9)).astype(np.float32)
     sigma = np.full_like(start, 0.004)
     whole = refine(looks()[0], start, sigma, looks()[1:])
-    monkeypatch.setattr(PROCESSOR, "band_pixels", start.size // 5)
+    monkeypatch.setattr(refine_depth, "_BAND_PIXELS", start.size // 5)
     bands = refine(looks()[0], start, sigma, looks()[1:])
     assert (np.isfinite(whole.depth) != np.isfinite(bands.depth)).mean() < 1e-3
     apart = np.abs(bands.depth - whole.depth) / whole.sigma
