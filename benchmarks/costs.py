@@ -283,7 +283,8 @@ def _of_stage(
         return sum(run.tasks_s.get(step, 0.0) for step in _MATCHING if name == "dense")
 
     usual = rows(_COMPUTING[name])
-    tasks_s = fitted(usual, [sum(run.tasks_s.values()) - matching(run) for run in runs])
+    growing = rows([key for key in _COMPUTING[name] if key != "once"])
+    tasks_s = fitted(growing, [sum(run.tasks_s.values()) - matching(run) for run in runs])
     matched = fitted(rows(("pictures", "matched_mpx")), [matching(run) for run in runs])
     for key, value in matched.items():
         tasks_s[key] = tasks_s.get(key, 0.0) + value
