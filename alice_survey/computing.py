@@ -26,6 +26,7 @@ from alice_survey.base.executor import default_threads
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.run.resources import processor
 from alice_survey.kit.words import count, duration
+from reconstruct.dense.scales import CELL_PIXELS, matching_scale, scale_for_cell
 
 PREDICTED = ("pool", "image", "calibrate", "mapping", "placing", "dense", "mosaic", "mesh")
 """Stages whose cost is known; the others take little."""
@@ -34,12 +35,6 @@ GROUPS = {"image": PREDICTED[:2], "calibrate and reconstruct": PREDICTED[2:]}
 BOARD_STAGES = ("pool", "calibrate")
 """Those whose tasks are pictures of a board."""
 OTHER_CORES = 16
-MATCHED_PIXELS = 3_000_000
-"""Depth with more is matched in pictures that are halved until they have fewer."""
-CELL_PIXELS = 2.5
-"""Side of a cell of the surface in pixels as refined."""
-LEAST_SCALE = 0.05
-"""Of depth."""
 FEATURE_MPX, PIXELS_PER_FEATURE = 1.5, 100.0
 """Most megapixels in which features are sought, and pixels for each that is wanted, if a rig is
 known."""
@@ -108,20 +103,6 @@ class SurveySize:
         }
 
 
-def depth_mpx(mpx: float, scale: float) -> tuple[float, float]:
-    """Megapixels of a picture at which dense matching runs, and at which depth is refined.
-
-    Args:
-        mpx: of the picture.
-        scale: of depth, as set or as cells need.
-    """
-    refined = mpx * scale**2
-    matched = refined
-    while matched > MATCHED_PIXELS / 1e6:
-        matched /= 4.0
-    return matched, refined
-
-
 def size_of(
     pictures: int,
     mpx: float,
@@ -148,10 +129,11 @@ def size_of(
     feature_mpx = min(mpx, FEATURE_MPX, wanted)
     if reconstruct.feature_scale is not None:
         feature_mpx = mpx * reconstruct.feature_scale**2
-    cell_m, scale = reconstruct.dem_cell_m, reconstruct.dense_scale or 1.0
-    if reconstruct.dense_scale is None and cell_m is not None and pixel_m is not None:
-        scale = min(1.0, max(LEAST_SCALE, CELL_PIXELS * pixel_m / cell_m))
-    matched_mpx, refined_mpx = depth_mpx(mpx, scale)
+    cell_m, scale = reconstruct.dem_cell_m, reconstruct.dense_scale
+    if scale is None:
+        scale = 1.0 if pixel_m is None else scale_for_cell(cell_m, pixel_m)
+    refined_mpx = mpx * scale**2
+    matched_mpx = mpx * matching_scale(1e6 * mpx, scale) ** 2
     cells = pictures * refined_mpx / (_LOOKS * CELL_PIXELS**2)
     mosaic_mpx = pictures * mpx / _LOOKS
     if pixel_m is not None:

@@ -8,20 +8,19 @@ enough for a package that is installed and not edited.
 """
 
 import hashlib
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from tempfile import gettempdir
 from types import CodeType, ModuleType
 from typing import Any, ParamSpec, TypeVar, overload
 
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
 from alice_survey.base.errors import note
+from alice_survey.base.run.resources import user_lock
 
 BLOCK = 128
 """Points at a time: loops over a block that do not branch become vector instructions."""
@@ -125,8 +124,6 @@ def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
     compile_it, cache = kernel.compile, kernel._cache
     index = cache._cache_file
     name = hashlib.blake2b(index._index_path.encode(), digest_size=16).hexdigest()
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    path = Path(gettempdir()) / f"alice-survey-kernels-{user}" / f"{name}.lock"
 
     def compiled_once(signature: Any) -> Any:
         if cache._index_key(signature, kernel.targetctx.codegen()) in index._load_index():
@@ -134,8 +131,7 @@ def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
         with ExitStack() as held:
             held.enter_context(global_compiler_lock)  # first: other threads may hold it
             with suppress(OSError, Timeout):  # then it is compiled once more
-                path.parent.mkdir(mode=0o700, exist_ok=True)
-                held.enter_context(FileLock(path, timeout=_LONGEST_WAIT_S))
+                held.enter_context(user_lock(f"kernel-{name}", _LONGEST_WAIT_S))
             return compile_it(signature)
 
     return compiled_once

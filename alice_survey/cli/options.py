@@ -8,10 +8,12 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer.models import ArgumentInfo
+
+from alice_survey.base.device import Choice, is_gpu_chosen
 
 if TYPE_CHECKING:
     from alice_survey.base.executor import Executor
@@ -39,7 +41,7 @@ ClusterFile = Annotated[
     typer.Option("--cluster", metavar="FILE", help="Run tasks on the Dask cluster of this file."),
 ]
 Device = Annotated[
-    Literal["auto", "cpu", "gpu"],
+    Choice,
     typer.Option(help="What refines depth: auto takes an NVIDIA GPU if one can be used."),
 ]
 Scale = Annotated[
@@ -79,12 +81,10 @@ def executor_on(
     threads: int | None,
     scheduler: str | None,
     cluster: Path | None,
-    device: Literal["auto", "cpu", "gpu"] = "cpu",
+    device: Choice = "cpu",
 ) -> "Iterator[Executor]":
     """Within this block, where a command runs its tasks: on a cluster if one is given."""
     if scheduler is None and cluster is None:
-        from alice_survey.base.device import is_gpu_chosen
-
         yield replace(executor_of(threads), uses_gpu=is_gpu_chosen(device))
         return
     if device == "gpu":

@@ -19,16 +19,14 @@ from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import MATCH_SIGMA_PX, Look, PartnerDepth, pair_depth
 from reconstruct.dense.rectify import rectify
+from reconstruct.dense.scales import matching_scale
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View, scaled_view
 
-LARGEST_PIXELS = 3_000_000
-"""Pictures with more pixels are halved for matching, until they have fewer."""
-CELL_PIXELS = 2.5
-"""Side of a cell of the surface in mean ground pixels of views, unless depth is coarser."""
-_LEAST_SCALE = 0.05
 _PROBES = 8
+_LOOKED_AT = 50
+"""Views from which the side of a pixel on the ground is taken, about."""
 _SCALES = 3
 _WORTH = 1.15
 """Half the resolution is taken where it finds this many times the depths."""
@@ -49,33 +47,25 @@ class Scales:
     """For semi-global matching, by which this depth is found before it is refined."""
 
 
-def matching_scale(view: View, finest: float = 1.0) -> float:
-    """A factor, halved until a picture that is shrunk by it has at most `LARGEST_PIXELS`."""
-    scale = finest
-    while np.prod(view.pinhole.size_px) * scale * scale > LARGEST_PIXELS:
-        scale /= 2.0
-    return scale
-
-
-def scale_for_cell(
-    cell: float | None, views: Sequence[View], points_of: Callable[[int], Array]
-) -> float:
-    """Factor at which a cell of the surface has as many pixels of a view as it has by default.
+def ground_pixel(views: Sequence[View], points_of: Callable[[int], Array]) -> float:
+    """Side of a pixel on the ground, the median of some views.
 
     Args:
-        cell: side of a cell; None for the finest that pictures give.
         views: of the model.
         points_of: from the number of a view to the points (N, 3) that bound its depth.
     """
-    if cell is None:
-        return 1.0
-    footprints = []
-    for number, view in enumerate(views):
-        points = points_of(number)
+    sides = []
+    for number in range(0, len(views), -(-len(views) // _LOOKED_AT)):
+        view, points = views[number], points_of(number)
         if len(points):
             depth = view.world_from_cam.inv().apply(points)[:, 2]
-            footprints.append(float(np.median(depth)) / view.pinhole.focal_px)
-    return float(np.clip(CELL_PIXELS * np.median(footprints) / cell, _LEAST_SCALE, 1.0))
+            sides.append(float(np.median(depth)) / view.pinhole.focal_px)
+    return float(np.median(sides))
+
+
+def pixels_of(view: View) -> int:
+    """How many a view has."""
+    return view.pinhole.width_px * view.pinhole.height_px
 
 
 def probed(partners: Sequence[Sequence[int]]) -> list[int]:
@@ -109,7 +99,7 @@ def find_scales(
         ((views[number], *(views[n] for n in partners[number])), points_of(number))
         for number in chosen
     ]
-    largest = min(matching_scale(views[number], finest) for number in chosen)
+    largest = min(matching_scale(pixels_of(views[number]), finest) for number in chosen)
     scales = [largest * 0.5**n for n in range(_SCALES)]
     shares: list[float] = []
     for tried in (scales[:2], scales[2:]):  # the third is asked only where the second is better

@@ -22,8 +22,8 @@ from reconstruct.dense.dem import (
     slope_deg,
     without_strays,
 )
-from reconstruct.dense.matching_trial import CELL_PIXELS
 from reconstruct.dense.pose_part import ErrorsOfPoses
+from reconstruct.dense.scales import CELL_PIXELS
 from reconstruct.dense.surface_tiles import (
     FuseSetup,
     SurfaceTile,

@@ -7,22 +7,19 @@ neighbours spline (4 n) and validity (1). With six neighbours of 9.2 megapixels 
 besides the few hundred MB that CUDA takes for each process.
 """
 
-import os
-import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from filelock import FileLock
 from numba import cuda
 from numba.cuda.cudadrv.driver import CudaAPIError
 from numpy.typing import NDArray
 
 from alice_survey.base.errors import warn
-from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, refine
+from alice_survey.base.run.resources import user_lock
+from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, Share, refine
 
 _BLOCK = (32, 8)
 """Threads along a row, and rows: a warp reads neighbouring pixels."""
@@ -41,9 +38,8 @@ def refine_on_gpu(
 
     Depths differ from those of the processor by rounding.
     """
-    lock = Path(tempfile.gettempdir()) / f"alice-survey-gpu-{os.getuid()}.lock"
     try:
-        with FileLock(lock):
+        with user_lock("gpu"):
             return refine(reference, depth, sigma, others, spare, _Gpu())
     except CudaAPIError as error:
         if "OUT_OF_MEMORY" not in str(error):
@@ -98,16 +94,17 @@ def launched(kernel: Callable[..., None]) -> Any:
     """
     work = cuda.jit(device=True)(getattr(kernel, "py_func", kernel))
 
-    @cuda.jit
-    def launch(arguments):  # type: ignore[no-untyped-def]
+    def launch(arguments: Any) -> None:
         columns, rows = cuda.gridsize(2)
         column, row = cuda.grid(2)
         work((row, rows, column, columns), *arguments)
 
-    return launch
+    return cuda.jit(launch)
 
 
-def blur(share, planes, weights, step, blurred):  # type: ignore[no-untyped-def]
+def blur(
+    share: Share, planes: Float32, weights: Float32, step: tuple[int, int], blurred: Float32
+) -> None:
     """Take the weighted mean along rows or columns, mirrored at the edges with the edge doubled.
 
     Args:

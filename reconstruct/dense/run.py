@@ -21,13 +21,14 @@ from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import (
     Scales,
     find_scales,
-    matching_scale,
+    ground_pixel,
+    pixels_of,
     probed,
-    scale_for_cell,
 )
 from reconstruct.dense.moving import COMPARED, clear_moving, keep_look, mask_moving, show_moving
 from reconstruct.dense.plane_rasters import Confirmed, fuse_planes
 from reconstruct.dense.pose_part import find_errors_of_poses
+from reconstruct.dense.scales import matching_scale, scale_for_cell
 from reconstruct.dense.stereo_pairs import (
     PointsInSight,
     choose_partners,
@@ -164,8 +165,9 @@ def _scales(
     """As settings want them; what they leave open is tried out."""
     if reconstruct.dense_scale is not None:
         wanted = reconstruct.dense_scale
-        return Scales(depth=wanted, matching=matching_scale(model.views[0], wanted))
-    finest = scale_for_cell(reconstruct.dem_cell_m, model.views, points.of)
+        smallest = min(matching_scale(pixels_of(view), wanted) for view in model.views)
+        return Scales(depth=wanted, matching=smallest)
+    finest = scale_for_cell(reconstruct.dem_cell_m, ground_pixel(model.views, points.of))
     return find_scales(workspace, model.views, partners, points.of, finest, executor)
 
 

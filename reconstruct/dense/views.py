@@ -198,6 +198,13 @@ def view_depth(scale: float, match_sigma_px: float, matched: tuple[ViewTask, Arr
     store.drop(task.index, "apart.scales")
 
 
+def _compared(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:
+    small = scaled_view(view, scale)
+    shown = _look(store, number, view.pinhole.size_px, small.pinhole.size_px)
+    contrast, spline, valid = shown
+    return ComparedView(view=small, contrast=contrast, spline=spline, valid=valid)
+
+
 def refining_scales(scale: float) -> list[float]:
     """Factors on the size of a view at which a depth that was matched at one of them is refined.
 
@@ -230,22 +237,15 @@ def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
     else:
         refined_by = refine
     for factor in refining_scales(scale):
-
-        def look(number: int, view: View, factor: float = factor) -> ComparedView:
-            small = scaled_view(view, factor)
-            shown = _look(store, number, view.pinhole.size_px, small.pinhole.size_px)
-            contrast, spline, valid = shown
-            return ComparedView(view=small, contrast=contrast, spline=spline, valid=valid)
-
-        reference = look(task.index, task.view)
+        reference = _compared(store, factor, task.index, task.view)
         depth, sigma = (enlarged(of, reference.view.pinhole.size_px) for of in (depth, sigma))
         start = depth
         refined = refined_by(
             reference,
             depth,
             sigma,
-            [look(*other) for other in first],
-            [look(*other) for other in spare],
+            [_compared(store, factor, *other) for other in first],
+            [_compared(store, factor, *other) for other in spare],
         )
         depth, sigma = refined.depth, refined.sigma
     agreeing = np.asarray(store.load(task.index, "agreeing"))

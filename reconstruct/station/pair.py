@@ -27,7 +27,8 @@ from alice_survey.kit.figure import colour_bar, figure_style, new_figure, save_f
 from camera_calib.rig import Rig, read_rig, write_rig
 from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
-from reconstruct.dense.matching_trial import matching_scale, shrunk
+from reconstruct.dense.matching_trial import pixels_of, shrunk
+from reconstruct.dense.scales import matching_scale
 from reconstruct.matching.features import find_features
 from reconstruct.matching.matches import match_descriptors
 from reconstruct.mesh.atlas import Wedges
@@ -238,7 +239,7 @@ def dense_pair(
     Raises:
         ReconstructionError: the views cannot be rectified.
     """
-    wanted = min(scale or matching_scale(optics.views[0]), 1.0)
+    wanted = min(scale or matching_scale(pixels_of(optics.views[0])), 1.0)
     views = [scaled_view(view, wanted) for view in optics.views]
     names = [str(path.absolute()) for path in pictures]
     opened = Pictures(

@@ -27,9 +27,7 @@ from alice_survey.computing import (
     stage_costs,
 )
 from benchmarks.costs import fitted, written
-from reconstruct.dense.matching_trial import matching_scale, scale_for_cell
 from reconstruct.matching.features import detection_scales
-from tests.oracles_dense import stereo_views
 
 COST = StageCost(
     serial_s=10.0,
@@ -101,19 +99,15 @@ def test_what_is_written_is_read_as_it_was() -> None:
 @pytest.mark.parametrize("mpx", [0.5, 2.9, 3.1, 9.2, 30.0])
 def test_pictures_are_halved_as_the_stages_do(mpx: float) -> None:
     side = int(np.sqrt(mpx * 1e6))
-    view = stereo_views(np.zeros(1), np.zeros(1))[0]
-    view = replace(view, pinhole=view.pinhole.resized(side, side))
-    for scale in (1.0, 0.4):
-        matched, refined = computing.depth_mpx(mpx, scale)
-        assert refined == pytest.approx(mpx * scale**2)
-        assert matched == pytest.approx(mpx * matching_scale(view, scale) ** 2)
-    pixel_m = 2.0 / view.pinhole.focal_px
-    points = view.world_from_cam.apply(np.array([[0.0, 0.0, 2.0]]))
-    for cell_m in (None, 2 * pixel_m, 5 * pixel_m, 100 * pixel_m):
-        wanted = ReconstructConfig(dem_cell_m=cell_m)
-        scale = scale_for_cell(cell_m, [view], [points].__getitem__)
-        found = size_of(10, mpx, wanted, pixel_m=pixel_m).refined_mpx
-        assert found == pytest.approx(mpx * scale**2)
+    full = size_of(10, mpx, ReconstructConfig())
+    assert full.refined_mpx == mpx
+    assert min(mpx, 0.75) <= full.matched_mpx <= 3.0
+    assert np.log2(np.sqrt(mpx / full.matched_mpx)) % 1 == pytest.approx(0.0, abs=1e-9)
+    coarse = size_of(10, mpx, ReconstructConfig(dem_cell_m=0.01), pixel_m=0.002)
+    assert coarse.refined_mpx == pytest.approx(mpx * 0.5**2)
+    assert size_of(10, mpx, ReconstructConfig(dense_scale=0.4)).refined_mpx == pytest.approx(
+        0.16 * mpx
+    )
     for most in (1000, 8000):
         reconstruct = ReconstructConfig(max_features=most)
         scales = detection_scales((side, side), most)

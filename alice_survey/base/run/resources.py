@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import os
 import platform
 import sys
 import threading
@@ -11,7 +12,10 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING
+
+from filelock import FileLock
 
 if TYPE_CHECKING:
     import psutil
@@ -163,6 +167,20 @@ def release_memory() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+def user_lock(name: str, longest_wait_s: float = -1.0) -> FileLock:
+    """A lock that all processes of a user on this machine share; it is in no folder of a network.
+
+    Args:
+        name: of what is locked.
+        longest_wait_s: for another process, after which `filelock.Timeout` is raised; below 0
+            there is no end.
+    """
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(gettempdir()) / f"alice-survey-locks-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return FileLock(folder / f"{name}.lock", timeout=longest_wait_s)
 
 
 @cache

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,9 +7,10 @@ import pytest
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
-from reconstruct.dense import matching_trial
+from reconstruct.dense import scales
 from reconstruct.dense.depth import enlarged
-from reconstruct.dense.matching_trial import Scales, find_scales, matching_scale, scale_for_cell
+from reconstruct.dense.matching_trial import Scales, find_scales, ground_pixel
+from reconstruct.dense.scales import matching_scale, scale_for_cell
 from reconstruct.dense.stereo_pairs import choose_partners
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
@@ -85,7 +85,8 @@ def test_depth_matched_in_smaller_pictures_is_as_exact_once_it_is_refined(survey
         shares.append(np.isfinite(depth).mean())
         errors.append(MAD_TO_SIGMA * np.median(np.abs(error[np.isfinite(error)])))
     assert min(shares) > 0.9 * shares[0] > 0.3
-    assert 0.5 < min(errors) <= max(errors) < 1.5 < 4 * errors[0]
+    assert min(errors) > 0.5
+    assert max(errors) < 1.4 * errors[0]
 
 
 def test_enlarged_depth_of_a_plane_is_that_plane_and_unknown_stays_unknown():
@@ -107,14 +108,15 @@ def test_enlarged_depth_of_a_plane_is_that_plane_and_unknown_stays_unknown():
 @pytest.mark.parametrize(("cell", "scale"), [(None, 1.0), (0.01, 1.0), (0.1, None), (9.0, 0.05)])
 def test_scale_follows_from_the_cell_that_is_wanted(survey, cell, scale):
     model = survey[1]
-    found = scale_for_cell(cell, model.views, points_of_views(model).__getitem__)
-    pixel = 2.0 / model.views[0].pinhole.focal_px
-    assert found == pytest.approx(2.5 * pixel / 0.1 if scale is None else scale, rel=0.1)
+    pixel = ground_pixel(model.views, points_of_views(model).__getitem__)
+    assert pixel == pytest.approx(2.0 / model.views[0].pinhole.focal_px, rel=0.1)
+    expected = 2.5 * pixel / 0.1 if scale is None else scale
+    assert scale_for_cell(cell, pixel) == pytest.approx(expected)
 
 
 def test_detail_below_the_scale_of_matching_is_kept_where_pictures_are_clear(survey, monkeypatch):
     workspace, model = survey
-    monkeypatch.setattr(matching_trial, "LARGEST_PIXELS", 30_000)
+    monkeypatch.setattr(scales, "LARGEST_PIXELS", 30_000)
     partners, points = choose_partners(model, 3), points_of_views(model).__getitem__
     found = find_scales(workspace, model.views, partners, points, 1.0, SERIAL)
     assert found == Scales(depth=1.0, matching=0.5)
@@ -152,7 +154,6 @@ def test_grainy_pictures_are_matched_at_a_lower_resolution_with_a_larger_sigma(s
 
 
 def test_large_pictures_are_halved_until_they_fit():
-    view = stereo_views(np.zeros(1), np.zeros(1))[0]
-    assert matching_scale(view) == 1.0
-    large = replace(view, pinhole=view.pinhole.resized(3384, 2710))
-    assert matching_scale(large) == 0.5
+    assert matching_scale(320 * 256) == 1.0
+    assert matching_scale(3384 * 2710) == 0.5
+    assert matching_scale(3384 * 2710, 0.6) == 0.3
