@@ -339,7 +339,8 @@ class SurveyCost:
         return (
             f"about {duration(self.time_s(many))} on {count(many, unit)}"
             f"{'' if many == OTHER_CORES else other}, "
-            f"{_rounded(self.memory_mib(many) / 1024)} GiB of memory, "
+            f"{_rounded(self.memory_mib(many) / 1024)} GiB of memory"
+            f"{' in all' if unit == 'worker' else ''}, "
             f"{_rounded(self.disk_mb / 1e3)} GB of disk"
         )
 
