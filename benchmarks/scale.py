@@ -47,14 +47,17 @@ class StepCost:
     """How many of what it works on: observations, pairs, samples."""
 
 
-def measure(step: str, pictures: int, work: Path, threads: int) -> StepCost | None:
-    """Run a step, unless its file is there; None where it failed."""
+def measure(
+    step: str, pictures: int, work: Path, threads: int, rig: Path | None = None
+) -> StepCost | None:
+    """Run a step, on an example's rig or that of a file, unless it is done; None if it failed."""
     file = work / f"{pictures}" / f"{step}.json"
     if not file.is_file():
         command = [sys.executable, "-m", "benchmarks.scale_steps", step, str(pictures)]
         # threads of libraries that wait for each other count as computing on a busy machine
         alone = {**os.environ, **dict.fromkeys(_THREADS, "1")}
-        ran = subprocess.run([*command, str(work), str(threads)], check=False, env=alone)
+        command += [str(work), str(threads), *(() if rig is None else ("--rig", str(rig)))]
+        ran = subprocess.run(command, check=False, env=alone)
         if ran.returncode:
             return None
     return StepCost(step=step, pictures=pictures, **json.loads(file.read_text()))

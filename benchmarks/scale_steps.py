@@ -1,6 +1,6 @@
 """One step of `benchmarks.scale` in this process, on a survey of synthetic tracks.
 
-python -m benchmarks.scale_steps STEP PICTURES FOLDER THREADS
+python -m benchmarks.scale_steps STEP PICTURES FOLDER THREADS [--rig FILE]
 """
 
 import argparse
@@ -25,9 +25,9 @@ from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from benchmarks.bend_survey import calibrated_rig
 from benchmarks.block_size import ALTITUDE_M, DATUM, Block, block, near_start, records_of
-from camera_calib.approximation.pinhole_warp import best_warp
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import Prior
-from camera_calib.rig import Rig
+from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
@@ -41,9 +41,14 @@ from reconstruct.dense.stereo_pairs import PointsInSight, choose_partners, neigh
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import LIGHT, light_parts
 from reconstruct.light.solve import GRID, LightSamples, as_rows, solve_light
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import map_calibrated
+from reconstruct.mapping.refraction import refract
+from reconstruct.matching.matches import PairMatches
 from reconstruct.matching.pairs import choose_pairs, most_alike
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.views.model import SparseModel, View, WorldFrame
+from reconstruct.views.model_files import colmap_pinhole
 from reconstruct.views.range_shift import range_shift
 
 MAKE = "make"
@@ -52,6 +57,11 @@ _POINTS = 30
 """On the sea floor, of each station."""
 _LATTICE, _WITNESSES = (28, 22), 8
 """Spots along a view's width and height, and views it is compared with."""
+_MAPPED_POINTS = 100
+"""On the sea floor, of each station, where their matches are mapped."""
+_LEAST_MATCHES = 15
+_WRONG, _WRONG_PX = 0.005, 20.0
+"""Share of the keypoints that are wrong, and by how much."""
 _LOOK = 8192
 """Numbers that describe a picture's looks."""
 
@@ -63,6 +73,8 @@ class StepWork:
     folder: Path
     pictures: int
     executor: Executor
+    rig_file: Path | None = None
+    """Of a calibrated rig; an example's is calibrated where there is none."""
 
     @property
     def own(self) -> Path:
@@ -72,6 +84,8 @@ class StepWork:
     @cached_property
     def rig(self) -> Rig:
         """The calibrated rig, its reference first."""
+        if self.rig_file is not None:
+            return read_rig(self.rig_file)
         example = _QUICK_EXAMPLE if self.pictures < _QUICK_PICTURES else _EXAMPLE
         return calibrated_rig(self.folder, example, 4, 8)
 
@@ -273,8 +287,7 @@ def _partners(work: StepWork) -> Prepared:
 def _model(work: StepWork) -> SparseModel:
     """The truth as pinholes see it."""
     rig, truth, pixels = work.rig, work.survey.truth, work.survey.pixels
-    near, far = 0.9 * ALTITUDE_M, 1.1 * ALTITUDE_M
-    warps = {name: best_warp(camera, near, far) for name, camera in rig.cameras.items()}
+    warps = _warps(rig)
     shifts = {name: range_shift(warp) for name, warp in warps.items()}
     poses = RigidTransform.from_components(truth.centres, Rotation.from_matrix(truth.turns))
     in_rig = {
@@ -299,9 +312,61 @@ def _model(work: StepWork) -> SparseModel:
     )
 
 
+def _warps(rig: Rig) -> dict[str, PinholeWarp]:
+    near, far = 0.9 * ALTITUDE_M, 1.1 * ALTITUDE_M
+    return {name: best_warp(camera, near, far) for name, camera in rig.cameras.items()}
+
+
+def _map(work: StepWork) -> Prepared:
+    """Mapping from matches as `match_pair` leaves them, a few of which are wrong."""
+    rig, seen = work.rig, _matched(work)
+    poses = dict(rig.cam_from_rig)
+
+    def run() -> int:
+        folder = work.own / "mapping"
+        with work.executor.started() as executor:
+            mapped = map_calibrated(seen, poses, folder, 1, executor=executor)
+            mapped, _ = refract(mapped, seen, folder, poses, settle=False)
+        mapped.model.write_binary(folder)
+        shutil.rmtree(folder)
+        if mapped.model.num_reg_images() < work.pictures:
+            raise RuntimeError(f"{mapped.model.num_reg_images()} of {work.pictures} pictures")
+        return int(mapped.model.compute_num_observations())
+
+    return run
+
+
+def _matched(work: StepWork) -> Observations:
+    """Keypoints of dense tracks, and matches of the pairs that navigation chooses."""
+    rig, records, rng = work.rig, work.records, np.random.default_rng(work.pictures)
+    cameras = len(rig.cameras)
+    pixels = block(rig, work.pictures // cameras, _MAPPED_POINTS).pixels
+    wrong = np.flatnonzero(rng.uniform(size=len(pixels.taken)) < _WRONG)
+    pixels.taken[wrong] += rng.normal(0, _WRONG_PX, (len(wrong), 2))
+    picture = cameras * pixels.station + pixels.camera
+    order = np.lexsort((pixels.point, picture))
+    ends = np.cumsum(np.bincount(picture, minlength=work.pictures))[:-1]
+    points = np.split(pixels.point[order], ends)
+    taken: list[Array] = np.split(pixels.taken[order], ends)
+    geometry = {"config": 2, **dict.fromkeys("EFH", np.eye(3))}  # COLMAP's number of a calibrated
+    pairs = []
+    for i, j in sorted(set().union(*choose_pairs(records, rig, DATUM))):
+        _, *rows = np.intersect1d(points[i], points[j], assume_unique=True, return_indices=True)
+        if len(rows[0]) >= _LEAST_MATCHES:
+            matches = np.stack(rows, axis=1).astype(np.uint32)
+            pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    warps = _warps(rig)
+    return Observations(
+        images=records,
+        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()},
+        taken=taken, pairs=pairs, warps=warps,
+    )  # fmt: skip
+
+
 STEPS: dict[str, Callable[[StepWork], Prepared]] = {
     MAKE: _make,
     "pairs": _pairs,
+    "map": _map,
     "adjust": _adjust,
     "shape": _shape,
     "place": _place,
@@ -328,10 +393,12 @@ def main() -> None:
     parser.add_argument("pictures", type=int)
     parser.add_argument("work", type=Path)
     parser.add_argument("threads", type=int)
+    parser.add_argument("--rig", type=Path)
     given = parser.parse_args()
     work = StepWork(
-        folder=given.work, pictures=given.pictures, executor=local_executor(given.threads)
-    )
+        folder=given.work, pictures=given.pictures, executor=local_executor(given.threads),
+        rig_file=given.rig,
+    )  # fmt: skip
     work.own.mkdir(parents=True, exist_ok=True)
     run = STEPS[given.step](work)
     before = _spent()[0]

@@ -39,10 +39,13 @@ class ErrorsOfPoses:
     def around(self, low: Array, high: Array) -> "ErrorsOfPoses":
         """Those of the points around a box, of south and west (2,) to north and east (2,)."""
         margin = float(np.max(high - low))
-        place = self.points_world[:, :2]
         while True:
-            near = ((place > low - margin) & (place < high + margin)).all(axis=1)
-            if near.sum() >= min(_COMPANY, len(place)):
+            reach = margin + float(np.max(high - low))
+            near = np.array(self._level_tree.query_ball_point(low, reach, p=np.inf), np.int64)
+            place = self.points_world[near, :2]
+            near = near[((place > low - margin) & (place < high + margin)).all(axis=1)]
+            if len(near) >= min(_COMPANY, len(self.points_world)):
+                near.sort()
                 return ErrorsOfPoses(
                     points_world=self.points_world[near], covariances=self.covariances[near]
                 )
@@ -67,6 +70,10 @@ class ErrorsOfPoses:
             found[part] = np.median(_along(covariances, normals_world[part, None]), axis=1)
         sigmas: Array = np.sqrt(found)
         return sigmas
+
+    @cached_property
+    def _level_tree(self) -> cKDTree:
+        return cKDTree(self.points_world[:, :2])
 
     @cached_property
     def _tree(self) -> cKDTree:

@@ -1,11 +1,12 @@
 """Fusing the points of all views into the surface, tile by tile of the ground."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.windows import Window
 
 from alice_survey.base.frames import Array
 from reconstruct.dense.free_space import look_at_points
@@ -83,24 +84,39 @@ class SurfaceTile:
         return np.asarray(store.load(self.number, _NAME))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FuseTasks:
+    """Tasks of all tiles, each made when it is asked for: what is around a tile is a copy."""
+
+    grid: DemGrid
+    reached: Sequence[tuple[Window, Sequence[int]]]
+    """Tiles, and the numbers of the views whose points may fall in each."""
+    views: Sequence[View]
+    poses: ErrorsOfPoses | None
+
+    def __len__(self) -> int:
+        return len(self.reached)
+
+    def __iter__(self) -> Iterator[FuseTask]:
+        for number, (window, seeing) in enumerate(self.reached):
+            row, column = int(window.row_off), int(window.col_off)
+            tile = self.grid.window(row, column, int(window.height), int(window.width))
+            low, high = _corners(tile)
+            near = None if self.poses is None else self.poses.around(low[::-1], high[::-1])
+            pairs = tuple((index, self.views[index]) for index in seeing)
+            yield FuseTask(number=number, grid=tile, views=pairs, poses=near)
+
+
 def fuse_tasks(
     grid: DemGrid,
     views: Sequence[View],
     summaries: Sequence[ViewSummary],
     poses: ErrorsOfPoses | None,
-) -> list[FuseTask]:
+) -> FuseTasks:
     """Tiles of a grid that points of views may fall in, in rows."""
     boxes = np.array([summary.bounds or (np.nan,) * 4 for summary in summaries])[:, [1, 0, 3, 2]]
     reached = tiles_reached(grid, _TILE_CELLS, boxes, _RIM_CELLS * grid.cell)
-    tasks = []
-    for number, (window, seeing) in enumerate(reached):
-        row, column = int(window.row_off), int(window.col_off)
-        tile = grid.window(row, column, int(window.height), int(window.width))
-        low, high = _corners(tile)
-        near = None if poses is None else poses.around(low[::-1], high[::-1])
-        pairs = tuple((index, views[index]) for index in seeing)
-        tasks.append(FuseTask(number=number, grid=tile, views=pairs, poses=near))
-    return tasks
+    return FuseTasks(grid=grid, reached=reached, views=views, poses=poses)
 
 
 def _corners(grid: DemGrid) -> tuple[Array, Array]:

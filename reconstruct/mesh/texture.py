@@ -180,8 +180,7 @@ def wedge_pixels(
     """
     label = charts.views[wedges.chart]
     pixels = np.empty((len(label), 2))
-    order = np.argsort(label, kind="stable")
-    for mine in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+    for mine in by_value(label, np.arange(len(label))):
         number = int(label[mine[0]])
         points = vertices[wedges.vertex[mine]]
         if number >= 0:
@@ -190,6 +189,13 @@ def wedge_pixels(
             axis = (-1 - number) // 2
             pixels[mine] = np.delete(points, axis, axis=1) / plain_pixel
     return pixels
+
+
+def by_value(values: NDArray[np.integer], rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Some rows in groups of one value each, by rising value and in their order."""
+    order = rows[np.argsort(values[rows], kind="stable")]
+    groups = np.split(order, np.flatnonzero(np.diff(values[order])) + 1)
+    return groups if len(order) else []
 
 
 def even_colour(pictures: Pictures, view: View, light: LightModel, part: Part = WHOLE) -> Float32:
@@ -277,7 +283,7 @@ def _corrections(
     at_seam = np.zeros(len(label), np.bool_)
     at_seam[seam_pairs(wedges)] = True
     at_seam &= label >= 0
-    groups = [np.flatnonzero(at_seam & (label == n)) for n in np.unique(label[at_seam])]
+    groups = by_value(label, np.flatnonzero(at_seam))
     tasks = [(views[label[group[0]]], pixels[group]) for group in groups]
     compare = partial(seam_colours, workspace, light)
     colours = np.full((len(label), 3), np.nan)
@@ -352,8 +358,8 @@ def _paint_tasks(
     face_starts = np.searchsorted(charts.chart[face_order], np.arange(count + 1))
     tasks = []
     shown = np.maximum(charts.views, -1)
-    for number in np.unique(shown[atlas.page >= 0]):
-        mine = np.flatnonzero((shown == number) & (atlas.page >= 0))
+    for mine in by_value(shown, np.flatnonzero(atlas.page >= 0)):
+        number = int(shown[mine[0]])
         members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
             PagePaintTask(

@@ -49,10 +49,10 @@ from reconstruct.mesh.texture import (
 from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import (
     CANDIDATES,
+    blocks_near,
     find_candidates,
     ray_scene,
     to_world,
-    vertices_near,
 )
 from reconstruct.ply import CloudFile
 from reconstruct.views.model import View, WorldFrame
@@ -197,7 +197,7 @@ def region_tasks(
         seeing = tuple(
             views[n]
             for n in np.flatnonzero(away <= reach).tolist()
-            if len(vertices_near(views[n], middle[None], (middle[None], radius), setup.offset))
+            if len(blocks_near(views[n], (middle[None], radius), setup.offset))
         )
         ring = [key for key in _around(number, 1, ratio) if key in fine.cells and key not in tiles]
         near = {key for cell in _around(number, 1) for key in _around(cell, 0, ratio)}

@@ -40,6 +40,28 @@ class Candidates:
     """(T, CANDIDATES); 0 where there are no more."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Shape:
+    """A mesh to look at."""
+
+    vertices: Array
+    triangles: Triangles
+    offset: Array
+    """(3,) of its coordinates."""
+    scene: Any
+    """To cast rays at."""
+    spheres: tuple[Array, Array]
+    """Around blocks of vertices."""
+    by_block: NDArray[np.int32]
+    """(T,) faces by the block of their first vertex."""
+    starts: NDArray[np.int64]
+    """(B + 1,) start of each block in these."""
+
+    def faces_of(self, block: int) -> NDArray[np.int32]:
+        """The faces whose first vertex is in a block."""
+        return self.by_block[self.starts[block] : self.starts[block + 1]]
+
+
 def to_world(points_enu: Array, offset_enu: Array) -> Array:
     """Points (N, 3) of a mesh, east, north, up from an offset, in the world frame of views."""
     world: Array = (points_enu + offset_enu) @ _ENU_TO_NED.T
@@ -87,21 +109,28 @@ def see_faces(
     Returns:
         (N,) faces, and (N,) pixels a unit of length, fewer towards the rim of the picture.
     """
-    vertices, triangles, offset, scene, spheres = _geometry(mesh, mesh.stat().st_mtime_ns)
-    near = vertices_near(view, vertices, spheres, offset)
+    shape = _geometry(mesh, mesh.stat().st_mtime_ns)
+    vertices, triangles, offset = shape.vertices, shape.triangles, shape.offset
+    near = blocks_near(view, shape.spheres, offset)
     if not len(near):
         return np.empty(0, np.int32), np.empty(0, np.float32)
     valid = Pictures.still(workspace).valid(view.image)
-    pixels = np.full((len(vertices), 2), np.nan)
-    pixels[near] = view.project(to_world(vertices[near], offset))
-    faces = np.flatnonzero(usable_pixels(pixels, valid)[triangles].all(axis=1))
-    return _quality(vertices, triangles, faces, pixels, view, offset, scene, lift)
+    numbers = (near[:, None] * _BLOCK + np.arange(_BLOCK)).reshape(-1)
+    numbers = numbers[numbers < len(vertices)]
+    pixels = view.project(to_world(vertices[numbers], offset))
+    usable = usable_pixels(pixels, valid)
+    place = np.full(len(shape.spheres[0]), -1)
+    place[near] = np.arange(len(near))
+    faces = np.sort(np.concatenate([shape.faces_of(block) for block in near]))
+    block = place[triangles[faces] // _BLOCK]
+    faces, block = faces[(block >= 0).all(axis=1)], block[(block >= 0).all(axis=1)]
+    corners = block * _BLOCK + triangles[faces] % _BLOCK
+    inside = usable[corners].all(axis=1)
+    return _quality(shape, faces[inside], pixels[corners[inside]], view, lift)
 
 
-def vertices_near(
-    view: View, vertices: Array, spheres: tuple[Array, Array], offset_enu: Array
-) -> NDArray[np.intp]:
-    """Numbers of the vertices in blocks that may reach into a view's frame."""
+def blocks_near(view: View, spheres: tuple[Array, Array], offset_enu: Array) -> NDArray[np.intp]:
+    """Numbers of the spheres, of `block_spheres`, that may reach into a view's frame."""
     centres, radii = spheres
     points = view.world_from_cam.inv().apply(to_world(centres, offset_enu))
     low, high = view.pinhole.slopes(np.array([(0, 0), view.pinhole.size_px]))
@@ -111,9 +140,7 @@ def vertices_near(
         for slope, sign in ((high[axis] + reach[axis], 1.0), (low[axis] - reach[axis], -1.0)):
             beyond = sign * (points[:, axis] - slope * points[:, 2]) / np.hypot(1.0, slope)
             near &= beyond < radii
-    blocks = np.flatnonzero(near)
-    numbers = (blocks[:, None] * _BLOCK + np.arange(_BLOCK)).reshape(-1)
-    return numbers[numbers < len(vertices)]
+    return np.flatnonzero(near)
 
 
 def block_spheres(vertices: Array) -> tuple[Array, Array]:
@@ -136,26 +163,20 @@ def usable_pixels(pixels: Array, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _quality(
-    vertices: Array,
-    triangles: Triangles,
-    faces: NDArray[np.intp],
-    pixels: Array,
-    view: View,
-    offset: Array,
-    scene: Any,
-    lift: float,
+    shape: _Shape, faces: NDArray[np.intp], pixels: Array, view: View, lift: float
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Which of some faces (N,), whose corners a view shows at pixels (N, 3, 2), it sees."""
     import open3d as o3d
 
-    camera = view.world_from_cam.translation @ _ENU_TO_NED - offset
+    vertices, triangles = shape.vertices, shape.triangles
+    camera = view.world_from_cam.translation @ _ENU_TO_NED - shape.offset
     corners = vertices[triangles[faces]]
     middle = corners.mean(axis=1)
     normal = face_normals(vertices, triangles[faces])
     sight = camera - middle
     distance = np.linalg.norm(sight, axis=1)
     cosine = (normal * sight).sum(axis=1) / np.maximum(distance, 1e-30)
-    p = pixels[triangles[faces]]
-    a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    a, b = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
     area_px = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     area = face_areas(vertices, triangles[faces])
     facing = (cosine > _LEAST_COSINE) & (area > 0)
@@ -167,26 +188,35 @@ def _quality(
     rays = np.concatenate([spots, away / reach], axis=2).astype(np.float32)
     hidden = np.zeros(rays.shape[:2], np.bool_)
     if len(rays):
-        hit = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+        hit = shape.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
         hidden = hit < reach[..., 0]
     seen = np.flatnonzero(facing)[~hidden.any(axis=1)]
     size = np.array(view.pinhole.size_px)
-    inset = np.minimum(p[seen], size - p[seen]).min(axis=(1, 2)) / (0.5 * size.min())
+    inset = np.minimum(pixels[seen], size - pixels[seen]).min(axis=(1, 2)) / (0.5 * size.min())
     taper = np.clip(inset, 0.02, 1.0)
     quality = np.sqrt(area_px[seen] / area[seen]) * np.sqrt(taper)
     return faces[seen].astype(np.int32), quality.astype(np.float32)
 
 
 @lru_cache(maxsize=1)
-def _geometry(
-    path: Path, _written_ns: int
-) -> tuple[Array, Triangles, Array, Any, tuple[Array, Array]]:
+def _geometry(path: Path, _written_ns: int) -> _Shape:
     with np.load(path) as data:
         vertices, triangles, offset = data["vertices"], data["triangles"], data["offset"]
         scene = ray_scene(vertices, triangles)
         if "occluder_triangles" in data and len(data["occluder_triangles"]):
             _add(scene, data["occluder_vertices"], data["occluder_triangles"])
-    return vertices, triangles, offset, scene, block_spheres(vertices)
+    spheres = block_spheres(vertices)
+    block = triangles[:, 0] // _BLOCK
+    counts = np.bincount(block, minlength=len(spheres[0]))
+    return _Shape(
+        vertices=vertices,
+        triangles=triangles,
+        offset=offset,
+        scene=scene,
+        spheres=spheres,
+        by_block=np.argsort(block, kind="stable").astype(np.int32),
+        starts=np.concatenate([[0], np.cumsum(counts)]),
+    )
 
 
 def ray_scene(vertices: Array, triangles: Triangles) -> Any:
