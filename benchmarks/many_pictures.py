@@ -48,7 +48,9 @@ from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import python
 from benchmarks.reconstruct_surveys import demo_like, render
-from benchmarks.scale import growth
+from benchmarks.scale import StepCost, growth, measure
+from benchmarks.scale import figures_of as figures_of_step
+from benchmarks.scale_steps import MAKE
 from reconstruct.views.model import read_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction, rigid3d
 
@@ -343,6 +345,23 @@ def heights_apart(lattice: Lattice, workspace: Path) -> tuple[float, float]:
     return 1e3 * math.sqrt(squares / max(common, 1)), common / max(wanted, 1)
 
 
+def map_tracks(tile: Path, options: argparse.Namespace) -> list[StepCost]:
+    """What mapping of synthetic tracks on the tile's rig took, up to where it failed."""
+    folder, rig = options.work / "tracks", tile / "calibration" / "rig.json"
+    folder.mkdir(exist_ok=True)
+    found = []
+    for pictures in options.pictures:
+        if measure(MAKE, pictures, folder, options.threads, rig) is None:
+            break
+        row = measure("map", pictures, folder, options.threads, rig)
+        if row is None:
+            break
+        found.append(row)
+        print(f"{'mapping':<8}{pictures:>9}{row.cpu_s:>9.1f}{'':9}{row.peak_gib:>8.2f}  "
+              f"{row.amount} observations", flush=True)  # fmt: skip
+    return found
+
+
 def figures_of(rows: Sequence[StageCost], *, judged: bool) -> list[Figure]:
     """Figures of one stage, by rising number of pictures; small surveys are not judged."""
     name, found = rows[0].stage, []
@@ -370,9 +389,10 @@ def main() -> None:
           f"{'worker':>8}{'disk GiB':>10}{'files':>9}{'open':>6}", flush=True)  # fmt: skip
     tile = make_tile(options.work)
     own = len(read_manifest(tile / "images" / "manifest.csv"))
+    options.pictures.sort()
     rows: dict[str, list[StageCost]] = {}
     figures, failed = [], []
-    for wanted in sorted(options.pictures):
+    for wanted in options.pictures:
         lattice = lattice_of(tile, -(-wanted // own))
         workspace = options.work / f"{wanted}"
         pictures = repeat(lattice, workspace)
@@ -392,9 +412,14 @@ def main() -> None:
             Figure(name=f"{pictures} pictures: cells of the tile", value=share, unit="",
                    goal=Goal(least=0.99, most=1.0)),
         ]  # fmt: skip
+    mapped = map_tracks(tile, options)
+    failed += [f"mapping of {n} pictures" for n in options.pictures[len(mapped) :]]
     for of_stage in rows.values():
         figures += figures_of(of_stage, judged=not options.quick)
-    kept = {stage: [asdict(row) for row in of_stage] for stage, of_stage in rows.items()}
+    if mapped:
+        figures += figures_of_step(mapped, judged=not options.quick)
+    kept: dict[str, list[Any]] = {stage: [asdict(r) for r in own] for stage, own in rows.items()}
+    kept["mapping"] = [asdict(row) for row in mapped]
     findings = Findings(figures=tuple(figures), failed=tuple(failed))
     sys.exit(hand_over(options, about, findings, {"stages": kept}))
 

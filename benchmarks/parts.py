@@ -166,6 +166,12 @@ PARTS = (
         long=True,
     ),
     Part(
+        name="many-pictures",
+        module="many_pictures",
+        arguments=lambda _, work: ("--work", str(work)),
+        long=True,
+    ),
+    Part(
         name="reconstruct-peers",
         module="reconstruct",
         arguments=_reconstruct("peers"),
