@@ -113,12 +113,11 @@ def fuse_planes(
     )
     tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
     tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))
-    count = sum(tile.count for tile in tiles)
-    if count == 0:
+    if not any(tile.count for tile in tiles):
         raise no_depth(len(model.views))
-    surface = (tile.points(setup.store) for tile in tiles)
-    spool = setup.store.folder / "copc"
-    write_clouds(folder, surface, count, setup.offset_enu, model.frame, cell, spool)
+    write_clouds(
+        folder, setup.store, tiles, setup.offset_enu, model.frame, cell, confirmed.executor
+    )
     if (folder / PLANES).exists():  # of a run that was interrupted
         shutil.rmtree(folder / PLANES)
     made: list[Fused] = []
