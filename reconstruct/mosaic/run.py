@@ -204,12 +204,21 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
         grid,
         model.frame,
         executor.map(label_block, tasks(blocks), label=label("seams"), task_mib=_TASK_MIB),
+        executor.local_cores,
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = sights / "rough.tif"
     groups = [tasks(group) for group in neighbours(tiles, _GROUP * _TILE_PX)]
     painted = executor.map(paint_tiles, groups, label=label("mosaic"), task_mib=_TASK_MIB)
-    covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
+    covered = write_tiles(
+        rough,
+        folder / "mosaic_source.tif",
+        grid,
+        model.frame,
+        painted,
+        names,
+        executor.local_cores,
+    )
     if covered == 0.0:
         for name in ("coverage.tif", "mosaic_source.tif"):
             (folder / name).unlink()
