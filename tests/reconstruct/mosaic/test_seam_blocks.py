@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruct.mosaic.grid import CELL_PX, Footprints
+from reconstruct.mosaic.grid import CELL_PX, Footprints, blocks_of, in_passes
 from reconstruct.mosaic.run import seam_blocks
 from reconstruct.raster import DemGrid
 
@@ -24,3 +24,25 @@ def test_blocks_hold_no_more_than_fits(pictures: int, side: int) -> None:
     assert sum(b.core.height * b.core.width for b in blocks) == GRID.rows * GRID.columns
     if side > 512:
         assert max(len(b.views) * b.grid.rows * b.grid.columns for b in blocks) < 13e6 * CELL_PX**2
+
+
+def test_neighbours_are_laid_in_turn() -> None:
+    """Of two blocks that share an edge one comes later and knows the other."""
+    strip = Footprints(
+        boxes=np.array([[0.0, 7.0, -16.0, 0.0], [17.0, 24.0, -9.0, -1.0]]), reach=np.zeros(2)
+    )
+    blocks = blocks_of(GRID, strip, 1024, 256)
+    first, second = in_passes(blocks)
+    assert {id(block) for block, _ in first + second} == {id(block) for block in blocks}
+    assert all(not cores for _, cores in first)
+    done = [block.core for block, _ in first]
+    for block, cores in second:
+        touching = [
+            core for core in done
+            if {abs(core.row_off - block.core.row_off), abs(core.col_off - block.core.col_off)}
+            == {0, 1024}
+        ]  # fmt: skip
+        assert [core for core in cores if core in touching] == list(touching) or len(touching) == 0
+        assert set(map(str, touching)) <= set(map(str, cores))
+    places = {(b.core.row_off, b.core.col_off) for b, _ in second}
+    assert not any((r + 1024, c) in places or (r, c + 1024) in places for r, c in places)
