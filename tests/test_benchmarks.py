@@ -242,8 +242,8 @@ def a_cost(folder: Path, *, code: int = 0) -> Cost:
 
 def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Path) -> None:
     cost, broken = a_cost(tmp_path), a_cost(tmp_path, code=1)
-    found = Accuracy(registered=16, cameras_mm=0.5, points_mm=2.0, points_median_mm=1.0,
-                     surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
+    found = Accuracy(registered=16, cameras_mm=0.5, bend_mm=0.1, points_mm=2.0,
+                     points_median_mm=1.0, surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
     costs = {"sparse": cost, "dense": cost, "mosaic": cost}
 
     all_ran = against_peers(16, costs, found, {"colmap": (cost, found), "other": (cost, found)})
