@@ -3,7 +3,7 @@
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
         [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
         [--only peers,growth,hierarchical,haltbrekken,brighton] [--pictures 50,100]
-        [--sparse] [--quick] [--json FILE]
+        [--sparse] [--large 400] [--quick] [--json FILE]
 
 `peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and
 processor time, peak memory with children, pictures registered, and errors against the truth. Our
@@ -11,8 +11,8 @@ model is aligned rigidly; the others know no scale and are aligned with a free o
 the sparse model; with `--sparse` ours does too, and pyOrthomosaic is left out.
 Ours runs on a few pictures first, so that its kernels are compiled, as the others' are.
 `growth`: our own cost on 50, 100, 200 and 400 pictures at an eighth of the resolution.
-`hierarchical`: to the sparse model of 400 of these, next to COLMAP's hierarchical and global
-mappers, which match neighbours by navigation.
+`hierarchical`: to the sparse model of the first 400 (`--large`) of these, next to COLMAP's
+hierarchical and global mappers, which match neighbours by navigation.
 `haltbrekken`, `brighton`: real pictures of the folder given by `--data`; a picture of both
 mosaics side by side, and the distance from another tool's cloud.
 
@@ -39,6 +39,7 @@ from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_t
 
 PARTS = ("peers", "growth", "hierarchical", "haltbrekken", "brighton")
 NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"
+_GROWN, _GROWN_QUICK = (50, 100, 200, 400), (12, 24)
 _PEERS = Path(__file__).with_name("reconstruct_peers.py")
 _STAGES = ("sparse", "dense", "mosaic")
 _RUN = (
@@ -156,10 +157,10 @@ def run_growth(work: Path, counts: Sequence[int], scale: int) -> Findings:
     return findings
 
 
-def run_hierarchical(work: Path, count: int, limit_s: float) -> Findings:
+def run_hierarchical(work: Path, count: int, rendered: int, limit_s: float) -> Findings:
     """Ours next to mappers that are made for many pictures."""
-    whole = work / f"growth_{count}"
-    render(whole, survey_toml(count, 8))
+    whole = work / f"growth_{rendered}"
+    render(whole, survey_toml(rendered, 8))
     ours(subset(whole, work / "compiled", 8), ["sparse"])
     part = subset(whole, work / f"hierarchical{count}", count)
     pictures = pictures_of(part, _emptied(work / f"hierarchical{count}_pictures"))
@@ -328,6 +329,7 @@ def main() -> int:
         "--limit", type=float, default=3600.0, help="seconds that another program may take"
     )
     parser.add_argument("--pictures", default="50,100", help="of `peers`, by commas")
+    parser.add_argument("--large", type=int, default=_GROWN[-1], help="of `hierarchical`")
     parser.add_argument("--sparse", action="store_true", help="end `peers` at the sparse model")
     add_options(parser, quick="small surveys, to see that it runs")
     given = parser.parse_args()
@@ -348,9 +350,11 @@ def main() -> int:
         counts = [16] if given.quick else [int(n) for n in given.pictures.split(",")]
         findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit, stages)
     if "growth" in parts:
-        findings += run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
+        findings += run_growth(work, _GROWN_QUICK if given.quick else _GROWN, 8)
     if "hierarchical" in parts:
-        findings += run_hierarchical(work, 24 if given.quick else 400, given.limit)
+        most = (_GROWN_QUICK if given.quick else _GROWN)[-1]
+        large = most if given.quick else given.large
+        findings += run_hierarchical(work, large, max(large, most), given.limit)
     for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
         if name in parts:
             if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():
