@@ -26,7 +26,7 @@ class Accuracy:
     registered: int
     cameras_mm: float
     bend_mm: float
-    """Sag of the heights of cameras along the block or across it, whichever is larger."""
+    """Sag of the cameras' heights along the block or across it, whichever is larger."""
     points_mm: float
     """rms distance of sparse points from the true surface, all of them."""
     points_median_mm: float
@@ -69,6 +69,12 @@ def score_peer(out: Path, truth: Path) -> Accuracy:
     return _accuracy(target, pose.apply(found), points, cells)
 
 
+def bend_mm(true_ned: Array, found_ned: Array) -> float:
+    """Sag of the heights of a track (N, 3): positive where its ends are too high."""
+    sags = sag_weights(true_ned[:, :2]) @ (true_ned - found_ned)[:, 2]
+    return 1e3 * float(sags[np.abs(sags).argmax()])
+
+
 def cells_of(dem: Path) -> Array:
     """(N, 3) map x, map y and height of the known cells of an elevation model, thinned."""
     with rasterio.open(dem) as source:
@@ -89,11 +95,10 @@ def _accuracy(true_ned: Array, found_ned: Array, points: Array, cells: Array) ->
         return float(np.median(values)) if len(values) else float("nan")
 
     misses_m = found_ned - true_ned
-    sags = sag_weights(true_ned[:, :2]) @ -misses_m[:, 2]
     return Accuracy(
         registered=len(true_ned),
         cameras_mm=1e3 * float(np.sqrt((misses_m**2).sum(axis=1).mean())),
-        bend_mm=1e3 * float(sags[np.abs(sags).argmax()]),
+        bend_mm=bend_mm(true_ned, found_ned),
         points_mm=rms(points),
         points_median_mm=median(points),
         surface_mm=rms(cells),
