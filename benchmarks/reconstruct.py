@@ -24,7 +24,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -41,24 +41,30 @@ PARTS = ("peers", "growth", "hierarchical", "haltbrekken", "brighton")
 NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"
 _GROWN, _GROWN_QUICK = (50, 100, 200, 400), (12, 24)
 _PEERS = Path(__file__).with_name("reconstruct_peers.py")
-_STAGES = ("sparse", "dense", "mosaic")
-_RUN = (
-    "import sys; from pathlib import Path; from alice_survey.survey import settings; "
-    "from reconstruct.{stage}.run import run_{stage}; from alice_survey.base.executor import "
-    "local_executor; "
-    "w = Path(sys.argv[1]); run_{stage}(w, settings(w, None, needed=False), local_executor())"
-)
+_STAGES = {"sparse": ("mapping", "placing"), "dense": ("dense",), "mosaic": ("mosaic",)}
+"""Of ours, by what they end in."""
+_RUN = """
+import sys
+from pathlib import Path
+from alice_survey.cli.session import session
+from alice_survey.survey import run
+
+with session(sys.argv[1:], quiet=True, log_file=None, events=Path(sys.argv[2])):
+    run(sys.argv[3:], Path(sys.argv[1]), None)
+"""
 
 
-def ours(workspace: Path, stages: Sequence[str] = _STAGES) -> dict[str, Cost]:
-    """Cost of every stage of ours; ends at the first that fails."""
+def ours(workspace: Path, ends: Iterable[str] = tuple(_STAGES)) -> dict[str, Cost]:
+    """Cost of ours from each end to the next; ends at the first that fails.
+
+    Events, with the computing of each step, are in `logs` of the workspace.
+    """
     costs = {}
-    for stage in stages:
-        code = _RUN.format(stage=stage)
-        costs[stage] = measured(
-            [*python("-c", code), str(workspace)], workspace / "logs" / f"{stage}.log"
-        )
-        if not costs[stage].ok:
+    for end in ends:
+        log = workspace / "logs" / f"{end}.log"
+        arguments = [str(workspace), str(log.with_suffix(".jsonl")), *_STAGES[end]]
+        costs[end] = measured([*python("-c", _RUN), *arguments], log)
+        if not costs[end].ok:
             break
     return costs
 
@@ -99,11 +105,11 @@ def run_peers(
     interpreter: str | None,
     counts: Sequence[int],
     limit_s: float,
-    stages: Sequence[str] = _STAGES,
+    ends: Sequence[str] = tuple(_STAGES),
 ) -> Findings:
     """Table of all programs on the same rendered pictures; ours compiled beforehand."""
-    findings, to_mosaic = Findings(), "mosaic" in stages
-    ours(subset(demo, work / "compiled", 8), stages)
+    findings, to_mosaic = Findings(), "mosaic" in ends
+    ours(subset(demo, work / "compiled", 8), ends)
     for count in counts:
         part = subset(demo, work / f"peers{count}", count)
         folder = work / f"peers{count}_pictures"
@@ -111,7 +117,7 @@ def run_peers(
         pictures_of(part, folder)
         print(f"\n{count} rendered pictures; errors in mm: rms of cameras; rms/median of points "
               f"and of cells\n{_HEAD}", flush=True)  # fmt: skip
-        costs = ours(part, stages)
+        costs = ours(part, ends)
         found = score_ours(part) if costs["sparse"].ok else None
         print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
         if to_mosaic:
@@ -346,9 +352,9 @@ def main() -> int:
         if demo is None:
             demo = work / "demo"
             render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
-        stages = _STAGES[:1] if given.sparse else _STAGES
+        ends = list(_STAGES)[: 1 if given.sparse else None]
         counts = [16] if given.quick else [int(n) for n in given.pictures.split(",")]
-        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit, stages)
+        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit, ends)
     if "growth" in parts:
         findings += run_growth(work, _GROWN_QUICK if given.quick else _GROWN, 8)
     if "hierarchical" in parts:
