@@ -35,7 +35,7 @@ def colmap(pictures: Path, out: Path) -> None:
 
 
 def hierarchical(pictures: Path, out: Path, manifest: Path) -> None:
-    """COLMAP's hierarchical mapper, in clusters of about a quarter of the pictures.
+    """COLMAP's hierarchical mapper, in clusters of a quarter of the pictures and their overlap.
 
     Its default of 500 pictures a cluster would not part a survey of 400. As its manual advises,
     the merged model is triangulated and adjusted twice again.
