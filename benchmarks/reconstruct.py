@@ -217,7 +217,8 @@ def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float
     """Real drone pictures: distance from another tool's cloud."""
     from reconstruct.evaluate.cloud_files import read_reference
     from reconstruct.evaluate.cloud_registration import ReferenceSurface, register_cloud
-    from reconstruct.evaluate.reference import distances, evaluate_reference, lifted
+    from reconstruct.evaluate.cloud_registration import distances
+    from reconstruct.evaluate.reference import evaluate_reference, lifted
     from reconstruct.views.model import read_frame
 
     source, workspace = data / "brighton_beach", _emptied(work / "brighton_beach")
