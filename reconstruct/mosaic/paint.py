@@ -224,11 +224,11 @@ def label_block(task: PaintTask) -> Labels:
                 colours[found.box][at] = shown[at[0], at[1]]
         if task.even:
             tones = _tones(task, tools, looks, quality)
-        chosen = choose_views(number, share, colours, _settled(task, label.shape))
+        chosen = choose_views(number, share, colours, settled_around(task))
         known = chosen >= 0
         taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
         label = np.where(known, taken + 1, 0).astype(np.int32)
-    with atomic_path(_label_path(task.survey, block.core)) as path:
+    with atomic_path(label_path_of_core(task.survey, block.core)) as path:
         np.save(path, label[inner])
     return Labels(
         block=block,
@@ -239,11 +239,12 @@ def label_block(task: PaintTask) -> Labels:
     )
 
 
-def _settled(task: PaintTask, shape: tuple[int, int]) -> NDArray[np.int32]:
-    """Views that cells of neighbouring blocks have, -1 of others."""
+def settled_around(task: PaintTask) -> NDArray[np.int32]:
+    """Views that cells of a block's window have in its neighbours, -1 of others."""
+    shape = (task.block.grid.rows // CELL_PX, task.block.grid.columns // CELL_PX)
     settled = np.full(shape, -1, np.int32)
     for core in task.settled:
-        label = np.load(_label_path(task.survey, core)) - 1
+        label = np.load(label_path_of_core(task.survey, core)) - 1
         here, there = [], []
         for axis, name in enumerate(("row_off", "col_off")):
             start = (getattr(core, name) - getattr(task.block.window, name)) // CELL_PX
@@ -255,7 +256,8 @@ def _settled(task: PaintTask, shape: tuple[int, int]) -> NDArray[np.int32]:
     return settled
 
 
-def _label_path(survey: MosaicSetup, core: Window) -> Path:
+def label_path_of_core(survey: MosaicSetup, core: Window) -> Path:
+    """File of the views of the cells of a block."""
     return survey.sights / f"seams_{core.row_off}_{core.col_off}.npy"
 
 
