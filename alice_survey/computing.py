@@ -21,7 +21,13 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.base.artefacts import StageRecord, read_json, write_json
-from alice_survey.base.config import CameraConfig, ImagingConfig, ReconstructConfig, SeafloorConfig
+from alice_survey.base.config import (
+    CameraConfig,
+    ImagingConfig,
+    ReconstructConfig,
+    SeafloorConfig,
+    SurveyConfig,
+)
 from alice_survey.base.executor import default_threads
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.run.resources import processor
@@ -304,6 +310,19 @@ def stage_costs(
             scratch_mb=sums["scratch_mb"],
         )
     return found
+
+
+def task_memory_mib(stage: str, workspace: Path, config: SurveyConfig) -> float:
+    """What a process that runs tasks of a stage takes; 0 where it is not known."""
+    if stage not in PREDICTED:
+        return 0.0
+    try:
+        size = workspace_size(
+            workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
+        )
+    except OSError:  # of a picture, which the stage reports
+        return 0.0
+    return 0.0 if size is None else stage_costs(size)[stage].worker_mib
 
 
 @dataclass(frozen=True, kw_only=True)

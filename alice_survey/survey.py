@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -102,7 +102,10 @@ def run(
                     f"{workspace} holds imported pictures; '{stage.command}' is for simulated "
                     "surveys: choose another workspace with -w"
                 )
+    from alice_survey.computing import task_memory_mib
+
     lines, found = [], {}
+    executor = executor or local_executor()
     with _only_one(workspace):
         if "fly" in stages and "plan" not in stages:
             state = spec("plan").state(workspace, planned, {})
@@ -110,7 +113,8 @@ def run(
                 warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
-                done = stage.make(workspace, config, executor or local_executor())
+                task_mib = task_memory_mib(stage.name, workspace, config)
+                done = stage.make(workspace, config, replace(executor, task_mib=task_mib))
             text, data = stage.summary(workspace / stage.folder)
             found[stage.name] = {"done": done, **data}
             lines.append(f"{stage.name}: {text}" if done else f"{stage.name}: (up to date) {text}")

@@ -2,14 +2,17 @@
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
         [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
-        [--only peers,growth,haltbrekken,brighton] [--pictures 50,100] [--quick] [--json FILE]
+        [--only peers,growth,hierarchical,haltbrekken,brighton] [--pictures 50,100]
+        [--sparse] [--large 400] [--quick] [--json FILE]
 
 `peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and
 processor time, peak memory with children, pictures registered, and errors against the truth. Our
 model is aligned rigidly; the others know no scale and are aligned with a free one. COLMAP ends at
-the sparse model.
+the sparse model; with `--sparse` ours does too, and pyOrthomosaic is left out.
 Ours runs on a few pictures first, so that its kernels are compiled, as the others' are.
 `growth`: our own cost on 50, 100, 200 and 400 pictures at an eighth of the resolution.
+`hierarchical`: to the sparse model of the first 400 (`--large`) of these, next to COLMAP's
+hierarchical and global mappers, which match neighbours by navigation.
 `haltbrekken`, `brighton`: real pictures of the folder given by `--data`; a picture of both
 mosaics side by side, and the distance from another tool's cloud.
 
@@ -21,7 +24,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -34,40 +37,49 @@ from benchmarks.reconstruct_figures import against_peers, against_real, grown, o
 from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
 from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
 
-PARTS = ("peers", "growth", "haltbrekken", "brighton")
+PARTS = ("peers", "growth", "hierarchical", "haltbrekken", "brighton")
 NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"
+_GROWN, _GROWN_QUICK = (50, 100, 200, 400), (12, 24)
 _PEERS = Path(__file__).with_name("reconstruct_peers.py")
-_STAGES = ("sparse", "dense", "mosaic")
-_RUN = (
-    "import sys; from pathlib import Path; from alice_survey.survey import settings; "
-    "from reconstruct.{stage}.run import run_{stage}; from alice_survey.base.executor import "
-    "local_executor; "
-    "w = Path(sys.argv[1]); run_{stage}(w, settings(w, None, needed=False), local_executor())"
-)
+_STAGES = {"sparse": ("mapping", "placing"), "dense": ("dense",), "mosaic": ("mosaic",)}
+"""Of ours, by what they end in."""
+_RUN = """
+import sys
+from pathlib import Path
+from alice_survey.cli.session import session
+from alice_survey.survey import run
+
+with session(sys.argv[1:], quiet=True, log_file=None, events=Path(sys.argv[2])):
+    run(sys.argv[3:], Path(sys.argv[1]), None)
+"""
 
 
-def ours(workspace: Path, stages: Sequence[str] = _STAGES) -> dict[str, Cost]:
-    """Cost of every stage of ours; ends at the first that fails."""
+def ours(workspace: Path, ends: Iterable[str] = tuple(_STAGES)) -> dict[str, Cost]:
+    """Cost of ours from each end to the next; ends at the first that fails.
+
+    Events, with the computing of each step, are in `logs` of the workspace.
+    """
     costs = {}
-    for stage in stages:
-        code = _RUN.format(stage=stage)
-        costs[stage] = measured(
-            [*python("-c", code), str(workspace)], workspace / "logs" / f"{stage}.log"
-        )
-        if not costs[stage].ok:
+    for end in ends:
+        log = workspace / "logs" / f"{end}.log"
+        arguments = [str(workspace), str(log.with_suffix(".jsonl")), *_STAGES[end]]
+        costs[end] = measured([*python("-c", _RUN), *arguments], log)
+        if not costs[end].ok:
             break
     return costs
 
 
-def peer(name: str, interpreter: str, pictures: Path, out: Path, limit_s: float) -> Cost:
+def peer(
+    name: str, interpreter: str, pictures: Path, out: Path, limit_s: float, *more: Path
+) -> Cost:
     """Cost of another program on a folder of pictures."""
-    command = [interpreter, str(_PEERS), name, str(pictures), str(out)]
+    command = [interpreter, str(_PEERS), name, str(pictures), str(out), *map(str, more)]
     return measured(command, out.with_suffix(".log"), limit_s)
 
 
 _HEAD = (
-    f"{'':34} {'wall s':>8} {'cpu s':>8} {'MiB':>7} {'reg.':>5} {'cameras':>8} {'points':>15} "
-    f"{'surface':>15}"
+    f"{'':34} {'wall s':>8} {'cpu s':>8} {'MiB':>7} {'reg.':>5} {'cameras':>8} {'bend':>7} "
+    f"{'points':>15} {'surface':>15}"
 )
 
 
@@ -81,18 +93,23 @@ def row(name: str, costs: Sequence[Cost], found: Accuracy | None) -> str:
     if found is None:
         return line
     return (
-        f"{line} {found.registered:5} {found.cameras_mm:8.2f} "
+        f"{line} {found.registered:5} {found.cameras_mm:8.2f} {found.bend_mm:7.2f} "
         f"{found.points_mm:8.2f}/{found.points_median_mm:6.2f} "
         f"{found.surface_mm:8.2f}/{found.surface_median_mm:6.2f}"
     )
 
 
 def run_peers(
-    work: Path, demo: Path, interpreter: str | None, counts: Sequence[int], limit_s: float
+    work: Path,
+    demo: Path,
+    interpreter: str | None,
+    counts: Sequence[int],
+    limit_s: float,
+    ends: Sequence[str] = tuple(_STAGES),
 ) -> Findings:
     """Table of all programs on the same rendered pictures; ours compiled beforehand."""
-    findings = Findings()
-    ours(subset(demo, work / "compiled", 8))
+    findings, to_mosaic = Findings(), "mosaic" in ends
+    ours(subset(demo, work / "compiled", 8), ends)
     for count in counts:
         part = subset(demo, work / f"peers{count}", count)
         folder = work / f"peers{count}_pictures"
@@ -100,12 +117,14 @@ def run_peers(
         pictures_of(part, folder)
         print(f"\n{count} rendered pictures; errors in mm: rms of cameras; rms/median of points "
               f"and of cells\n{_HEAD}", flush=True)  # fmt: skip
-        costs = ours(part)
+        costs = ours(part, ends)
         found = score_ours(part) if costs["sparse"].ok else None
         print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
-        print(row("ours, to surface and mosaic", list(costs.values()), found), flush=True)
+        if to_mosaic:
+            print(row("ours, to surface and mosaic", list(costs.values()), found), flush=True)
         rivals: dict[str, tuple[Cost | None, Accuracy | None]] = {}
-        for name, python_of in (("colmap", sys.executable), ("pyorthomosaic", interpreter)):
+        programs = (("colmap", sys.executable), ("pyorthomosaic", interpreter))
+        for name, python_of in programs if to_mosaic else programs[:1]:
             if python_of is None:
                 print(NO_PYORTHOMOSAIC)
                 findings += Findings(left_out=(f"{count} pictures: {NO_PYORTHOMOSAIC}",))
@@ -144,6 +163,33 @@ def run_growth(work: Path, counts: Sequence[int], scale: int) -> Findings:
     return findings
 
 
+def run_hierarchical(work: Path, count: int, rendered: int, limit_s: float) -> Findings:
+    """Ours next to mappers that are made for many pictures."""
+    whole = work / f"growth_{rendered}"
+    render(whole, survey_toml(rendered, 8))
+    ours(subset(whole, work / "compiled", 8), ["sparse"])
+    part = subset(whole, work / f"hierarchical{count}", count)
+    pictures = pictures_of(part, _emptied(work / f"hierarchical{count}_pictures"))
+    print(f"\n{count} rendered pictures, errors in mm\n{_HEAD}", flush=True)
+    costs = ours(part, ["sparse"])
+    found = score_ours(part) if costs["sparse"].ok else None
+    print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
+    rivals: dict[str, tuple[Cost | None, Accuracy | None]] = {}
+    for name in ("hierarchical", "global"):
+        out = _emptied(work / f"hierarchical{count}_{name}")
+        manifest = part / "images" / "manifest.csv"
+        cost = peer(name, sys.executable, pictures, out, limit_s, manifest)
+        accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
+        print(row(f"colmap, {name}", [cost], accuracy), flush=True)
+        if cost.ok:
+            facts = json.loads((out / "cameras.json").read_text())
+            spent = ", ".join(f"{step} {s:.0f} s" for step, s in facts["cpu_s"].items())
+            print(f"  {facts['pairs']} pairs matched; models of {facts['models']} pictures, "
+                  f"{facts['reprojection_px']:.3f} px; computing: {spent}", flush=True)  # fmt: skip
+        rivals[name] = (cost, accuracy)
+    return against_peers(count, costs, found, rivals)
+
+
 def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real stereo pictures without navigation: both mosaics in one picture."""
     source, workspace = data / "haltbrekken", _emptied(work / "haltbrekken")
@@ -170,8 +216,8 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
 def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real drone pictures: distance from another tool's cloud."""
     from reconstruct.evaluate.cloud_files import read_reference
-    from reconstruct.evaluate.cloud_registration import ReferenceSurface, register_cloud
-    from reconstruct.evaluate.reference import distances, evaluate_reference, lifted
+    from reconstruct.evaluate.cloud_registration import ReferenceSurface, distances, register_cloud
+    from reconstruct.evaluate.reference import evaluate_reference, lifted
     from reconstruct.views.model import read_frame
 
     source, workspace = data / "brighton_beach", _emptied(work / "brighton_beach")
@@ -289,6 +335,8 @@ def main() -> int:
         "--limit", type=float, default=3600.0, help="seconds that another program may take"
     )
     parser.add_argument("--pictures", default="50,100", help="of `peers`, by commas")
+    parser.add_argument("--large", type=int, default=_GROWN[-1], help="of `hierarchical`")
+    parser.add_argument("--sparse", action="store_true", help="end `peers` at the sparse model")
     add_options(parser, quick="small surveys, to see that it runs")
     given = parser.parse_args()
     parts = given.only.split(",")
@@ -304,10 +352,15 @@ def main() -> int:
         if demo is None:
             demo = work / "demo"
             render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
+        ends = list(_STAGES)[: 1 if given.sparse else None]
         counts = [16] if given.quick else [int(n) for n in given.pictures.split(",")]
-        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit)
+        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit, ends)
     if "growth" in parts:
-        findings += run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
+        findings += run_growth(work, _GROWN_QUICK if given.quick else _GROWN, 8)
+    if "hierarchical" in parts:
+        most = (_GROWN_QUICK if given.quick else _GROWN)[-1]
+        large = most if given.quick else given.large
+        findings += run_hierarchical(work, large, max(large, most), given.limit)
     for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
         if name in parts:
             if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():

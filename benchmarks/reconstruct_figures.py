@@ -11,7 +11,7 @@ from benchmarks.reconstruct_scores import Accuracy
 
 _Numbers = dict[str, tuple[float, str]]
 """Value and unit by name."""
-_SPARSE_ALONE = ("colmap",)
+_SPARSE_ALONE = ("colmap", "hierarchical", "global")
 """Programs that end at the sparse model."""
 
 
@@ -104,6 +104,7 @@ def _sparse_errors(found: Accuracy | None) -> _Numbers:
     return {
         "registered": (found.registered, "pictures"),
         "cameras, rms error": (found.cameras_mm, "mm"),
+        "cameras, bend": (found.bend_mm, "mm"),
         "sparse points, rms distance": (found.points_mm, "mm"),
         "sparse points, median distance": (found.points_median_mm, "mm"),
     }

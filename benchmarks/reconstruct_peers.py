@@ -1,16 +1,25 @@
 """Other programs on a folder of pictures, each in a process of its own so that it can be measured.
 
     PYTHON benchmarks/reconstruct_peers.py colmap PICTURES OUT
+    PYTHON benchmarks/reconstruct_peers.py hierarchical PICTURES OUT MANIFEST
+    PYTHON benchmarks/reconstruct_peers.py global PICTURES OUT MANIFEST
     PYTHON benchmarks/reconstruct_peers.py pyorthomosaic PICTURES OUT
 
 Nothing of this project is imported: PYTHON may be that of another environment. Each writes
 `cameras.json`: the centre of every registered picture, in the program's own frame.
 """
 
+import csv
 import json
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+_PARTITIONS = 4
+_REACH_M = 2.0
+"""Between pictures that are matched by navigation: beyond, footprints of 2 m share nothing."""
 
 
 def colmap(pictures: Path, out: Path) -> None:
@@ -18,6 +27,86 @@ def colmap(pictures: Path, out: Path) -> None:
 
     One camera a folder: with one a picture, its default, it would do worse.
     """
+    import pycolmap
+
+    database = _features(pictures, out)
+    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+    _write_best(out, pycolmap.incremental_mapping(database, pictures, out), {})
+
+
+def hierarchical(pictures: Path, out: Path, manifest: Path) -> None:
+    """COLMAP's hierarchical mapper, in clusters of a quarter of the pictures and their overlap.
+
+    Its default of 500 pictures a cluster would not part a survey of 400. As its manual advises,
+    the merged model is triangulated and adjusted twice again.
+    """
+    import pycolmap
+
+    def mapped(database: Path) -> dict[int, Any]:
+        options = pycolmap.HierarchicalPipelineOptions()
+        with pycolmap.Database.open(database) as opened:
+            options.clustering_options.leaf_max_num_images = -(-opened.num_images() // _PARTITIONS)
+        models: dict[int, Any] = pycolmap.hierarchical_mapping(database, pictures, out, options)
+        for model in models.values():
+            for _ in range(2):
+                pycolmap.triangulate_points(model, database, pictures, out)
+                pycolmap.bundle_adjustment(model)
+        return models
+
+    _by_navigation(pictures, out, manifest, mapped)
+
+
+def global_mapper(pictures: Path, out: Path, manifest: Path) -> None:
+    """COLMAP's global mapper, once GLOMAP, after the calibration that its manual advises."""
+    import pycolmap
+
+    def mapped(database: Path) -> dict[int, Any]:
+        pycolmap.calibrate_view_graph(database)
+        models: dict[int, Any] = pycolmap.global_mapping(database, pictures, out)
+        return models
+
+    _by_navigation(pictures, out, manifest, mapped)
+
+
+def _by_navigation(
+    pictures: Path, out: Path, manifest: Path, mapped: Callable[[Path], dict[int, Any]]
+) -> None:
+    """Features, matches of neighbours by navigation, and a mapper; computing of each is kept."""
+    import pycolmap
+
+    marks = [time.process_time()]
+    database = _features(pictures, out)
+    marks.append(time.process_time())
+    with manifest.open(newline="") as file:
+        places = {
+            row["image"]: [
+                float(row["latitude_deg"]), float(row["longitude_deg"]), -float(row["depth_m"])
+            ]
+            for row in csv.DictReader(file)
+        }  # fmt: skip
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_pose_priors()  # of EXIF
+        for image in opened.read_all_images():
+            prior = pycolmap.PosePrior(
+                corr_data_id=image.data_id,
+                position=places[image.name],
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+            )
+            opened.write_pose_prior(prior)
+    near = pycolmap.SpatialPairingOptions(max_distance=_REACH_M)
+    pycolmap.match_spatial(database, pairing_options=near, device=pycolmap.Device.cpu)
+    with pycolmap.Database.open(database) as opened:
+        pairs = opened.num_matched_image_pairs()
+    marks.append(time.process_time())
+    models = mapped(database)
+    marks.append(time.process_time())
+    names = ("features", "matching", "mapping")
+    spent = {name: marks[i + 1] - marks[i] for i, name in enumerate(names)}
+    _write_best(out, models, {"pairs": pairs, "cpu_s": spent})
+
+
+def _features(pictures: Path, out: Path) -> Path:
+    """Database of COLMAP's default SIFT, one OPENCV camera a folder."""
     import pycolmap
 
     out.mkdir(parents=True)
@@ -30,8 +119,11 @@ def colmap(pictures: Path, out: Path) -> None:
         reader_options=pycolmap.ImageReaderOptions(camera_model="OPENCV"),
         device=pycolmap.Device.cpu,
     )
-    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
-    models = pycolmap.incremental_mapping(database, pictures, out)
+    return database
+
+
+def _write_best(out: Path, models: dict[int, Any], facts: dict[str, Any]) -> None:
+    """Write the largest of COLMAP's models."""
     if not models:
         raise SystemExit("no model")
     best = max(models.values(), key=lambda model: model.num_reg_images())
@@ -41,7 +133,8 @@ def colmap(pictures: Path, out: Path) -> None:
         if image.has_pose
     }
     points = [point.xyz.tolist() for point in best.points3D.values()]
-    facts = {"models": len(models), "reprojection_px": best.compute_mean_reprojection_error()}
+    sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
+    facts |= {"models": sizes, "reprojection_px": best.compute_mean_reprojection_error()}
     _write(out, centres, points, facts)
 
 
@@ -85,7 +178,12 @@ def _write(out: Path, centres: dict[str, Any], points: list[Any], facts: dict[st
     (out / "cameras.json").write_text(json.dumps(data))
 
 
+_PROGRAMS: dict[str, Callable[..., None]] = {
+    "colmap": colmap,
+    "hierarchical": hierarchical,
+    "global": global_mapper,
+    "pyorthomosaic": pyorthomosaic,
+}
+
 if __name__ == "__main__":
-    {"colmap": colmap, "pyorthomosaic": pyorthomosaic}[sys.argv[1]](
-        Path(sys.argv[2]), Path(sys.argv[3])
-    )
+    _PROGRAMS[sys.argv[1]](*map(Path, sys.argv[2:]))

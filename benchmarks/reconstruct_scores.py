@@ -12,6 +12,7 @@ from alice_survey.seafloor.terrain import Terrain, read_terrain
 from reconstruct.evaluate.figures import rms
 from reconstruct.evaluate.truth import read_true_poses, surface_distance
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
+from reconstruct.placing.bend import sag_weights
 from reconstruct.placing.track import read_track_poses
 from reconstruct.views.model import read_model
 
@@ -24,6 +25,8 @@ class Accuracy:
 
     registered: int
     cameras_mm: float
+    bend_mm: float
+    """Sag of the cameras' heights along the block or across it, whichever is larger."""
     points_mm: float
     """rms distance of sparse points from the true surface, all of them."""
     points_median_mm: float
@@ -47,7 +50,7 @@ def score_ours(workspace: Path) -> Accuracy:
     if (workspace / "dense" / "dem.tif").exists():
         enu = cells_of(workspace / "dense" / "dem.tif")
         cells = _distance_mm(terrain, pose.apply(enu[:, [1, 0, 2]] * [1, 1, -1]))
-    return _accuracy(len(names), pose.apply(found) - target, points, cells)
+    return _accuracy(target, pose.apply(found), points, cells)
 
 
 def score_peer(out: Path, truth: Path) -> Accuracy:
@@ -63,7 +66,13 @@ def score_peer(out: Path, truth: Path) -> Accuracy:
     cells = np.empty(0)
     if (out / "dsm.tif").exists():
         cells = _distance_mm(terrain, pose.apply(cells_of(out / "dsm.tif")))
-    return _accuracy(len(names), pose.apply(found) - target, points, cells)
+    return _accuracy(target, pose.apply(found), points, cells)
+
+
+def bend_mm(true_ned: Array, found_ned: Array) -> float:
+    """Sag of the heights of a track (N, 3): positive where its ends are too high."""
+    sags = sag_weights(true_ned[:, :2]) @ (true_ned - found_ned)[:, 2]
+    return 1e3 * float(sags[np.abs(sags).argmax()])
 
 
 def cells_of(dem: Path) -> Array:
@@ -81,13 +90,15 @@ def _distance_mm(terrain: Terrain, points_ned: Array) -> Array:
     return 1e3 * surface_distance(terrain, points_ned) if len(points_ned) else np.empty(0)
 
 
-def _accuracy(registered: int, misses_m: Array, points: Array, cells: Array) -> Accuracy:
+def _accuracy(true_ned: Array, found_ned: Array, points: Array, cells: Array) -> Accuracy:
     def median(values: Array) -> float:
         return float(np.median(values)) if len(values) else float("nan")
 
+    misses_m = found_ned - true_ned
     return Accuracy(
-        registered=registered,
+        registered=len(true_ned),
         cameras_mm=1e3 * float(np.sqrt((misses_m**2).sum(axis=1).mean())),
+        bend_mm=bend_mm(true_ned, found_ned),
         points_mm=rms(points),
         points_median_mm=median(points),
         surface_mm=rms(cells),

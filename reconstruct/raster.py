@@ -130,6 +130,7 @@ def tiled_raster(
     nodata: float | None,
     text: str,
     unit: str = "",
+    threads: int = 1,
 ) -> Iterator[Any]:
     """A one-band tiled GeoTIFF to write to, window by window; others are unknown and take no room.
 
@@ -141,6 +142,7 @@ def tiled_raster(
         nodata: value of unknown cells.
         text: what the band holds.
         unit: of its values; none of numbers.
+        threads: that compress; the file is the same for any number.
     """
     profile = {
         "driver": "GTiff",
@@ -158,7 +160,7 @@ def tiled_raster(
         "predictor": 3 if dtype.startswith("float") else 2,
         "bigtiff": "if_safer",
         "sparse_ok": True,
-        "num_threads": 1,
+        "num_threads": threads,
     }
     with rasterio.open(path, "w", **profile) as raster:
         raster.update_tags(**frame_tags(frame))

@@ -19,7 +19,7 @@ from benchmarks.figures import Figure, Findings, Goal, hand_over
 from benchmarks.measured import Cost
 from benchmarks.parts import PARTS, Part, Settings, chosen
 from benchmarks.reconstruct_figures import against_peers
-from benchmarks.reconstruct_scores import Accuracy
+from benchmarks.reconstruct_scores import Accuracy, bend_mm
 from benchmarks.runs import Run, run
 from reconstruct.placing.bend import sag_weights
 
@@ -242,8 +242,8 @@ def a_cost(folder: Path, *, code: int = 0) -> Cost:
 
 def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Path) -> None:
     cost, broken = a_cost(tmp_path), a_cost(tmp_path, code=1)
-    found = Accuracy(registered=16, cameras_mm=0.5, points_mm=2.0, points_median_mm=1.0,
-                     surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
+    found = Accuracy(registered=16, cameras_mm=0.5, bend_mm=0.1, points_mm=2.0,
+                     points_median_mm=1.0, surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
     costs = {"sparse": cost, "dense": cost, "mosaic": cost}
 
     all_ran = against_peers(16, costs, found, {"colmap": (cost, found), "other": (cost, found)})
@@ -262,6 +262,16 @@ def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Pa
     ours_broke = against_peers(16, {"sparse": broken}, None, {"colmap": (cost, found)})
     assert ours_broke.figures == ()
     assert ours_broke.failed == ("16 pictures, sparse: no model",)
+
+
+def test_bend_of_a_track_is_the_sag_of_its_heights_and_not_their_tilt() -> None:
+    north, east = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 8, 17), [0.0, 1.0, 2.0]))
+    true = np.column_stack([north, east, np.full(north.shape, 13.0)])
+    tilted = true + np.column_stack([0 * north, 0 * north, 0.3 + 0.01 * north - 0.02 * east])
+    lower = 0.005 * (1 - ((north - 4) / 4) ** 2)  # the middle, by 5 mm
+
+    assert bend_mm(true, tilted) == pytest.approx(0.0, abs=1e-9)
+    assert bend_mm(true, tilted + lower[:, None] * [0, 0, 1]) == pytest.approx(5.0)
 
 
 def test_a_run_keeps_the_log_and_no_figures_of_an_earlier_one(tmp_path: Path) -> None:

@@ -60,6 +60,8 @@ class Executor:
     """An engine that is running; without one, local processes start where there are tasks."""
     uses_gpu: bool = False
     """Whether tasks may use the GPU of this machine."""
+    task_mib: float = 0.0
+    """Memory that any task takes at least, where it is known."""
 
     @property
     def local_cores(self) -> int:
@@ -88,8 +90,8 @@ class Executor:
             items: what to work on.
             label: text of the progress bar.
             total: how many items, when `items` has no length.
-            task_mib: memory that one task takes, where that is known to be large: in local
-                processes as many run at once as there is memory for.
+            task_mib: memory that one task takes, where that is known to be larger than
+                `self.task_mib`: in local processes as many run at once as there is memory for.
 
         Raises:
             AliceError: a worker was ended from outside.
@@ -97,7 +99,8 @@ class Executor:
         if total is None and isinstance(items, Sized):
             total = len(items)
         with step(label, total) as counter:
-            for found in self._results(function, items, total, label, task_mib):
+            most = max(task_mib, self.task_mib)
+            for found in self._results(function, items, total, label, most):
                 yield found.result
                 counter.advance(spent=found.spent)
 
@@ -105,13 +108,23 @@ class Executor:
     def started(self) -> Iterator["Executor"]:
         """Within this block all calls of `map` share their processes.
 
-        Starting one and loading its libraries takes about two seconds of processor time.
+        Starting one and loading its libraries takes about two seconds of processor time. No more
+        start than there is memory for.
         """
+        workers = min(self.workers, _fitting(self.task_mib))
         if self.pool is not None or self.workers <= 1:
             yield self
             return
-        with _Processes(self.workers) as pool:
-            yield replace(self, pool=pool)
+        if workers < self.workers:
+            note(
+                f"{workers} of {self.workers} processes work, of {self.task_mib:.0f} MiB each: "
+                "memory has no room for more"
+            )
+        if workers <= 1:
+            yield replace(self, workers=1)
+            return
+        with _Processes(workers) as pool:
+            yield replace(self, pool=pool, workers=workers)
 
     def _results(
         self,

@@ -2,16 +2,21 @@
 
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.executor import Executor
 from alice_survey.base.records import CloudRecord
-from reconstruct.copc import copc_writer
+from reconstruct.copc import PointSpool, SpooledPart, write_copc
+from reconstruct.dense.surface_tiles import SurfaceTile
+from reconstruct.dense.view_store import ViewStore
 from reconstruct.ply import VERTEX as MESH_VERTEX
 from reconstruct.ply import write_ply
 from reconstruct.raster import crs_of
@@ -24,6 +29,7 @@ VERTEX = np.dtype([*MESH_VERTEX.descr, ("sigma", "<f4")])
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
 _MOST_OVERVIEW_POINTS = 40_000_000
 """That programs without levels of detail hold at once."""
+_OVERVIEW = "overview"
 _LAS_STEP = 1e-4
 _LAS_EXTRA = {
     "nx": "normal, east",
@@ -83,39 +89,60 @@ def write_cloud(
     return write_ply(path, parts, comments)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _CloudSetup:
+    """What all tiles share."""
+
+    store: ViewStore
+    header: "laspy.LasHeader"
+    spool: PointSpool
+    cell: float
+    edge: float
+    """Of the overview's cubes."""
+
+
 def write_clouds(
     folder: Path,
-    surface: Iterable[NDArray[Any]],
-    count: int,
+    store: ViewStore,
+    tiles: Sequence[SurfaceTile],
     offset_enu: Sequence[float],
     frame: WorldFrame,
     cell: float,
-    scratch: Path,
+    executor: Executor,
 ) -> None:
     """Write all points of a surface as COPC, and an overview that fits in memory as PLY.
 
     Args:
         folder: for `cloud.copc.laz`, `cloud.ply` and `cloud.json`.
-        surface: parts of it, records of `SURFACE_POINT` from the offset.
-        count: of all its points, one or more.
-        offset_enu: near the points.
+        store: with the surface.
+        tiles: of it, with one point or more in all.
+        offset_enu: of the points of tiles.
         frame: that the offset is in.
         cell: of the surface.
-        scratch: a folder for points that wait.
+        executor: runs the tiles.
     """
-    edge = voxel_edge(cell, count, _MOST_OVERVIEW_POINTS)
+    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MOST_OVERVIEW_POINTS)
     header = las_header(offset_enu, frame)
+    scratch = store.folder / "copc"
     if scratch.exists():  # of a run that was interrupted
         shutil.rmtree(scratch)
-    with copc_writer(folder / "cloud.copc.laz", header, cell, scratch) as add:
-
-        def overview() -> Iterator[NDArray[Any]]:
-            for part in surface:
-                add(las_points(vertices_of(part, cell, cell), header))
-                yield vertices_of(part, cell, edge)
-
-        points = write_cloud(folder / "cloud.ply", overview(), offset_enu, frame)
+    spool = PointSpool.of(scratch, header, cell)
+    setup = _CloudSetup(store=store, header=header, spool=spool, cell=cell, edge=edge)
+    spool_tile = partial(_spool_tile, setup)
+    parts = list(executor.map(spool_tile, tiles, label="lay out the point cloud"))
+    overview = (np.asarray(store.load(tile.number, _OVERVIEW)) for tile in tiles)
+    points = write_cloud(folder / "cloud.ply", overview, offset_enu, frame)
     write_cloud_json(folder / "cloud.json", points, offset_enu, edge, frame)
+    write_copc(folder / "cloud.copc.laz", header, spool, parts, executor)
+
+
+def _spool_tile(setup: _CloudSetup, tile: SurfaceTile) -> SpooledPart:
+    """Put the points of a tile in the spool, and those of the overview in the store."""
+    surface = tile.points(setup.store)
+    every = vertices_of(surface, setup.cell, setup.cell)
+    few = every if setup.edge == setup.cell else vertices_of(surface, setup.cell, setup.edge)
+    setup.store.save(tile.number, _OVERVIEW, few)
+    return setup.spool.add(f"{tile.number}", las_points(every, setup.header).array)
 
 
 def las_header(offset_enu: Sequence[float], frame: WorldFrame) -> "laspy.LasHeader":

@@ -113,12 +113,11 @@ def fuse_planes(
     )
     tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
     tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))
-    count = sum(tile.count for tile in tiles)
-    if count == 0:
+    if not any(tile.count for tile in tiles):
         raise no_depth(len(model.views))
-    surface = (tile.points(setup.store) for tile in tiles)
-    spool = setup.store.folder / "copc"
-    write_clouds(folder, surface, count, setup.offset_enu, model.frame, cell, spool)
+    write_clouds(
+        folder, setup.store, tiles, setup.offset_enu, model.frame, cell, confirmed.executor
+    )
     if (folder / PLANES).exists():  # of a run that was interrupted
         shutil.rmtree(folder / PLANES)
     made: list[Fused] = []
@@ -220,7 +219,8 @@ def _project(
         tasks.append((window, part, [tiles[n] for n in over]))
     label = "project" if plane.is_level else f"project {plane.name}"
     found = confirmed.executor.map(partial(project_tile, setup, plane), tasks, label=label)
-    _write_rasters(folder, grid, plane_frame(frame, plane), found)
+    threads = confirmed.executor.local_cores
+    _write_rasters(folder, grid, plane_frame(frame, plane), found, threads)
     write_plane(folder, plane, frame)
     preview_dem(folder / "dem.tif", folder / "dem.png")
     for name, ramp in (("dem", "viridis"), ("sigma", "cividis")):
@@ -267,7 +267,7 @@ def _middle_up(setup: FuseSetup, plane: Plane) -> float:
 
 
 def _write_rasters(
-    folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterable[RasterTile]
+    folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterable[RasterTile], threads: int
 ) -> None:
     unit, nan = frame.unit, float("nan")
     up = "towards its viewer" if frame.name == "plane" else "up"
@@ -298,7 +298,9 @@ def _write_rasters(
     with ExitStack() as files:
         rasters = {
             name: files.enter_context(
-                tiled_raster(folder / f"{file}.tif", grid, frame, dtype, nodata, text, unit)
+                tiled_raster(
+                    folder / f"{file}.tif", grid, frame, dtype, nodata, text, unit, threads
+                )
             )
             for name, (file, dtype, nodata, text, unit) in bands.items()
         }

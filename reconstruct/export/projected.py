@@ -26,7 +26,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.records import MeshRecord, SurfaceRecord
 from alice_survey.base.run import progress
 from alice_survey.stages import need
-from reconstruct.copc import copc_writer
+from reconstruct.copc import PointSpool, write_copc
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.views.model import WorldFrame, read_frame
 
@@ -202,18 +202,20 @@ def _cloud(source: Path, path: Path, spacing: float, target: Destination) -> Non
         header.scales = file.header.scales
         header.creation_date = file.header.creation_date
         header.add_crs(target.crs)
-        with copc_writer(path, header, spacing, path.with_name("scratch")) as add:
-            for part in file.chunk_iterator(_CHUNK):
-                points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
-                for name in part.array.dtype.names or ():
-                    if name not in "XYZ":
-                        points.array[name] = part.array[name]
-                at = target.places(np.column_stack([part.x, part.y]))
-                points.x, points.y, points.z = at[:, 0], at[:, 1], np.asarray(part.z)
-                normals = np.column_stack([part["nx"], part["ny"], part["nz"]])
-                turned = target.turned(normals, middle[:2])
-                points["nx"], points["ny"], points["nz"] = turned.T
-                add(points)
+        spool = PointSpool.of(path.with_name("scratch"), header, spacing)
+        parts = []
+        for number, part in enumerate(file.chunk_iterator(_CHUNK)):
+            points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+            for name in part.array.dtype.names or ():
+                if name not in "XYZ":
+                    points.array[name] = part.array[name]
+            at = target.places(np.column_stack([part.x, part.y]))
+            points.x, points.y, points.z = at[:, 0], at[:, 1], np.asarray(part.z)
+            normals = np.column_stack([part["nx"], part["ny"], part["nz"]])
+            turned = target.turned(normals, middle[:2])
+            points["nx"], points["ny"], points["nz"] = turned.T
+            parts.append(spool.add(f"{number}", points.array))
+    write_copc(path, header, spool, parts)
 
 
 @progress.step("transform the mesh")

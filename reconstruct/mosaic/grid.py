@@ -136,6 +136,26 @@ def neighbours(blocks: Sequence[Block], side_px: int) -> list[list[Block]]:
     return [groups[key] for key in sorted(groups)]
 
 
+def in_passes(blocks: Sequence[Block]) -> list[list[tuple[Block, tuple[Window, ...]]]]:
+    """Blocks in two passes of a chequerboard, each with its neighbours in the pass before.
+
+    Returns:
+        Passes that have any block: blocks of it, and the cores next to each.
+    """
+    rows, columns = (
+        {offset: n for n, offset in enumerate(sorted({getattr(b.core, name) for b in blocks}))}
+        for name in ("row_off", "col_off")
+    )
+    at = {(rows[b.core.row_off], columns[b.core.col_off]): b for b in blocks}
+    passes: list[list[tuple[Block, tuple[Window, ...]]]] = [[], []]
+    for (row, column), block in at.items():
+        around = ((row - 1, column), (row, column - 1), (row, column + 1), (row + 1, column))
+        later = (row + column) % 2
+        cores = tuple(at[key].core for key in around if later and key in at)
+        passes[later].append((block, cores))
+    return [one for one in passes if one]
+
+
 def coarse(grid: DemGrid, side_px: int = CELL_PX) -> DemGrid:
     """Cells of a number of pixels a side that cover a grid of pixels."""
     return DemGrid(

@@ -11,6 +11,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
+from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.blend import Blend, ViewPart
@@ -68,6 +69,8 @@ class PaintTask:
     colour: ColourModel
     even: bool
     """Broad tones are made to meet."""
+    settled: tuple[Window, ...] = ()
+    """Cores of neighbouring blocks whose seams are laid."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -191,7 +194,7 @@ def _thinned(seen: list[_Shown], spots: int, task: LightTask) -> list[_Shown]:
 
 @small_cache()
 def label_block(task: PaintTask) -> Labels:
-    """Choose the view of each cell of a block."""
+    """Choose the view of each cell of a block, and keep it for the blocks next to it."""
     block = task.block
     inner = _inner(block)
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
@@ -221,10 +224,12 @@ def label_block(task: PaintTask) -> Labels:
                 colours[found.box][at] = shown[at[0], at[1]]
         if task.even:
             tones = _tones(task, tools, looks, quality)
-        chosen = choose_views(number, share, colours)
+        chosen = choose_views(number, share, colours, settled_around(task))
         known = chosen >= 0
         taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
         label = np.where(known, taken + 1, 0).astype(np.int32)
+    with atomic_path(label_path_of_core(task.survey, block.core)) as path:
+        np.save(path, label[inner])
     return Labels(
         block=block,
         label=label[inner],
@@ -232,6 +237,28 @@ def label_block(task: PaintTask) -> Labels:
         stations=stations[inner],
         tones=tones[inner].transpose(2, 0, 1),
     )
+
+
+def settled_around(task: PaintTask) -> NDArray[np.int32]:
+    """Views that cells of a block's window have in its neighbours, -1 of others."""
+    shape = (task.block.grid.rows // CELL_PX, task.block.grid.columns // CELL_PX)
+    settled = np.full(shape, -1, np.int32)
+    for core in task.settled:
+        label = np.load(label_path_of_core(task.survey, core)) - 1
+        here, there = [], []
+        for axis, name in enumerate(("row_off", "col_off")):
+            start = (getattr(core, name) - getattr(task.block.window, name)) // CELL_PX
+            first = max(start, 0)
+            last = max(first, min(start + label.shape[axis], shape[axis]))
+            here.append(slice(first, last))
+            there.append(slice(first - start, last - start))
+        settled[tuple(here)] = label[tuple(there)]
+    return settled
+
+
+def label_path_of_core(survey: MosaicSetup, core: Window) -> Path:
+    """File of the views of the cells of a block."""
+    return survey.sights / f"seams_{core.row_off}_{core.col_off}.npy"
 
 
 @small_cache()

@@ -6,13 +6,14 @@ the picture as taken. No step holds more than one block, so that memory does not
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rasterio.windows import Window
 
 from alice_survey.base.config import ReconstructConfig, WaterConfig
 from alice_survey.base.errors import ReconstructionError, warn
@@ -29,12 +30,14 @@ from reconstruct.mosaic.grid import (
     blocks_of,
     footprints,
     height_range,
+    in_passes,
     mean_pixel,
     mosaic_grid,
     neighbours,
 )
 from reconstruct.mosaic.occluders import find_occluders
 from reconstruct.mosaic.paint import (
+    Labels,
     LightTask,
     PaintTask,
     SeenView,
@@ -186,30 +189,44 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
         return False
     colour = _solve(painting, model, survey, views, blocks, label("compare light"))
 
-    def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
-        return [
-            PaintTask(
-                survey=survey,
-                block=block,
-                views=tuple(views[n] for n in block.views),
-                colour=_part_of(colour, [names[n] for n in block.views]),
-                even=reconstruct.colour != "raw",
-            )
-            for block in blocks
-        ]
+    def task(block: Block, settled: tuple[Window, ...] = ()) -> PaintTask:
+        return PaintTask(
+            survey=survey,
+            block=block,
+            views=tuple(views[n] for n in block.views),
+            colour=_part_of(colour, [names[n] for n in block.views]),
+            even=reconstruct.colour != "raw",
+            settled=settled,
+        )
+
+    def labels() -> Iterator[Labels]:
+        passes = in_passes(blocks)
+        for number, some in enumerate(passes, 1):
+            name = "seams" if len(passes) == 1 else f"seams, {number} of {len(passes)}"
+            tasks = [task(*one) for one in some]
+            yield from executor.map(label_block, tasks, label=label(name), task_mib=_TASK_MIB)
 
     write_labels(
         (label_path(sights), tones_path(sights)),
         folder / "coverage.tif",
         grid,
         model.frame,
-        executor.map(label_block, tasks(blocks), label=label("seams"), task_mib=_TASK_MIB),
+        labels(),
+        executor.local_cores,
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = sights / "rough.tif"
-    groups = [tasks(group) for group in neighbours(tiles, _GROUP * _TILE_PX)]
+    groups = [[task(tile) for tile in group] for group in neighbours(tiles, _GROUP * _TILE_PX)]
     painted = executor.map(paint_tiles, groups, label=label("mosaic"), task_mib=_TASK_MIB)
-    covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
+    covered = write_tiles(
+        rough,
+        folder / "mosaic_source.tif",
+        grid,
+        model.frame,
+        painted,
+        names,
+        executor.local_cores,
+    )
     if covered == 0.0:
         for name in ("coverage.tif", "mosaic_source.tif"):
             (folder / name).unlink()

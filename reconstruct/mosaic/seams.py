@@ -25,6 +25,8 @@ _SEAM_COST = 0.1
 _DIFFERENCE_COST = 10.0
 """Cost of a seam along one cell where views differ by a factor of e."""
 _MOST_DIFFERENCE = 1.0
+_UNSETTLING_COST = 1000.0
+"""Cost of another view than the one that a cell has already."""
 
 
 def candidates(
@@ -52,15 +54,24 @@ def candidates(
     )
 
 
-def choose_views(number: NDArray[np.int32], share: Float32, colours: Float32) -> NDArray[np.int32]:
+def choose_views(
+    number: NDArray[np.int32],
+    share: Float32,
+    colours: Float32,
+    settled: NDArray[np.int32] | None = None,
+) -> NDArray[np.int32]:
     """Index of the candidate that each cell takes, (H, W); -1 where it has none.
 
     Args:
         number: (H, W, K) views, -1 where there are fewer.
         share: (H, W, K) quality over the best one's.
         colours: (H, W, K, 3) logarithm of what they show there.
+        settled: (H, W) views that cells have already, -1 of others, which seams are laid up to.
     """
     own = np.where(number >= 0, -np.log(np.maximum(share, 1e-6)), np.inf).astype(np.float32)
+    if settled is not None:
+        had = (number == settled[..., None]) & (number >= 0)
+        own += np.where(had.any(axis=2, keepdims=True) & ~had, np.float32(_UNSETTLING_COST), 0)
     chosen: NDArray[np.int32] = _trws(number, own, colours, _SWEEPS)
     return chosen
 

@@ -39,9 +39,10 @@ def write_tiles(
     frame: WorldFrame,
     groups: Iterator[list[Painted]],
     names: list[str],
+    threads: int,
 ) -> float:
     """Write colours and sources as they come; return the share of pixels that have colour."""
-    shared = _profile(grid, frame)
+    shared = _profile(grid, frame, threads)
     numbers = "uint16" if len(names) <= _LARGEST_UINT16 else "uint32"
     painted = 0
     with (
@@ -69,9 +70,10 @@ def write_labels(
     grid: DemGrid,
     frame: WorldFrame,
     blocks: Iterator[Labels],
+    threads: int,
 ) -> None:
     """Write view and tones of each cell, and a raster of how many pictures and stations see it."""
-    shared = _profile(coarse(grid), frame)
+    shared = _profile(coarse(grid), frame, threads)
     with (
         rasterio.open(cells_of[0], "w", count=1, dtype="int32", **shared) as labels,
         rasterio.open(
@@ -91,7 +93,7 @@ def write_labels(
             raster.write(np.stack([block.pictures, block.stations]), window=window)
 
 
-def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
+def _profile(grid: DemGrid, frame: WorldFrame, threads: int) -> dict[str, object]:
     return {
         "driver": "GTiff",
         "width": grid.columns,
@@ -105,6 +107,7 @@ def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
         "zlevel": 1,
         "bigtiff": "if_safer",
         "sparse_ok": True,
+        "num_threads": threads,
     }
 
 

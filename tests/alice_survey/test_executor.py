@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,24 @@ def test_as_many_tasks_run_as_there_is_memory_for(monkeypatch: pytest.MonkeyPatc
     assert processes(2000.0) == {os.getpid()}  # one runs, whatever it takes
     assert len(processes(450.0)) == 2
     assert os.getpid() not in processes(450.0)
+
+
+def test_no_more_processes_start_than_there_is_memory_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    memory = psutil.virtual_memory()._replace(available=1000 * 2**20)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+
+    def processes(task_mib: float) -> set[int]:
+        with replace(local_executor(3), task_mib=task_mib).started() as started:
+            return set(started.map(_process, range(12), label="ids"))
+
+    assert processes(2000.0) == {os.getpid()}
+    assert "1 of 3 processes work, of 2000 MiB each" in capsys.readouterr().err
+    assert len(processes(450.0)) == 2
+    assert "2 of 3 processes work" in capsys.readouterr().err
+    assert len(processes(100.0)) == 3
+    assert "processes work" not in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel's parent-death signal is Linux's")

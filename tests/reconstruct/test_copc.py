@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from laspy.copc import Bounds
 
+from alice_survey.base.executor import SERIAL, Executor, local_executor
 from reconstruct import copc
-from reconstruct.copc import copc_writer
+from reconstruct.copc import PointSpool, write_copc
 
 STEP_M = 1e-4
 SPACING_M = 0.02
@@ -38,15 +39,17 @@ def points_at(xyz: np.ndarray, header: laspy.LasHeader) -> laspy.ScaleAwarePoint
 
 
 def write(
-    folder: Path, parts: Iterable[np.ndarray], spacing: float = SPACING_M
+    folder: Path,
+    parts: Iterable[np.ndarray],
+    spacing: float = SPACING_M,
+    executor: Executor = SERIAL,
 ) -> tuple[Path, np.ndarray]:
     """A file of points at places (N, 3), and its records sorted."""
-    path, header, written = folder / "cloud.copc.laz", new_header(), []
-    with copc_writer(path, header, spacing, folder / "scratch") as add:
-        for xyz in parts:
-            points = points_at(xyz, header)
-            written.append(points.array.copy())
-            add(points)
+    path, header = folder / "cloud.copc.laz", new_header()
+    spool = PointSpool.of(folder / "scratch", header, spacing)
+    written = [points_at(xyz, header).array for xyz in parts]
+    spooled = [spool.add(f"{n}", points) for n, points in enumerate(written)]
+    write_copc(path, header, spool, spooled, executor)
     assert list(folder.iterdir()) == [path]
     return path, np.sort(np.concatenate(written))
 
@@ -82,6 +85,8 @@ def test_every_point_is_there_once(name: str, tmp_path: Path):
     with laspy.CopcReader.open(path) as reader:
         np.testing.assert_array_equal(np.sort(reader.query().array), written)
         assert reader.header.point_count == reader.header.number_of_points_by_return[0]
+        (sigma,) = reader.header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs
+        assert not (sigma.min_is_relevant() or sigma.max_is_relevant())
         for least, most, axis in zip(reader.header.mins, reader.header.maxs, "XYZ", strict=True):
             at = written[axis] * STEP_M + OFFSET_M["XYZ".index(axis)]
             assert (least, most) == pytest.approx((at.min(), at.max()), abs=1e-9)
@@ -152,17 +157,27 @@ def test_the_same_points_make_the_same_bytes(tmp_path: Path):
     assert files[0] == files[1]
 
 
+def test_workers_make_the_same_bytes(tmp_path: Path):
+    parts = np.array_split(floor(45.0, 24.0), 7)  # six cubes
+    files = []
+    for name, executor in (("a", SERIAL), ("b", local_executor(2))):
+        (tmp_path / name).mkdir()
+        files.append(write(tmp_path / name, parts, executor=executor)[0].read_bytes())
+    assert files[0] == files[1]
+
+
 def test_memory_does_not_hold_the_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(copc, "_GRID_BITS", 5)
     monkeypatch.setattr(copc, "_LEAF_POINTS", 1500)
     header, count = new_header(), 0
     tracemalloc.start()
     try:
-        with copc_writer(tmp_path / "c.laz", header, SPACING_M / 8, tmp_path / "scratch") as add:
-            for n in range(50):
-                places = floor(2.0, 2.0) + np.array([2.0 * (n % 10), 2.0 * (n // 10), 0.0])
-                add(points_at(places, header))
-                count += len(places)
+        spool, spooled = PointSpool.of(tmp_path / "scratch", header, SPACING_M / 8), []
+        for n in range(50):
+            places = floor(2.0, 2.0) + np.array([2.0 * (n % 10), 2.0 * (n // 10), 0.0])
+            spooled.append(spool.add(f"{n}", points_at(places, header).array))
+            count += len(places)
+        write_copc(tmp_path / "c.laz", header, spool, spooled)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

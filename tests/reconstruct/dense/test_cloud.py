@@ -4,6 +4,7 @@ import laspy
 import numpy as np
 
 from alice_survey.base.artefacts import read_json
+from alice_survey.base.executor import SERIAL
 from reconstruct.dense import cloud as cloud_module
 from reconstruct.dense.cloud import (
     VERTEX,
@@ -14,6 +15,8 @@ from reconstruct.dense.cloud import (
     write_clouds,
 )
 from reconstruct.dense.surface_points import SURFACE_POINT
+from reconstruct.dense.surface_tiles import SurfaceTile
+from reconstruct.dense.view_store import ViewStore
 from tests.oracles_dense import FRAME
 
 
@@ -104,11 +107,17 @@ def test_cubes_grow_only_when_there_are_too_many():
 def test_the_overview_is_thinned_and_the_copc_is_not(tmp_path, monkeypatch):
     monkeypatch.setattr(cloud_module, "_MOST_OVERVIEW_POINTS", 1000)
     surface, offset = random_surface(), (1.0, 2.0, -12.0)
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    (scratch / "0_0_0.points").write_bytes(bytes(500))  # of a run that was interrupted
-    parts = np.array_split(surface, 5)
-    write_clouds(tmp_path, parts, len(surface), offset, FRAME, 0.05, scratch)
+    store = ViewStore(tmp_path / "scratch")
+    left = store.folder / "copc" / "0_0_0" / "0.points"  # of a run that was interrupted
+    left.parent.mkdir(parents=True)
+    left.write_bytes(bytes(500))
+    tiles = []
+    for number, part in enumerate(np.array_split(surface, 5)):
+        store.save(number, "surface", part)
+        tiles.append(
+            SurfaceTile(number=number, count=len(part), corners_enu=np.empty((8, 3)), bounds={})
+        )
+    write_clouds(tmp_path, store, tiles, offset, FRAME, 0.05, SERIAL)
     about = read_json(tmp_path / "cloud.json")
     assert about["thinned_to"] == 0.1
     assert about["points"] < 0.9 * len(surface)
@@ -116,4 +125,4 @@ def test_the_overview_is_thinned_and_the_copc_is_not(tmp_path, monkeypatch):
     found = np.sort(cloud.xyz - offset, axis=0)
     np.testing.assert_allclose(found, np.sort(surface["enu"], axis=0), atol=6e-5)
     np.testing.assert_array_equal(np.sort(cloud.red), np.sort(surface["colour"][:, 0] * 257.0))
-    assert not scratch.exists()
+    assert not left.parent.parent.exists()

@@ -62,3 +62,29 @@ def test_cells_that_no_view_sees_have_none_and_few_candidates_are_kept() -> None
     chosen = choose_views(number, share, np.zeros((*number.shape, 3), np.float32))
     assert chosen[2, 3] == -1
     assert (chosen >= 0).sum() == 41
+
+
+def test_seams_are_laid_up_to_views_that_are_settled() -> None:
+    """Energy over both halves of a grid, the second laid with or without regard to the first."""
+    gains = []
+    for seed in range(8):
+        number, share, colours = random_problem(seed, 12, 16, 3)
+        left, right = (slice(None), slice(0, 8)), (slice(None), slice(8, 16))
+        apart = np.full((12, 16), -1, np.int32)
+        for half in (left, right):
+            apart[half] = choose_views(number[half], share[half], colours[half])
+        settled = np.full((12, 16), -1, np.int32)
+        settled[left] = np.take_along_axis(number, np.maximum(apart, 0)[..., None], 2)[left][..., 0]
+        joined = choose_views(number, share, colours, settled)
+        np.testing.assert_array_equal(joined[left], apart[left])
+        before, after = (labels_energy(number, share, colours, one) for one in (apart, joined))
+        gains.append(before - after)
+    assert min(gains) > 0
+    assert np.mean(gains) > 5  # of some 150
+
+
+def test_a_settled_view_that_is_no_candidate_leaves_a_cell_free() -> None:
+    number, share, colours = random_problem(3, 5, 6, 2)
+    settled = np.full((5, 6), 77, np.int32)
+    free = choose_views(number, share, colours)
+    np.testing.assert_array_equal(choose_views(number, share, colours, settled), free)

@@ -52,7 +52,7 @@ def written(folder: Path, side_px: int) -> tuple[float, float]:
     grid = grid_of(side_px)
     names = [f"{n}.png" for n in range(PICTURES)]
     rough = folder / "rough.tif"
-    share = write_tiles(rough, folder / "source.tif", grid, FRAME, strip(grid), names)
+    share = write_tiles(rough, folder / "source.tif", grid, FRAME, strip(grid), names, 1)
     cloud_optimised(rough, folder / "mosaic.tif", 1)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
     status = Path("/proc/self/status").read_text()  # `getrusage` counts the parent's memory too
@@ -91,3 +91,14 @@ def test_a_strip_across_a_large_box_takes_little(side_px: int, tmp_path: Path):
         small = mosaic.read(out_shape=(4, count, count))  # from overviews
         np.testing.assert_array_equal(small[3] == 255, np.eye(count, dtype=bool))
         np.testing.assert_array_equal(np.diag(small[0]), 1 + np.arange(count) % 200)
+
+
+def test_threads_make_the_same_bytes(tmp_path: Path):
+    grid = grid_of(8 * TILE_PX)
+    names = [f"{n}.png" for n in range(PICTURES)]
+    files = []
+    for threads in (1, 4):
+        rough, source = (tmp_path / f"{name}_{threads}.tif" for name in ("rough", "source"))
+        write_tiles(rough, source, grid, FRAME, strip(grid), names, threads)
+        files.append((rough.read_bytes(), source.read_bytes()))
+    assert files[0] == files[1]
