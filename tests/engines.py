@@ -16,10 +16,14 @@ class PicklingThreads:
         self._threads = ThreadPoolExecutor(workers)
         self.executor = Executor(workers=workers, pool=self)
         self.tasks = 0
+        self.largest_task = 0
+        """Bytes of it."""
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":
         self.tasks += 1
-        return self._threads.submit(_run, pickle.dumps((function, args)))
+        task = pickle.dumps((function, args))
+        self.largest_task = max(self.largest_task, len(task))
+        return self._threads.submit(_run, task)
 
     def __enter__(self) -> Self:
         return self

@@ -72,6 +72,8 @@ class PagePaintTask:
 
     view: View | None
     """None for what no view sees, which has the colours of the cloud."""
+    factors: Float32 | None
+    """What evens its light; None without a view."""
     atlas: Atlas
     """Of these patches."""
     pixels: tuple[Array, ...]
@@ -129,8 +131,8 @@ def paint(
     for path, (width, height) in zip(scratch, atlas.sizes, strict=True):
         np.memmap(path, np.uint8, "w+", shape=(height, width, 3)).flush()
     placed = pixels * atlas.scale
-    tasks = _paint_tasks(atlas, wedges, charts, views, placed, corrections)
-    for _ in executor.map(partial(paint_view, workspace, light, scratch), tasks, label="paint"):
+    tasks = _paint_tasks(atlas, wedges, charts, views, light, placed, corrections)
+    for _ in executor.map(partial(paint_view, workspace, scratch), tasks, label="paint"):
         pass
     on_page = atlas.place(pixels, wedges.chart)
     pages, colours = [], np.zeros((len(vertices), 3))
@@ -198,10 +200,9 @@ def by_value(values: NDArray[np.integer], rows: NDArray[np.int64]) -> list[NDArr
     return groups if len(order) else []
 
 
-def even_colour(pictures: Pictures, view: View, light: LightModel, part: Part = WHOLE) -> Float32:
+def even_colour(pictures: Pictures, view: View, factors: Float32, part: Part = WHOLE) -> Float32:
     """A view's picture, or a part of it, under even light, (H, W, 3) BGR."""
     colour = pictures.colour(view.image, part)
-    factors = light.factors(view.camera, view.image)
     x, y = (
         ((np.arange(size)[along] + 0.5) / size * (nodes - 1)).astype(np.float32)
         for size, nodes, along in zip(
@@ -222,19 +223,18 @@ def _part_around(view: View, low: Array, high: Array, margin: int) -> Part:
     return slice(first[1], last[1]), slice(first[0], last[0])
 
 
-def seam_colours(workspace: Path, light: LightModel, task: tuple[View, Array]) -> Float32:
+def seam_colours(workspace: Path, task: tuple[View, Float32, Array]) -> Float32:
     """Mean colour around pixels (N, 2) of one view, (N, 3) BGR; NaN where nothing usable is near.
 
     Args:
         workspace: with the pictures.
-        light: of the survey.
-        task: the view and the pixels.
+        task: the view, what evens its light, and the pixels.
     """
-    view, pixels = task
+    view, factors, pixels = task
     pictures = Pictures.still(workspace)
     margin = math.ceil(5 * _SEAM_SIGMA_PX)
     part = _part_around(view, np.nanmin(pixels, axis=0), np.nanmax(pixels, axis=0), margin)
-    even = even_colour(pictures, view, light, part)
+    even = even_colour(pictures, view, factors, part)
     weight = pictures.valid(view.image, part).astype(np.float32)
     even *= weight[..., None]
     total = cv2.GaussianBlur(even, (0, 0), _SEAM_SIGMA_PX)
@@ -284,10 +284,11 @@ def _corrections(
     at_seam[seam_pairs(wedges)] = True
     at_seam &= label >= 0
     groups = by_value(label, np.flatnonzero(at_seam))
-    tasks = [(views[label[group[0]]], pixels[group]) for group in groups]
-    compare = partial(seam_colours, workspace, light)
+    seeing = [views[label[group[0]]] for group in groups]
+    tasks = [(view, light.factors(view.camera, view.image), pixels[group])
+             for view, group in zip(seeing, groups, strict=True)]  # fmt: skip
     colours = np.full((len(label), 3), np.nan)
-    found = executor.map(compare, tasks, label="compare seams")
+    found = executor.map(partial(seam_colours, workspace), tasks, label="compare seams")
     for group, colour in zip(groups, found, strict=True):
         colours[group] = colour
     return level_seams(wedges, colours, label >= 0)
@@ -345,6 +346,7 @@ def _paint_tasks(
     wedges: Wedges,
     charts: Charts,
     views: Sequence[View],
+    light: LightModel,
     placed: Array,
     corrections: Array,
 ) -> list[PagePaintTask]:
@@ -360,10 +362,12 @@ def _paint_tasks(
     shown = np.maximum(charts.views, -1)
     for mine in by_value(shown, np.flatnonzero(atlas.page >= 0)):
         number = int(shown[mine[0]])
+        view = views[number] if number >= 0 else None
         members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
             PagePaintTask(
-                view=views[number] if number >= 0 else None,
+                view=view,
+                factors=None if view is None else light.factors(view.camera, view.image),
                 atlas=replace(
                     atlas,
                     page=atlas.page[mine],
@@ -382,31 +386,28 @@ def _paint_tasks(
     return tasks
 
 
-def paint_view(
-    workspace: Path, light: LightModel, files: tuple[Path, ...], task: PagePaintTask
-) -> None:
+def paint_view(workspace: Path, files: tuple[Path, ...], task: PagePaintTask) -> None:
     """Write the patches of one view into the pages; no two views write to the same pixel.
 
     Args:
         workspace: with the pictures.
-        light: of the survey.
         files: of the pages.
         task: the patches.
     """
     atlas = task.atlas
-    pages = [
-        np.memmap(path, np.uint8, "r+", shape=(height, width, 3))
-        for path, (width, height) in zip(files, atlas.sizes, strict=True)
-    ]
+    pages = {
+        number: np.memmap(files[number], np.uint8, "r+", shape=(*atlas.sizes[number][::-1], 3))
+        for number in np.unique(atlas.page).tolist()
+    }
     picture = np.zeros((1, 1, 3), np.float32)
     valid = np.ones((1, 1), np.uint8)
     part = WHOLE
-    if task.view is not None:
+    if task.view is not None and task.factors is not None:
         pictures = Pictures.still(workspace)
         if atlas.scale == 1.0:
             ends = atlas.source.min(axis=0), (atlas.source + atlas.box).max(axis=0)
             part = _part_around(task.view, *ends, 0)
-        picture = even_colour(pictures, task.view, light, part)
+        picture = even_colour(pictures, task.view, task.factors, part)
         valid = pictures.valid(task.view.image, part).astype(np.uint8)
         if atlas.scale < 1.0:
             size = (
@@ -432,10 +433,10 @@ def paint_view(
         beyond = ~covered & ~usable
         patch[beyond] = patch[nearest][beyond]
         left, top = atlas.corner[i]
-        pages[atlas.page[i]][top : top + height, left : left + width] = np.clip(
+        pages[int(atlas.page[i])][top : top + height, left : left + width] = np.clip(
             np.rint(patch), 0, 255
         ).astype(np.uint8)
-    for page in pages:
+    for page in pages.values():
         page.flush()
 
 

@@ -24,6 +24,8 @@ _LONGEST_PX = 1800
 _LONGEST_IN = 9.0
 _TURN_DEG = 50.0
 """A track that turns by more than this between legs starts a new line."""
+_MOST_NAMED = 24
+"""Lines that the legend names one by one: a big survey has hundreds."""
 _LEAST_LINE = 3
 """Stations of a line; fewer lie in a turn."""
 _TWO_SIGMA = 2.0
@@ -56,18 +58,22 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
     places = np.stack([poses[name].translation for name in names])[:, :2]
     ellipses = _ellipses(track_csv.with_name("track_covariance.npz"), names, places)
     lines = split_lines(places)
+    count = int(lines.max()) + 1
     width_in, height_in = _size(extent)
     figure = new_figure(height_in, width_in)
     axes = figure.subplots()
     axes.imshow(picture, extent=extent, interpolation="bilinear")
     axes.plot(places[:, 1], places[:, 0], color="white", linewidth=0.6, alpha=0.7, zorder=2)
-    for number in range(lines.max() + 1):
+    for number in range(count):
         on = lines == number
         colour = _COLOURS[number % len(_COLOURS)]
+        label = f"line {number + 1}: {int(on.sum())} stations"
+        if count > _MOST_NAMED:
+            label = "_" if number else f"{count} lines of {int((lines >= 0).sum())} stations"
         axes.plot(
             places[on, 1], places[on, 0], "o-", color=colour, markersize=3.5, linewidth=1.2,
             markeredgecolor="black", markeredgewidth=0.4, zorder=4,
-            label=f"line {number + 1}: {int(on.sum())} stations",
+            label=label,
         )  # fmt: skip
     turning = lines < 0
     if turning.any():

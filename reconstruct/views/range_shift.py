@@ -11,6 +11,7 @@ map can be inverted as long as the field changes slowly: `RangeShift.contraction
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -77,13 +78,11 @@ class RangeShift:
         return found
 
     def scaled(self, sx: float, sy: float) -> "RangeShift":
-        """The same field for a picture that is made smaller by a factor along x and y."""
-        return replace(
-            self,
-            nodes=self.nodes * [sx, sy],
-            width_px=self.width_px * sx,
-            height_px=self.height_px * sy,
-        )
+        """The same field for a picture that is made smaller by a factor along x and y.
+
+        Views that share a field share the smaller one, in memory and in what goes to processes.
+        """
+        return _scaled(self, sx, sy)
 
     @property
     def field(self) -> Nodes:
@@ -94,6 +93,16 @@ class RangeShift:
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         per_depth = 1.0 / np.broadcast_to(np.asarray(depth, dtype=np.float64), len(pixels))
         return _move(self.field, self.inverse_working, pixels, per_depth, inverse)
+
+
+@lru_cache(maxsize=16)
+def _scaled(shift: RangeShift, sx: float, sy: float) -> RangeShift:
+    return replace(
+        shift,
+        nodes=shift.nodes * [sx, sy],
+        width_px=shift.width_px * sx,
+        height_px=shift.height_px * sy,
+    )
 
 
 def as_nodes(values: NDArray[np.float64], width_px: float, height_px: float) -> Nodes:

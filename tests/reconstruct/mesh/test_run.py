@@ -17,6 +17,7 @@ from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.surface import splat
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of
+from tests.engines import PicklingThreads
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,
@@ -65,6 +66,18 @@ def write_dense(folder: Path, images: list[str]) -> None:
     )
     write_light(dense / "light.json", light)
     write_json(dense / "stage.json", {})
+
+
+def test_tasks_do_not_grow_with_the_survey(tmp_path: Path):
+    views = stereo_views(np.array([-0.2, 0.2]), np.array([0.0, 0.05]))
+    write_workspace(tmp_path, sparse_model(views, SCENE), SCENE)
+    others = [f"left/other_{n:05d}.png" for n in range(5000)]
+    write_dense(tmp_path, [*(view.image for view in views), *others])
+    settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=1.0, mesh_page_px=512))
+    with PicklingThreads(2) as engine:
+        assert spec("mesh").make(tmp_path, settings, engine.executor)
+    assert engine.tasks > 10
+    assert engine.largest_task < 500_000  # those of 5,000 pictures take more than a megabyte
 
 
 @pytest.fixture(scope="module")

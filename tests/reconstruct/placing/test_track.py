@@ -253,14 +253,19 @@ def test_lines_end_where_the_track_turns() -> None:
     assert split_lines(straight).tolist() == [0] * 9
 
 
-def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> None:
+def write_green(path: Path) -> None:
+    """A mosaic of one colour."""
     grid = DemGrid(west=-6.0, north=6.0, cell=0.02, columns=600, rows=600)
     profile = {
         "driver": "GTiff", "width": 600, "height": 600, "count": 3, "dtype": "uint8",
         "crs": crs_of(FRAME), "transform": transform_of(grid),
     }  # fmt: skip
-    with rasterio.open(tmp_path / "mosaic.tif", "w", **profile) as raster:
+    with rasterio.open(path, "w", **profile) as raster:
         raster.write(np.full((3, 600, 600), [[[40]], [[120]], [[60]]], np.uint8))
+
+
+def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> None:
+    write_green(tmp_path / "mosaic.tif")
     track = rows()
     covariances = np.stack([np.diag([0.25, 0.04, 0.01, 0, 0, 0])] * 3)
     write_track_csv(tmp_path / "track.csv", track, FRAME, track_sigmas(track, covariances))
@@ -278,3 +283,26 @@ def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> N
     assert figures[0].shape != figures[1].shape or (figures[0] != figures[1]).any()  # ellipses
     with pytest.raises(WorkspaceError):
         plot_track_over(tmp_path / "none.tif", tmp_path / "track.csv", tmp_path / "t.png")
+
+
+def test_the_figure_of_a_track_of_many_lines_is_a_map_not_a_legend(tmp_path: Path) -> None:
+    write_green(tmp_path / "mosaic.tif")
+    first = rows()[0]
+    track = [
+        replace(
+            first,
+            image=f"left/{line:03d}{place}.png",
+            station=4 * line + place,
+            time_s=float(4 * line + place),
+            world_from_cam=RigidTransform.from_components(
+                [-5.5 + 11.0 * line / 200, (place if line % 2 == 0 else 3 - place) - 1.5, 10.0],
+                first.world_from_cam.rotation,
+            ),
+        )
+        for line in range(200)
+        for place in range(4)
+    ]
+    write_track_csv(tmp_path / "track.csv", track, FRAME, track_sigmas(track, None))
+    plot_track_over(tmp_path / "mosaic.tif", tmp_path / "track.csv", tmp_path / "t.png")
+    high, wide = cv2.imread(str(tmp_path / "t.png")).shape[:2]
+    assert 0.5 * wide < high < wide

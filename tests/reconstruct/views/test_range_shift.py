@@ -1,5 +1,6 @@
 """The shift with distance that a warp to one pinhole leaves."""
 
+import pickle
 from dataclasses import replace
 from functools import cache
 
@@ -15,7 +16,7 @@ from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort
 from camera_calib.rig import design_rig
-from reconstruct.views.model import View
+from reconstruct.views.model import View, scaled_view
 from reconstruct.views.range_shift import (
     RangeShift,
     no_shift,
@@ -158,3 +159,20 @@ def test_from_a_contraction_of_one_two_pixels_show_one_spot() -> None:
     assert near == pytest.approx(1.0)
     shown = shift.ideal(np.array([[350.0, 300.0], [450.0, 300.0]]), 1.2)
     np.testing.assert_allclose(shown[0], shown[1], atol=1e-6)
+
+
+def test_views_of_one_camera_in_shrunk_pictures_share_their_field() -> None:
+    warp = warp_of(0.02, 0.0)
+    shift = range_shift(warp)
+    views = [
+        View(
+            image=f"{n}.png", camera="left", station=n, pinhole=warp.pinhole,
+            world_from_cam=RigidTransform.identity(), shift=shift,
+        )
+        for n in range(8)
+    ]  # fmt: skip
+    shrunk = [scaled_view(view, 0.5) for view in views]
+    assert shrunk[0].shift.nodes.nbytes > 100_000
+    assert len(pickle.dumps(shrunk)) < 1.2 * len(pickle.dumps(shrunk[:1]))
+    other = scaled_view(replace(views[0], shift=replace(shift, nodes=2.0 * shift.nodes)), 0.5)
+    np.testing.assert_allclose(other.shift.nodes, 2.0 * shrunk[0].shift.nodes)
