@@ -171,6 +171,7 @@ PARTS = (
         arguments=lambda _, work: ("--work", str(work)),
         long=True,
     ),
+    Part(name="refine-gpu", module="refine_gpu", packages=("numba_cuda",)),
     Part(
         name="reconstruct-peers",
         module="reconstruct",

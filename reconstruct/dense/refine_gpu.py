@@ -7,6 +7,7 @@ neighbours spline (4 n) and validity (1). With six neighbours of 9.2 megapixels 
 besides the few hundred MB that CUDA takes for each process.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -23,6 +24,9 @@ from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, 
 
 _BLOCK = (32, 8)
 """Threads along a row, and rows: a warp reads neighbouring pixels."""
+_PROCESS_BYTES = 3 << 29
+"""Of the GPU, for a process and for the context of another that waits."""
+_MOST_AT_ONCE = 64
 _REACH_SIGMAS = 4
 """OpenCV cuts the Gaussian of 32-bit pictures off there."""
 
@@ -34,12 +38,13 @@ def refine_on_gpu(
     others: Sequence[ComparedView],
     spare: Sequence[ComparedView] = (),
 ) -> RefinedDepth:
-    """As `refine`, one process of a user at a time; on the processor where memory does not suffice.
+    """As `refine`, by as many processes of a user at a time as the GPU has memory for.
 
-    Depths differ from those of the processor by rounding.
+    Where memory does not suffice after all, the processor does it. Depths differ from those of the
+    processor by rounding.
     """
     try:
-        with user_lock("gpu"):
+        with user_lock(f"gpu-{os.getpid() % places()}"):
             return refine(reference, depth, sigma, others, spare, _Gpu())
     except CudaAPIError as error:
         if "OUT_OF_MEMORY" not in str(error):
@@ -49,6 +54,12 @@ def refine_on_gpu(
         "fewer --threads or a smaller dense_scale take less"
     )
     return refine(reference, depth, sigma, others, spare)
+
+
+def places() -> int:
+    """Processes that work on the GPU at the same time: one alone leaves it idle for most of it."""
+    _, total = cuda.current_context().get_memory_info()
+    return int(max(1, min(total / _PROCESS_BYTES, _MOST_AT_ONCE)))
 
 
 class _Gpu:
