@@ -81,7 +81,13 @@ def run(
     imported = is_imported(workspace)
     simulated = all(spec(stage).simulated for stage in stages)
     config = settings(workspace, survey, needed=not imported, simulated=simulated)
+    as_written = config
     planned = config = changed(config, "imaging", scale=scale)
+    if planned.imaging.scale != as_written.imaging.scale:
+        warn(
+            f"--scale {scale} holds for this run alone, the next without it renders the pictures "
+            f"again: to keep it, put scale = {scale} below [imaging] in survey.toml"
+        )
     if flight is not None and flight != FlightChanges():
         config = flight.applied(config)
         warn("these options hold for this flight alone: to keep them, put them into survey.toml")

@@ -229,6 +229,20 @@ def test_planes_of_the_command_line_hold_for_one_run(
     assert "hold for this run" not in capsys.readouterr().err
 
 
+def test_a_scale_of_the_command_line_holds_for_one_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = init_survey(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["alice-survey", "image", "-w", str(tmp_path), "--scale", "4"])
+    with pytest.raises(SystemExit):
+        main()  # there is no flight
+    assert "put scale = 4 below [imaging]" in capsys.readouterr().err
+    path.write_text(re.sub("^scale = 1 ", "scale = 4 ", path.read_text(), flags=re.MULTILINE))
+    with pytest.raises(SystemExit):
+        main()
+    assert "holds for this run" not in capsys.readouterr().err
+
+
 def test_status_names_the_next_command(tmp_path: Path) -> None:
     init_survey(tmp_path)
     shown = CliRunner().invoke(app, ["status", "-w", str(tmp_path), "--json"])
