@@ -124,7 +124,7 @@ def write_copc(
     for part in parts:
         for key in part.cubes:
             names.setdefault(key, []).append(part.name)
-    grid = _Grid.over(names, spool.bits)
+    grid = _OctreeGrid.over(names, spool.bits)
     packing = _Packing.of(header)
     tasks = [(key, tuple(names[key])) for key in grid.in_order(names)]
     found = executor.map(
@@ -200,7 +200,7 @@ class _Cube:
 
 
 def _make_cube(
-    spool: PointSpool, grid: "_Grid", packing: _Packing, task: tuple[Key, tuple[str, ...]]
+    spool: PointSpool, grid: "_OctreeGrid", packing: _Packing, task: tuple[Key, tuple[str, ...]]
 ) -> _Cube:
     """Make all nodes below that of a cube."""
     key, names = task
@@ -268,7 +268,7 @@ def _write(file: BinaryIO, header: "laspy.LasHeader", nodes: "_Nodes") -> None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Grid:
+class _OctreeGrid:
     """Where nodes lie: the root is over all cubes."""
 
     first: NDArray[np.int64]
@@ -278,7 +278,7 @@ class _Grid:
     cube_bits: int
 
     @classmethod
-    def over(cls, cubes: Iterable[Key], bits: int) -> "_Grid":
+    def over(cls, cubes: Iterable[Key], bits: int) -> "_OctreeGrid":
         """Over cubes whose edges are 2**bits steps."""
         keys = np.array(sorted(cubes))
         first = keys.min(axis=0)
@@ -353,7 +353,7 @@ class _Nodes:
         self,
         file: BinaryIO,
         header: "laspy.LasHeader",
-        grid: _Grid,
+        grid: _OctreeGrid,
         packing: _Packing,
         there: Collection[Key],
         cubes: Iterator[_Cube],

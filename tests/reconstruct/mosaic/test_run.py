@@ -283,8 +283,8 @@ def test_labels_beyond_65535_stay_apart(
         return [replace(entry, number=entry.number + before) for entry in views_of(*arguments)]
 
     def write_all(*arguments):
-        *others, names = arguments
-        return write(*others, [*map(str, range(before)), *names])
+        *others, names, threads = arguments
+        return write(*others, [*map(str, range(before)), *names], threads)
 
     monkeypatch.setattr(run, "_seen_views", later_views)
     monkeypatch.setattr(run, "write_tiles", write_all)
