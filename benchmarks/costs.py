@@ -58,7 +58,9 @@ _COMPUTING: dict[str, Sequence[str]] = {
     "mesh": ("once", "pictures", "taken_mpx", "cells"),
 }  # fmt: skip
 """What may drive the computing of a stage."""
-_PROCESS = ("once",)
+_PROCESS = dict.fromkeys(PREDICTED, ("once",)) | dict.fromkeys(
+    ("mapping", "placing"), ("once", "kilofeatures")
+)
 _WORKER = dict.fromkeys(PREDICTED, ("once", "picture_mpx")) | {
     "dense": ("once", "refined_picture_mpx")
 }
@@ -289,7 +291,7 @@ def _of_stage(
     for key, value in matched.items():
         tasks_s[key] = tasks_s.get(key, 0.0) + value
     memory_rows = [
-        {f"process {key}": run.size.drivers[key] for key in _PROCESS}
+        {f"process {key}": run.size.drivers[key] for key in _PROCESS[name]}
         | {
             f"worker {key}": min(run.workers, run.size.pictures) * run.size.drivers[key]
             for key in _WORKER[name]
