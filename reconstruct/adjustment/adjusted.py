@@ -24,7 +24,7 @@ from reconstruct.adjustment.uncertainty import Uncertainty, estimate
 from reconstruct.mapping.arrays import frames_of, observed, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.views.model_files import colmap_pinhole, keypoints_of, rigid3d
+from reconstruct.views.model_files import colmap_pinhole, rigid3d, stored_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,7 +168,7 @@ def taken_pixels(
         records: pictures.
         warps: by camera.
     """
-    seen, stored = observed(model), keypoints_of(model)
+    seen, stored = observed(model), stored_of(model).keypoints
     found = [np.zeros((0, 2))] * len(records)
     for number, rows in sorted(stored.items()):
         warp = warps[records[number - 1].camera]

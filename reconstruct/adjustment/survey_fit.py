@@ -48,11 +48,17 @@ from reconstruct.mapping.arrays import (
     frames_of,
     linked_groups,
 )
-from reconstruct.mapping.bundle import move_points
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import Keypoints
-from reconstruct.mapping.robust import cauchy_cost, cauchy_weights, sigma_of, variance_of
+from reconstruct.mapping.robust import (
+    cauchy_cost,
+    cauchy_weights,
+    loss_scale,
+    sigma_of,
+    variance_of,
+)
+from reconstruct.mapping.spread_points import move_points
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
 
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
@@ -431,7 +437,7 @@ def on_pinholes(
     keypoints = Keypoints(found, seen)
     if len(fit.point_ids) < len(model.points3D):  # the others lie where the old rig had them
         keypoints.correct(model, 1.0)
-        move_points(model, fit.sigma_px)
+        move_points(model, loss_scale(fit.sigma_px))
     keypoints.correct(model, 1.0)
     model.update_point_3d_errors()
     return found

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
-from reconstruct.views.model_files import keypoints_of
+from reconstruct.views.model_files import stored_of
 
 Indices = NDArray[np.int64]
 LEAST_POINTS = 4
@@ -131,15 +131,13 @@ def observed(model: pycolmap.Reconstruction) -> Observed:
     """The observations of a model as it is now."""
     poses = {n: i.cam_from_world().matrix() for n, i in model.images.items() if i.has_pose}
     pictures = np.array(sorted(poses), dtype=np.int64)
-    stored = keypoints_of(model)
-    xyz = dict(model.points3D.items())
-    ids = np.array(sorted(xyz), dtype=np.int64)
-    points = np.array([xyz[i].xyz for i in ids.tolist()]).reshape(-1, 3)
+    stored = stored_of(model)
+    ids, points = stored.point_ids, stored.points
     # One of no length first, for a model without pictures.
     keypoint, pixels, point = [np.zeros(0, np.int64)], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
     local, starts = [np.zeros((0, 3))], [0]
     for number in pictures.tolist():
-        rows = stored[number]
+        rows = stored.keypoints[number]
         at = np.flatnonzero(rows["point"] >= 0)
         mine = np.searchsorted(ids, rows["point"][at]).astype(np.int64)
         keypoint.append(at)

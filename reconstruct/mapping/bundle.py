@@ -52,16 +52,3 @@ def all_pictures(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentCon
         if image.has_pose:
             config.add_image(number)
     return config
-
-
-def move_points(model: pycolmap.Reconstruction, sigma_px: float) -> None:
-    """Put points, in place, where the keypoints have them: poses, rig and cameras are held.
-
-    Args:
-        model: to change.
-        sigma_px: of keypoints.
-    """
-    config = all_pictures(model)
-    for frame in sorted(model.reg_frame_ids()):
-        config.set_constant_rig_from_world_pose(frame)
-    pycolmap.create_default_bundle_adjuster(held_options(sigma_px), config, model).solve()

@@ -28,6 +28,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.mapping.bundle import all_pictures, direct_solver
 from reconstruct.mapping.database import Observations, station_frames
+from reconstruct.mapping.spread_points import move_points, spread_part, take_poses
 from reconstruct.mapping.stations import StationLink, link_stations
 from reconstruct.views.model_files import as_transform, rigid3d
 
@@ -131,7 +132,8 @@ def adjust(
     """Adjust a whole model of a rig in place; nothing but the rig sets its scale.
 
     COLMAP's mappers hold two cameras of different frames where they are: with a rig that holds a
-    length as well, which then stays as it was (0.5 % off on a 24-station scene).
+    length as well, which then stays as it was (0.5 % off on a 24-station scene). Where cameras are
+    held, points that are spread over the pictures adjust the poses, and all points follow.
 
     Args:
         model: with registered frames and points.
@@ -139,6 +141,9 @@ def adjust(
         tolerance: relative decrease of the cost below which it ends.
         robust_px: scale of a Cauchy loss; None: plain least squares.
     """
+    refines = options.ba_refine_focal_length or options.ba_refine_extra_params
+    part = None if refines else spread_part(model)
+    whole, model = model, model if part is None else part
     config = all_pictures(model)
     config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
     adjustment = direct_solver(options.get_global_bundle_adjustment())
@@ -150,6 +155,9 @@ def adjust(
     if robust_px is None:  # near its end: full Gauss-Newton steps, since weak directions are many
         solver.initial_trust_region_radius = _NO_BOUND
     pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
+    if part is not None:
+        take_poses(whole, part)
+        move_points(whole, robust_px)
 
 
 def _triangulated(

@@ -24,7 +24,8 @@ from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_group
 from reconstruct.mapping.bundle import FULLY, ROUGHLY, all_pictures, held_options
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.robust import pixel_sigma
+from reconstruct.mapping.robust import loss_scale, pixel_sigma
+from reconstruct.mapping.spread_points import move_points, spread_part, take_poses
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""
@@ -206,8 +207,8 @@ def refract(
         if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
             settled = True
             break
-        tolerance = FULLY if settle else ROUGHLY
-        mapped = adjust_freely(replace(mapped, model=model, notes=notes), tolerance)
+        rough = replace(mapped, model=model, notes=notes)
+        mapped = adjust_freely(rough, FULLY) if settle else adjust_roughly(rough)
         model = pycolmap.Reconstruction(mapped.model)
         if len(moves) == 1:
             removed, added = judge(model, scale)
@@ -250,17 +251,38 @@ def adjust_freely(mapped: Mapped, tolerance: float | None = None) -> Mapped:
         count = sum(image.num_points3D for image in mapped.model.images.values())
         tolerance = _LAST_STEP_SIGMAS**2 / (2.0 * max(count, 1))
     model = pycolmap.Reconstruction(mapped.model)
+    _solve(model, pixel_sigma(model), tolerance, on_rig=bool(np.isfinite(mapped.baseline)))
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)
+
+
+def adjust_roughly(mapped: Mapped) -> Mapped:
+    """Adjust all poses on a rig by points that are spread over the pictures; all points follow.
+
+    Near enough for an adjustment on exact rays.
+    """
+    model = pycolmap.Reconstruction(mapped.model)
+    part, sigma_px = spread_part(model), pixel_sigma(model)
+    _solve(model if part is None else part, sigma_px, ROUGHLY, on_rig=True)
+    if part is not None:
+        take_poses(model, part)
+        move_points(model, loss_scale(sigma_px))
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)
+
+
+def _solve(
+    model: pycolmap.Reconstruction, sigma_px: float, tolerance: float, *, on_rig: bool
+) -> None:
+    """Adjust poses and points in place."""
     config = all_pictures(model)
-    if np.isfinite(mapped.baseline):
+    if on_rig:
         for frame in frames_of(model)[first_of(model_groups(model))].tolist():
             config.set_constant_rig_from_world_pose(frame)
     else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(
-        held_options(pixel_sigma(model), tolerance), config, model
-    ).solve()
-    model.update_point_3d_errors()
-    return replace(mapped, model=model)
+    options = held_options(sigma_px, tolerance)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def _pinholes(

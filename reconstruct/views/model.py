@@ -173,7 +173,7 @@ def read_model(sparse: str | Path) -> SparseModel:
 
 
 def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
-    from reconstruct.views.model_files import as_transform, keypoints_of
+    from reconstruct.views.model_files import as_transform, stored_of
 
     warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
     # Without lengths in metres a port's shift is not known.
@@ -197,16 +197,15 @@ def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
                 shift=shifts[record.camera],
             )
         )
-    ids = np.array(sorted(model.points3D), dtype=np.int64)
-    keypoints = keypoints_of(model)
-    seen = [kept[kept >= 0] for kept in (keypoints[i.image_id]["point"] for i in images)]
-    points = np.searchsorted(ids, np.concatenate([ids[:0], *seen]))
+    kept = stored_of(model)
+    seen = [at[at >= 0] for at in (kept.keypoints[i.image_id]["point"] for i in images)]
+    points = np.searchsorted(kept.point_ids, np.concatenate([kept.point_ids[:0], *seen]))
     numbers = np.repeat(np.arange(len(seen)), [len(one) for one in seen])
     order = np.lexsort((numbers, points))
     return SparseModel(
         frame=frame,
         views=tuple(views),
-        points_world=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
+        points_world=kept.points,
         observations=np.column_stack([points[order], numbers[order]]),
     )
 

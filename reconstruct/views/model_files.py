@@ -9,7 +9,8 @@ on reading what is not there. The layout is that of COLMAP 4 (scene/reconstructi
 import errno
 import struct
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import Pinhole
 
 _PARAMS = {
@@ -29,6 +32,9 @@ _PARAMS = {
 KEYPOINT = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
 """Place of a keypoint, and the id of its point: -1 where it has none."""
 _SENSOR, _POSE = struct.calcsize("<iI"), 7 * 8
+_NO_ROOM = "no room for a temporary copy of the model"
+_POINT_HEAD, _TRACK_LENGTH = 32, 43
+"""Bytes of a point's id and place, and where the length of its track is."""
 
 
 def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
@@ -73,17 +79,69 @@ def as_transform(pose: Any) -> RigidTransform:
     )
 
 
-def keypoints_of(model: pycolmap.Reconstruction) -> dict[int, NDArray[np.void]]:
-    """The keypoints of every registered picture by its id, (N,) of `KEYPOINT`.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredModel:
+    """What COLMAP keeps of a model, as arrays."""
 
-    They travel through COLMAP's own file: one by one it takes eight times as long.
+    keypoints: Mapping[int, NDArray[np.void]]
+    """Of every registered picture by its id, (N,) of `KEYPOINT`."""
+    point_ids: NDArray[np.int64]
+    """(P,) ids of the points, ascending."""
+    points: Array
+    """(P, 3) where they are."""
+
+
+def stored_of(model: pycolmap.Reconstruction) -> StoredModel:
+    """Keypoints and points of a model.
+
+    They travel through COLMAP's own files: one by one it takes eight times as long.
 
     Raises:
-        OSError: there is no room for the file.
+        OSError: there is no room for the files.
     """
     with tempfile.TemporaryDirectory() as folder:
         model.write_binary(folder)
-        return dict(_all_keypoints(Path(folder) / "images.bin"))
+        point_ids, points = _all_points(Path(folder) / "points3D.bin")
+        return StoredModel(
+            keypoints=dict(_all_keypoints(Path(folder) / "images.bin")),
+            point_ids=point_ids,
+            points=points,
+        )
+
+
+def _all_points(path: Path) -> tuple[NDArray[np.int64], Array]:
+    content = np.fromfile(path, np.uint8)
+    starts, end = _point_starts(content)
+    if end != len(content):
+        raise OSError(errno.ENOSPC, _NO_ROOM, path)
+    head = content[starts[:, None] + np.arange(_POINT_HEAD)]
+    numbers = head[:, :8].copy().view("<i8")[:, 0]
+    order = np.argsort(numbers)
+    return numbers[order], head[order, 8:].copy().view("<f8")
+
+
+@compiled
+def _point_starts(content: NDArray[np.uint8]) -> tuple[NDArray[np.int64], int]:
+    """(P,) where the entries of `points3D.bin` start, and where they end; -1 if it is too short."""
+    size, least = content.shape[0], _TRACK_LENGTH + 8
+    if size < 8:
+        return np.empty(0, np.int64), -1
+    count = np.int64(0)
+    for k in range(8):
+        count |= np.int64(content[k]) << (8 * k)
+    if count < 0 or count > size // least:
+        return np.empty(0, np.int64), -1
+    starts = np.empty(count, np.int64)
+    at = 8
+    for i in range(count):
+        if at + least > size:
+            return starts[:i], -1
+        starts[i] = at
+        track = np.int64(0)
+        for k in range(4):  # a longer one has no room in a file either
+            track |= np.int64(content[at + _TRACK_LENGTH + k]) << (8 * k)
+        at += least + 8 * track
+    return starts, at
 
 
 def _all_keypoints(path: Path) -> Iterator[tuple[int, NDArray[np.void]]]:
@@ -97,7 +155,7 @@ def _all_keypoints(path: Path) -> Iterator[tuple[int, NDArray[np.void]]]:
             yield number, np.frombuffer(content, KEYPOINT, count, first)
             at = first + KEYPOINT.itemsize * count
     except (struct.error, ValueError):
-        raise OSError(errno.ENOSPC, "no room for a temporary copy of the model", path) from None
+        raise OSError(errno.ENOSPC, _NO_ROOM, path) from None
 
 
 def _check(path: Path, length: Callable[[bytes, int], int]) -> None:
@@ -138,8 +196,8 @@ def _keypoints(content: bytes, at: int) -> tuple[int, int]:
 
 
 def _point(content: bytes, at: int) -> int:
-    (track,) = struct.unpack_from("<Q", content, at + 43)
-    return int(51 + 8 * track)
+    (track,) = struct.unpack_from("<Q", content, at + _TRACK_LENGTH)
+    return int(_TRACK_LENGTH + 8 + 8 * track)
 
 
 def _rig(content: bytes, at: int) -> int:

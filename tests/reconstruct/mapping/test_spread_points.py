@@ -1,0 +1,109 @@
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.optimize import minimize
+
+from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.refraction import adjust_freely, adjust_roughly
+from reconstruct.mapping.spread_points import move_points, spread_part
+from reconstruct.placing.alignment import align_rigid
+from tests.reconstruct.scenes import Scene, make_scene
+from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+
+ROBUST_PX = 0.5
+
+
+def dense_block(points: int, noise_px: float, error: tuple[float, float]) -> tuple[Scene, Mapped]:
+    scene = make_scene(lines=2, stations=6, points=points, noise_px=noise_px)
+    return scene, near_truth(scene, *warped_scene(scene), np.random.default_rng(3), error)
+
+
+def camera_rms_m(mapped: Mapped, scene: Scene) -> float:
+    found = pupils_and_points(mapped, scene)[0]
+    true = np.array([pose.translation for pose in scene.ned_from_cam])
+    at = align_rigid(found, true).apply(found)
+    return float(np.sqrt(((at - true) ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("robust_px", [None, ROBUST_PX])
+def test_points_move_to_the_minimum_of_their_own_errors(robust_px: float | None) -> None:
+    """Against a general minimiser, with one keypoint in fifty far off."""
+    _, mapped = dense_block(400, 0.3, (1e-3, 0.0))
+    model, rng = pycolmap.Reconstruction(mapped.model), np.random.default_rng(7)
+    for image in model.images.values():
+        for keypoint in image.points2D:
+            if rng.random() < 0.02:
+                keypoint.xy = keypoint.xy + rng.normal(0, 20.0, 2)
+    for point in model.points3D.values():
+        point.xyz = point.xyz + rng.normal(0, 0.03, 3)
+    before = pycolmap.Reconstruction(model)
+
+    move_points(model, robust_px)
+
+    seen = observed(before)
+    for k in range(0, len(seen.point_ids), 23):
+        rows = np.flatnonzero(seen.point == k)
+        images = [before.images[int(seen.pictures[seen.starts[1:].searchsorted(r, "right")])]
+                  for r in rows]  # fmt: skip
+
+        def cost(xyz: np.ndarray, rows=rows, images=images) -> float:
+            squares = np.array([
+                ((image.project_point(xyz) - seen.pixels[r]) ** 2).sum()
+                for image, r in zip(images, rows, strict=True)
+            ])  # fmt: skip
+            if robust_px is not None:
+                squares = robust_px**2 * np.log1p(squares / robust_px**2)
+            return float(squares.sum())
+
+        number = int(seen.point_ids[k])
+        found = model.points3D[number].xyz
+        best = minimize(cost, found, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9})
+        assert cost(found) < cost(before.points3D[number].xyz)
+        assert cost(found) <= best.fun * (1 + 1e-6) + 1e-9
+        assert found == pytest.approx(best.x, abs=2e-5)
+
+
+def test_a_part_keeps_what_every_cell_wants() -> None:
+    _, mapped = dense_block(50000, 0.0, (0.0, 0.0))
+    whole, part = mapped.model, spread_part(mapped.model)
+    assert part is not None
+    assert whole.num_points3D() == mapped.model.num_points3D()  # it stays as it was
+    assert part.compute_num_observations() < 0.5 * whole.compute_num_observations()
+    for number, image in whole.images.items():
+        counts = []
+        for model in (whole, part):
+            here = model.images[number]
+            xy = np.array([k.xy for k in here.points2D if k.has_point3D()]).reshape(-1, 2)
+            counts.append(
+                np.histogram2d(
+                    *xy.T, bins=8, range=((0, image.camera.width), (0, image.camera.height))
+                )[0]
+            )
+        every, kept = counts
+        assert np.all(kept >= np.minimum(every, 12))
+    tracks = [
+        np.mean([point.track.length() for point in model.points3D.values()])
+        for model in (whole, part)
+    ]
+    assert tracks[1] > tracks[0]
+
+
+def test_a_model_of_few_points_is_not_thinned() -> None:
+    _, mapped = dense_block(800, 0.0, (0.0, 0.0))
+    assert spread_part(mapped.model) is None
+
+
+def test_poses_from_some_of_the_points_are_nearly_as_good() -> None:
+    scene, start = dense_block(50000, 0.3, (2e-3, 5e-3))
+    rough, full = adjust_roughly(start), adjust_freely(start, 1e-4)
+    assert spread_part(start.model) is not None
+    best, found = camera_rms_m(full, scene), camera_rms_m(rough, scene)
+    assert camera_rms_m(start, scene) > 10 * best
+    assert found < 3 * best
+    again = adjust_freely(replace(rough, model=rough.model), 1e-4)
+    assert camera_rms_m(again, scene) == pytest.approx(best, rel=0.1)
+    errors = [np.mean([p.error for p in m.model.points3D.values()]) for m in (rough, full)]
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
