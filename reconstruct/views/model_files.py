@@ -131,8 +131,7 @@ def _point_starts(content: NDArray[np.uint8]) -> tuple[NDArray[np.int64], int]:
         count |= np.int64(content[k]) << (8 * k)
     if count < 0 or count > size // least:
         return np.empty(0, np.int64), -1
-    starts = np.empty(count, np.int64)
-    at = 8
+    starts, at = np.empty(count, np.int64), np.int64(8)
     for i in range(count):
         if at + least > size:
             return starts[:i], -1
@@ -141,7 +140,7 @@ def _point_starts(content: NDArray[np.uint8]) -> tuple[NDArray[np.int64], int]:
         for k in range(4):  # a longer one has no room in a file either
             track |= np.int64(content[at + _TRACK_LENGTH + k]) << (8 * k)
         at += least + 8 * track
-    return starts, at
+    return starts, int(at)
 
 
 def _all_keypoints(path: Path) -> Iterator[tuple[int, NDArray[np.void]]]:
