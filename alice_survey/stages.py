@@ -21,6 +21,7 @@ from alice_survey.base.config import Config, SurveyConfig
 from alice_survey.base.errors import AliceError, WorkspaceError
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
+from alice_survey.kit.words import share
 
 Summary = tuple[str, dict[str, Any]]
 """Result of a stage: a line of text, and JSON values."""
@@ -263,9 +264,9 @@ def _plan_summary(folder: Path) -> Summary:
         f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
         f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
         f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
-        f"{plan['side_overlap']:.0%} side, {plan['coverage']:.1%} covered as requested; a picture "
-        f"every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map in "
-        f"{folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
+        f"{plan['side_overlap']:.0%} side, {share(plan['coverage'])} covered as requested; "
+        f"a picture every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map "
+        f"in {folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
     )
     return text, plan
 
@@ -280,8 +281,8 @@ def _fly_summary(folder: Path) -> Summary:
         f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
         f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
-        f"{flight.coverage.share_at_overlap:.1%} of the area covered as requested, "
-        f"{flight.coverage.every_camera_share:.1%} seen by every camera; "
+        f"{share(flight.coverage.share_at_overlap)} of the area covered as requested, "
+        f"{share(flight.coverage.every_camera_share)} seen by every camera; "
         f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
     )
     return text, flight.to_json()

@@ -125,7 +125,7 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
             assert seen[name] == whole[name], name
 
 
-KILLS = 50
+KILLS = 24
 
 
 def wait_for(
@@ -145,8 +145,8 @@ def wait_for(
     return None
 
 
-def test_killed_fifty_times_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
-    """At random times in every stage, four or five times in each."""
+def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
+    """At random times in every stage, two or three times in each."""
     workspace = settings_in(tmp_path / "killed")
     events = workspace.with_suffix(".jsonl")
     took_s = {
@@ -171,7 +171,7 @@ def test_killed_fifty_times_it_ends_the_same(undisturbed: Path, tmp_path: Path) 
         run.wait()
         if ended and not ended.get("resumed"):  # where kernels had to be compiled it took longer
             took_s[stage] = min(took_s[stage], ended["took_s"])
-    assert min(killed.values()) >= 4
+    assert min(killed.values()) >= 2
     assert whole_before_kill < KILLS / 2  # most fell into the work of their stage
     assert start(workspace, threads=1).wait() == 0
     assert not list(workspace.glob("*.partial"))
@@ -238,7 +238,10 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
 
 
 def test_more_threads_give_the_same_numbers(undisturbed: Path, tmp_path: Path) -> None:
-    workspace = settings_in(tmp_path / "two")
+    workspace = tmp_path / "two"
+    shutil.copytree(undisturbed, workspace)
+    for stage in FOLDERS[FOLDERS.index("mapping") :]:
+        shutil.rmtree(workspace / stage)
     assert start(workspace, threads=2).wait() == 0
     for name in ("sparse/track.csv", "evaluation/cameras.csv"):
         one, two = (

@@ -36,6 +36,20 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _true_is_no_number(cls, value: object, info: ValidationInfo) -> object:
+        wanted = cls.model_fields[str(info.field_name)].annotation
+        if wanted is not bool and _holds_bool(value):
+            raise ValueError("true and false are no numbers")
+        return value
+
+
+def _holds_bool(value: object) -> bool:
+    if isinstance(value, list | tuple):
+        return any(map(_holds_bool, value))
+    return isinstance(value, bool)
+
 
 class AreaConfig(Config):
     """The area to survey and the limits of the vehicle's movement.
@@ -56,6 +70,7 @@ class AreaConfig(Config):
     corridor_ne_m: Ring | None = None
     corridor_latlon_deg: GeoRing | None = None
     corridor_width_m: float = Field(5.0, gt=0, le=1000)
+    closed_lines: Literal["corridor", "inside"] | None = Field(None, exclude_if=lambda c: c is None)
     wkt: str | None = None
     file: Path | None = None
     layer: str | None = None
@@ -142,10 +157,10 @@ class CameraConfig(Config):
 
     width_px: int = Field(3384, ge=64, le=20_000)
     height_px: int = Field(2710, ge=64, le=20_000)
-    pixel_um: float = Field(3.69, gt=0, le=100)
-    focal_mm: float = Field(12.5, gt=0, le=500)
+    pixel_um: float = Field(3.69, ge=0.5, le=100)
+    focal_mm: float = Field(12.5, ge=0.5, le=500)
     f_number: float = Field(4.0, ge=0.7, le=64)
-    baseline_m: float = Field(0.1, gt=0, le=2)
+    baseline_m: float = Field(0.1, ge=0.001, le=2)
     lens: Literal["opencv", "fisheye"] = Field("opencv", exclude_if="opencv".__eq__)
     port: Literal["flat", "dome", "none"] = Field("flat", exclude_if="flat".__eq__)
     port_distance_m: float = Field(0.02, ge=0, le=0.5)
@@ -159,9 +174,9 @@ class CameraConfig(Config):
     position_body_m: tuple[float, float, float] = (0.55, -0.05, 0.08)
     dvl_position_body_m: tuple[float, float, float] = (-0.4145, 0.0, 0.11)
     shortest_interval_s: float = Field(0.1, gt=0, le=60)
-    quantum_efficiency: float = Field(0.5, gt=0, le=1)
-    full_well_e: float = Field(9000.0, gt=100)
-    read_noise_e: float = Field(12.0, ge=0)
+    quantum_efficiency: float = Field(0.5, ge=0.01, le=1)
+    full_well_e: float = Field(9000.0, gt=100, le=1e7)
+    read_noise_e: float = Field(12.0, ge=0, le=1000)
 
 
 class WaterConfig(Config):
@@ -200,7 +215,7 @@ class PlanConfig(Config):
     """Settings of the plan: altitude, speed, overlap, lines and turns."""
 
     altitude_m: float = Field(2.0, ge=0.3, le=10)
-    speed_mps: float = Field(0.2, gt=0, le=3)
+    speed_mps: float = Field(0.2, ge=0.01, le=3)
     forward_overlap: float = Field(0.6, ge=0, le=0.95)
     side_overlap: float = Field(0.28, ge=0, le=0.95)
     line_spacing_m: float | None = Field(None, gt=0, le=20)
@@ -214,17 +229,25 @@ class PlanConfig(Config):
     allowed_blur_px: float = Field(1.0, gt=0, le=20)
     yaw_rate_deg_s: float = Field(1.0, ge=0, le=90)
     roll_pitch_rate_deg_s: float = Field(1.0, ge=0, le=90)
-    sharp_px: float = Field(3.0, gt=0, le=20)
+    sharp_px: float = Field(3.0, ge=0.1, le=20)
     strobe_lead_s: float = Field(0.0002, ge=0, le=0.1)
     least_clearance_m: float = Field(1.0, ge=0.1, le=10)
     steepest_deg: float = Field(20.0, gt=0, le=60)
     turns: Literal["auto", "arcs", "spot", "sway"] = "auto"
-    turn_radius_m: float = Field(0.5, gt=0, le=20)
-    turn_rate_limit_deg_s: float = Field(30.0, gt=0, le=180)
+    turn_radius_m: float = Field(0.5, ge=0.05, le=20)
+    turn_rate_limit_deg_s: float = Field(30.0, ge=0.5, le=180)
     run_in_m: float = Field(0.5, ge=0.1, le=20)
     home_ne_m: tuple[float, float] | None = None
     split_dives: bool = True
     dive_s: float | None = Field(None, gt=0, le=1e6)
+
+    @property
+    def arc_radius_m(self) -> float:
+        """Radius of arcs: as set; with `turns = "auto"` at least what the limit of rate asks."""
+        if self.turns != "auto":
+            return self.turn_radius_m
+        least_m = self.speed_mps / math.radians(self.turn_rate_limit_deg_s)
+        return max(self.turn_radius_m, math.ceil(100.0 * least_m) / 100.0)
 
 
 class ThrusterHealth(Config):
@@ -307,7 +330,7 @@ class ImagingConfig(Config):
 
     scale: int = Field(1, ge=1, le=16)
     image_format: Literal["png", "jpg"] = "png"
-    strobe_lumens: float = Field(30_000.0, gt=0)
+    strobe_lumens: float = Field(30_000.0, ge=1, le=1e8)
     strobe_beam_deg: float = Field(120.0, gt=1, lt=180)
     strobes_body_m: tuple[tuple[float, float, float], ...] = ((0.75, 0.0, 0.08), (-0.6, 0.0, 0.08))
     samples: int = Field(2, ge=1, le=8)
@@ -416,6 +439,8 @@ def load_config(path: str | Path) -> SurveyConfig:
         0.2
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{path}: not a file: give the settings as a plain file")
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -446,7 +471,10 @@ def _with_resolved_files(settings: dict[str, Any], folder: Path) -> dict[str, An
     for section, key in _FILES:
         values = settings.get(section)
         if isinstance(values, dict) and isinstance(values.get(key), str):
-            result[section] = {**result[section], key: str(folder / values[key])}
+            file = folder / values[key]
+            if file.exists() and not (file.is_file() or file.is_dir()):
+                raise ConfigError(f"{section}.{key}: {file} is neither a file nor a folder")
+            result[section] = {**result[section], key: str(file)}
     return result
 
 

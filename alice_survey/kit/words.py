@@ -52,13 +52,13 @@ def digits(value: float, wanted: int = 3) -> str:
     return f"{value:.{places}f}"
 
 
-def share(value: float | None) -> str:
-    """`99.8 %`; never 100 % of what is incomplete."""
+def share(value: float | None, places: int = 1) -> str:
+    """`99.8 %`; never 100 % of what is incomplete: 0.9998 is `99.9 %`."""
     if value is None or not math.isfinite(value):
         return "unknown"
-    text = f"{100 * value:.1f}"
-    if text == "100.0":
-        text = "100" if value >= 1.0 else "more than 99.9"
+    text = f"{100 * value:.{places}f}"
+    if float(text) == 100.0:
+        text = "100" if value >= 1.0 else f"{100 - 0.1**places:.{places}f}"
     return f"{text} %"
 
 

@@ -10,6 +10,8 @@ from shapely.geometry.base import BaseGeometry
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 
+_CLOSED = 0.02
+"""Gap of a closed line, over its length: drawn by hand, ends seldom meet."""
 Ring = Array
 """(N, 2) corners; the first may or may not be repeated as the last."""
 
@@ -22,6 +24,13 @@ class RawLine:
     """(N, 2) points."""
     width_m: float | None = None
     """Width; None where its source does not give it."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it goes round something: its ends are near to each other for its length."""
+        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        gap = float(np.linalg.norm(self.points[-1] - self.points[0]))
+        return len(self.points) > 3 and gap <= _CLOSED * float(steps.sum())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

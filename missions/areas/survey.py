@@ -27,6 +27,8 @@ from missions.areas.repair import (
 from missions.values.area import Area, multipolygon
 
 _SMALL_SHARE = 1e-6
+_POLAR_DEG = 66.6
+"""Few dive so far north or south: coordinates may be swapped."""
 _LOCAL_SETTINGS = ("no_go_ne_m", "allowed_ne_m")
 
 
@@ -45,7 +47,7 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     Raises:
         PlanError: a shape cannot be used; the message names the source and the place.
     """
-    raw = _survey_shapes(settings)
+    raw = _with_closed_lines(_survey_shapes(settings), settings)
     no_go_raw = [*_no_go_shapes(settings), *([raw.no_go] if raw.no_go is not None else [])]
     allowed_raw = _allowed_shapes(settings)
     frame = _local_frame(settings, raw)
@@ -96,6 +98,13 @@ def _local_frame(settings: AreaConfig, raw: RawShapes) -> LocalFrame:
         datum = Datum(settings.latitude_deg, settings.longitude_deg)
     else:
         datum = middle(raw)
+        latitude_deg, longitude_deg = datum.latitude_deg, datum.longitude_deg
+        if abs(latitude_deg) > _POLAR_DEG >= abs(longitude_deg):
+            warn(
+                f"area: {raw.origin} lies at latitude {latitude_deg:.6g}, longitude "
+                f"{longitude_deg:.6g}: if these are swapped, correct the file; if not, set the "
+                "datum there (latitude_deg, longitude_deg)"
+            )
         local = [name for name in _LOCAL_SETTINGS if getattr(settings, name)]
         if local:
             warn(
@@ -277,6 +286,26 @@ def _survey_shapes(settings: AreaConfig) -> RawShapes:
         if corners is not None:
             return from_rings(name, [corners], geographic="latlon" in name)
     return from_rings("rectangle", [_rectangle(settings)], geographic=False)
+
+
+def _with_closed_lines(raw: RawShapes, settings: AreaConfig) -> RawShapes:
+    """Shapes whose closed lines are polygons where that is set; warns where nothing is."""
+    ours = [line for line in raw.lines if line.width_m is None and line.is_closed]
+    drawn = settings.file is not None or settings.wkt is not None
+    if not (ours and drawn) or settings.closed_lines == "corridor":
+        return raw
+    if settings.closed_lines == "inside":
+        lines = tuple(line for line in raw.lines if not any(line is one for one in ours))
+        return replace(
+            raw, lines=lines, polygons=(*raw.polygons, *((line.points,) for line in ours))
+        )
+    what = "a line that closes is" if len(ours) == 1 else f"{len(ours)} lines that close are"
+    warn(
+        f"area: {raw.origin}: {what} surveyed as a corridor of {settings.corridor_width_m:g} m "
+        "along the line, not what lies inside: set area.closed_lines = 'inside' for that, or "
+        "'corridor' if it is meant"
+    )
+    return raw
 
 
 def _no_go_shapes(settings: AreaConfig) -> list[RawShapes]:

@@ -26,6 +26,7 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
+from alice_survey.kit.words import share
 from missions.coverage.certificate import Certificate
 from missions.coverage.geofiles import NO_DATA, sampled
 from missions.coverage.holes import Hole
@@ -118,10 +119,11 @@ def _figures(certificate: Certificate, holes: Sequence[Hole]) -> str:
     holes_text = f"{len(holes)} hole" if len(holes) == 1 else f"{len(holes)} holes"
     return (
         f"{certificate.stations} stations, {certificate.taken} pictures; seen "
-        f"{certificate.covered_share:.2%}, in stereo {certificate.stereo_share:.2%}, at the "
-        f"requested overlap {certificate.share_at_overlap:.2%}\n(that is {pattern.passes} "
-        f"line{'s' if pattern.passes > 1 else ''} and {asked} pictures of each camera); "
-        f"{holes_text}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
+        f"{share(certificate.covered_share, 2)}, in stereo "
+        f"{share(certificate.stereo_share, 2)}, at the "
+        f"requested overlap {share(certificate.share_at_overlap, 2)}\n(that is "
+        f"{pattern.passes} line{'s' if pattern.passes > 1 else ''} and {asked} pictures of each "
+        f"camera); {holes_text}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
         f"grid {100 * certificate.grid.cell_m:.1f} cm"
     )
 

@@ -213,6 +213,8 @@ def focus_rows(
     """Focus, depth of field, aperture and diffraction."""
     n = camera.n_water
     enough = focus.f_number_needed <= limits.f_number
+    depth_m = focus.far_altitude_m - focus.near_altitude_m
+    depth = f"{depth_m:.2f} m deep" if math.isfinite(depth_m) else "at all greater distances too"
     return settings_of("focus and aperture", [
         ("focus, set in air", focus.focus_air_m, "m", "2 / (1/D_top + 1/D_bottom)", _SOURCE,
          "relief_m",
@@ -223,7 +225,7 @@ def focus_rows(
         ("sharp from, to", (focus.near_altitude_m, focus.far_altitude_m), "m",
          "1 / (1/s +- c N / (f f'))", _SOURCE, "sharp_px",
          f"altitudes in focus to {plan.sharp_px:g} px at F/{limits.f_number:g}, "
-         f"{focus.far_altitude_m - focus.near_altitude_m:.2f} m deep; the relief takes "
+         f"{depth}; the relief takes "
          f"{plan.altitude_m - plan.relief_m:.3g} to {plan.altitude_m + plan.relief_m:.3g} m. "
          f"The paper's depth of field of 2 m at F/{limits.f_number:g} takes a circle of "
          f"{focus.papers_depth_px:.1f} px"),

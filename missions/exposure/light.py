@@ -336,7 +336,7 @@ def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: fl
     veil = np.trapezoid(sent, path, axis=0)
     centre = np.array([camera.cx_px, camera.cy_px])
     signal = floor_radiance(rig, imaging, water, altitude_m, centre)
-    share = veil / (veil + signal)
+    share = np.divide(veil, veil + signal, out=np.zeros(3), where=veil + signal > 0)
     return Scatter(
         veil_share=_triple(share),
         lit_from_m=min(

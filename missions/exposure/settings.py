@@ -54,6 +54,9 @@ from missions.exposure.trigger import (
 )
 from missions.values.footprint import footprint_size_m, overlap
 
+_DARK = 1000.0
+"""More than so many times the light that a picture gets is none that it can be given."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImagingSetup:
@@ -223,10 +226,13 @@ def _dark(budget: LightBudget, read_noise_e: float, jerlov: str) -> str:
     fault = too_dark(budget)
     if not fault:
         return ""
-    times = light_for_snr_e(LEAST_SNR, read_noise_e) / budget.median_e
+    needed_e = light_for_snr_e(LEAST_SNR, read_noise_e)
+    missing = "no light arrives"
+    if needed_e < _DARK * budget.median_e:
+        missing = f"{needed_e / budget.median_e:.1f} times the light is missing"
     return (
-        f"pictures will be {fault} in Jerlov {jerlov} water: {times:.1f} times the "
-        "light is missing; lower altitude_m or speed_mps, or raise allowed_blur_px or the aperture"
+        f"pictures will be {fault} in Jerlov {jerlov} water: {missing}; lower altitude_m or "
+        "speed_mps, or raise allowed_blur_px or the aperture"
     )
 
 

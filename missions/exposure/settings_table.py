@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from alice_survey.kit.words import share
+
 WIDTH = 100
 _COLUMNS = (23, 24, 31, 16)
 _GAP = "  "
@@ -44,7 +46,7 @@ class Setting:
         """The value with its unit, to about three digits."""
         values = self.value if isinstance(self.value, tuple) else (self.value,)
         if self.unit == "%":
-            return " / ".join(_number(100.0 * v) for v in values) + " %"
+            return " / ".join(_percent(v) for v in values) + " %"
         return f"{' / '.join(_number(v) for v in values)} {self.unit}".rstrip()
 
 
@@ -95,10 +97,16 @@ def _line(cells: tuple[str, ...]) -> str:
     return _GAP.join(c.ljust(w) for c, w in zip(cells, _COLUMNS, strict=True)).rstrip()
 
 
+def _percent(part: float) -> str:
+    """As other numbers; but 100 is all of it."""
+    text = _number(100.0 * part)
+    return share(part, 2).removesuffix(" %") if text == "100" and part < 1.0 else text
+
+
 def _number(value: float) -> str:
     """Three digits or so, never in powers of ten where a plain number is short."""
     if not math.isfinite(value):
-        return "inf" if value > 0 else "-"
+        return "infinity" if value > 0 else "-"
     if value == 0:
         return "0"
     size = abs(value)

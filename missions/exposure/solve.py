@@ -423,7 +423,7 @@ def turn_s(plan: PlanConfig, spacing_m: float) -> float:
     between. `turns = "auto"` takes the quicker.
     """
     rate_rad_s = spot_rate_rad_s(plan.turn_rate_limit_deg_s)
-    costs, radius = time_costs(plan.speed_mps, turn_rate_rad_s=rate_rad_s), plan.turn_radius_m
+    costs, radius = time_costs(plan.speed_mps, turn_rate_rad_s=rate_rad_s), plan.arc_radius_m
     if spacing_m >= 2 * radius:
         arcs = math.pi * radius + spacing_m - 2 * radius
     else:

@@ -12,6 +12,7 @@ from alice_survey.base.artefacts import need_stage, write_json
 from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.executor import SERIAL, Executor, local_executor
+from alice_survey.kit.words import share
 from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, mounted, read_rig
 from missions.coverage.certificate import Certificate, certificate
@@ -196,8 +197,8 @@ def check_report(
                 folder / "refly", plan, rig, config.camera, config.water, config.plan
             )
             text += (
-                f"\nto fly the holes again: {words}; then {plan.coverage:.2%} of them are at that "
-                f"overlap: {folder / 'refly'}"
+                f"\nto fly the holes again: {words}; then {share(plan.coverage, 2)} of them are "
+                f"at that overlap: {folder / 'refly'}"
             )
     if monte_carlo:
         terrain = survey_terrain(
@@ -282,7 +283,7 @@ def _check_text(check: Check) -> str:
         f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
         f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm",
         f"  {'':<{width}}  {'planned':>9}  {'flown':>9}",
-        *(f"  {name:<{width}}  {a:>9.2%}  {b:>9.2%}" for name, a, b in rows),
+        *(f"  {name:<{width}}  {share(a, 2):>9}  {share(b, 2):>9}" for name, a, b in rows),
         f"  {'pictures':<{width}}  {planned.taken:>9}  {flown.taken:>9}",
         f"  {'fewest pictures of a camera':<{width}}  {planned.fewest_pictures:>9}  "
         f"{flown.fewest_pictures:>9}",
@@ -317,12 +318,12 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
 
 def _flights_text(result: MonteCarlo) -> str:
     data = result.to_json()
-    share, seen = data["share_at_overlap"], data["covered_share"]
+    often, seen = data["share_at_overlap"], data["covered_share"]
     complete = result.endings.get("complete", 0)
     return (
         f"\n{counted(result.flights, 'simulated flight')}, {complete} complete: at the "
-        f"requested overlap {share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at "
-        f"least one picture {seen['p50']:.2%} ({seen['p05']:.2%});\n"
+        f"requested overlap {share(often['p50'], 2)} ({share(often['p05'], 2)} in the worst "
+        f"twentieth), in at least one picture {share(seen['p50'], 2)} ({share(seen['p05'], 2)});\n"
         f"the place that is missed most is missed in "
         f"{math.ceil(100 * data['greatest_hole_probability'])} % of flights"
     )

@@ -18,6 +18,7 @@ from alice_survey.kit.figure import (
     figure_style,
     save_figure,
 )
+from alice_survey.kit.words import share
 from camera_calib.rig import Rig, design_rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
@@ -125,7 +126,7 @@ def _summary(plan: Plan) -> str:
         f"{plan.duration_s / 60:.0f} min at {plan.speed_mps:g} m/s, {plan.energy_wh:.0f} Wh\n"
         f"altitude {plan.altitude_m:g} m, overlap {plan.reached_forward_overlap:.0%} forward, "
         f"{plan.reached_side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "
-        f"{plan.coverage:.1%} covered as requested"
+        f"{share(plan.coverage)} covered as requested"
     )
 
 

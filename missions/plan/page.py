@@ -18,6 +18,7 @@ from alice_survey.kit.document import (
     Verdict,
 )
 from alice_survey.kit.page import render_html
+from alice_survey.kit.words import share
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate
@@ -109,7 +110,7 @@ def _facts(plan: Plan, rig: Rig) -> list[tuple[str, str]]:
         ("every", f"{plan.interval_s:.2f} s"),
         ("exposure", f"{plan.exposure_s * 1000:.2f} ms"),
         ("overlap", f"{along:.0f} / {across:.0f} %"),
-        ("covered", f"{plan.coverage:.2%}"),
+        ("covered", share(plan.coverage, 2)),
         ("way", f"{plan.length_m:.0f} m"),
         ("time", f"{minutes:.0f} min" if minutes < 180 else f"{minutes / 60:.1f} h"),
         ("dives", f"{len(plan.dives)}"),
@@ -120,7 +121,7 @@ def _facts(plan: Plan, rig: Rig) -> list[tuple[str, str]]:
 def _coverage(seen: Certificate) -> Table:
     passes = seen.pattern.passes
     rows = (
-        ("In at least one picture", f"{seen.covered_share:.3%}"),
+        ("In at least one picture", share(seen.covered_share, 3)),
         ("Seen by every camera", f"{seen.every_camera_share:.3%}"),
         ("Seen by all cameras at once (stereo)", f"{seen.stereo_share:.3%}"),
         (

@@ -131,7 +131,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             ways=ways,
             costs=costs,
             home_ne=home,
-            turn_radius_m=wanted.turn_radius_m,
+            turn_radius_m=wanted.arc_radius_m,
             run_in_m=wanted.run_in_m,
             turns=wanted.turns,
             usable_wh=usable_wh(config.vehicle),
@@ -165,7 +165,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             reached_side_overlap=imaging.spacing.mean_overlap,
             lines=tuple(lines),
             dives=dives,
-            turn_radius_m=wanted.turn_radius_m,
+            turn_radius_m=wanted.arc_radius_m,
             run_in_m=wanted.run_in_m,
             length_m=sum(dive.route.length_m for dive in dives),
             duration_s=sum(dive.duration_s for dive in dives),
@@ -201,7 +201,7 @@ def _turn_margin_m(plan: PlanConfig, pattern: Pattern) -> float:
     """Room around the area for the widest turn: run-out, and a loop of three quarters of a turn."""
     outside = max(pattern.overhang_m, pattern.edge_m, 0.0)
     outside += max(pattern.spacing_m, pattern.step_m) / 2
-    return outside + plan.run_in_m + 3.0 * plan.turn_radius_m
+    return outside + plan.run_in_m + 3.0 * plan.arc_radius_m
 
 
 def _home(given: tuple[float, float] | None, area: Area) -> tuple[float, float]:
@@ -324,7 +324,14 @@ def _check_turns(plan: PlanConfig) -> None:
         raise PlanError(
             f"turns of {plan.turn_radius_m:g} m radius at {plan.speed_mps:g} m/s need "
             f"{turn_rate_deg_s(plan):.0f} deg/s; turn_rate_limit_deg_s is "
-            f"{plan.turn_rate_limit_deg_s:g}: raise turn_radius_m or lower speed_mps"
+            f"{plan.turn_rate_limit_deg_s:g}: raise turn_radius_m, lower speed_mps or set "
+            "turns = 'auto'"
+        )
+    if plan.arc_radius_m > plan.turn_radius_m:
+        warn(
+            f"turn_radius_m {plan.turn_radius_m:g} at {plan.speed_mps:g} m/s is beyond "
+            f"turn_rate_limit_deg_s {plan.turn_rate_limit_deg_s:g}: arcs are planned with "
+            f"{plan.arc_radius_m:g} m"
         )
 
 

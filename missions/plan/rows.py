@@ -6,6 +6,7 @@ from typing import Any
 
 from alice_survey.base.config import VehicleConfig
 from alice_survey.base.text_table import text_table
+from alice_survey.kit.words import share
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate
 from missions.exposure.settings_table import Setting, setting_from_json
@@ -109,7 +110,8 @@ def _coverage_row(seen: Certificate) -> Setting:
         "covered as requested", seen.share_at_overlap, "%", "union of real footprints", "lines",
         f"by every camera on {seen.pattern.passes} line{'s'[: seen.pattern.passes > 1]} and in "
         f"{often} pictures or more, as in an endless pattern of this spacing and step; "
-        f"{seen.covered_share:.2%} is in some picture, {seen.stereo_share:.2%} in stereo; the "
+        f"{share(seen.covered_share, 2)} is in some picture, "
+        f"{share(seen.stereo_share, 2)} in stereo; the "
         f"place seen least is in {seen.fewest_pictures} pictures of a camera, the mean place "
         f"in {seen.mean_pictures:.1f} of all",
     )  # fmt: skip

@@ -41,13 +41,12 @@ def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
 
 def turn_rate_deg_s(plan: PlanConfig) -> float:
     """Rate of the turns that a plan's arcs need."""
-    return math.degrees(plan.speed_mps / plan.turn_radius_m)
+    return math.degrees(plan.speed_mps / plan.arc_radius_m)
 
 
 def arcs_fit(plan: PlanConfig) -> bool:
-    """Whether the arcs of a plan, if it has any, are within its rate of turn."""
-    needs_arcs = plan.turns in ("auto", "arcs")
-    return not needs_arcs or turn_rate_deg_s(plan) <= plan.turn_rate_limit_deg_s
+    """Whether the arcs of a plan are within its rate of turn, where it wants nothing but arcs."""
+    return plan.turns != "arcs" or turn_rate_deg_s(plan) <= plan.turn_rate_limit_deg_s
 
 
 def too_strong(
@@ -186,7 +185,7 @@ def _speeds(
             radius_m = math.ceil(10.0 * speed / limit_rad_s) / 10.0
             plan = plan.model_copy(update={"turn_radius_m": radius_m})
             wider = f" and plan.turn_radius_m {radius_m:g}"
-        faster = replace(flown, speed_mps=speed, turn_radius_m=plan.turn_radius_m)
+        faster = replace(flown, speed_mps=speed, turn_radius_m=plan.arc_radius_m)
         if speed == own or not flies_everywhere(faster) or not _images(replace(setup, plan=plan)):
             continue
         ratio = speed / own

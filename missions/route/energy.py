@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.config import SeaConfig, SurveyConfig, VehicleConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.base.errors import PlanError, VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import coefficients_from_file
 from alice_survey.vehicle.fleet import vehicle
@@ -97,7 +97,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         speed_mps=plan.speed_mps,
         line_heading_deg=plan.line_heading_deg,
         current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
-        turn_radius_m=plan.turn_radius_m,
+        turn_radius_m=plan.arc_radius_m,
         most_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=config.vehicle.hotel_w,
@@ -230,7 +230,10 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
     craft = sound_craft_of(settings)
     lost = settings.thruster_health.impaired if settings.health_known else {}
     present = {thruster.name for thruster in craft.thrusters}
-    return craft.weakened({name: left for name, left in lost.items() if name in present})
+    left = craft.weakened({name: left for name, left in lost.items() if name in present})
+    if not left.thrusters:
+        raise VehicleError(f"{craft.name} has no thruster left: check vehicle.thruster_health")
+    return left
 
 
 def has_sway(craft: Vehicle) -> bool:

@@ -212,7 +212,7 @@ def test_the_certificate_shows_the_gaps_of_lines_too_far_apart(
         ),
         ({"plan": {"home_ne_m": [50.0, 0.0]}}, "home_ne_m"),
         ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "forward_overlap"),
-        ({"plan": {"speed_mps": 0.4, "turn_radius_m": 0.5}}, "46 deg/s"),
+        ({"plan": {"speed_mps": 0.4, "turn_radius_m": 0.5, "turns": "arcs"}}, "46 deg/s"),
     ],
 )
 def test_errors_of_planning_take_few_lines(sections: dict[str, Any], named: str) -> None:

@@ -36,7 +36,10 @@ def test_numbers_have_no_exponent(value: float, expected: str) -> None:
 
 def test_a_share_that_is_not_whole_never_says_100() -> None:
     assert share(1.0) == "100 %"
-    assert share(0.9999) == "more than 99.9 %"
+    assert share(0.9999) == "99.9 %"
+    assert share(0.99999, 2) == "99.99 %"
+    assert share(0.99984, 2) == "99.98 %"
+    assert share(1.0, 2) == "100 %"
     assert share(0.9984) == "99.8 %"
     assert share(0.5) == "50.0 %"
 

@@ -37,7 +37,7 @@ TARGET = parse_target("apriltag 6x6 88mm 0.3")
 OF_BOUND = 1.15
 NOISE = 0.03
 """Of a pixel, as a share of full light; white is 0.7."""
-VIEWS, TRIALS = 16, 6
+VIEWS, TRIALS = 16, 3
 BORDER_PX = 5.0
 
 

@@ -87,7 +87,7 @@ def test_the_table_fits_a_hundred_columns_and_json_is_plain() -> None:
         (0.42812, "Hz", "0.428 Hz"),
         (0.306, "%", "30.6 %"),
         ((1.65, 2.0, 2.345678), "m", "1.65 / 2 / 2.35 m"),
-        (float("inf"), "m", "inf m"),
+        (float("inf"), "m", "infinity m"),
         (12345678.0, "", "1.23e+07"),
     ],
 )

@@ -50,10 +50,10 @@ def test_hidden_coefficients_and_current_are_recovered() -> None:
 
 
 @pytest.mark.slow
-def test_sigmas_are_honest_over_a_hundred_logs() -> None:
+def test_sigmas_are_honest_over_many_logs() -> None:
     rng = np.random.default_rng(11)
     scores, damping, drift = [], [], []
-    for _ in range(100):
+    for _ in range(50):
         factors, current = rng.uniform(0.6, 1.6, 4), rng.uniform(-0.2, 0.2, 2)
         truth = {
             name: KNOWN.coefficients.values[name] * factor
