@@ -265,8 +265,8 @@ def _plan_summary(folder: Path) -> Summary:
         f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
         f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
         f"{plan['side_overlap']:.0%} side, {share(plan['coverage'])} covered as requested; "
-        f"a picture every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map "
-        f"in {folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
+        f"a picture every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; "
+        f"map in {folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
     )
     return text, plan
 
@@ -475,7 +475,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="plan",
         command="plan",
         about="lines, stations and camera settings that image the area",
-        version=4,
+        version=5,
         work="missions.plan.run:run_plan",
         takes=(WHOLE,),
         settings={
@@ -618,7 +618,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="mapping",
         command="reconstruct",
         about="cameras and points in the model's own gauge",
-        version=11,
+        version=12,
         work="reconstruct.mapping.run:run_mapping",
         takes=("reconstruct", "seed"),
         needs=("image",),
@@ -641,7 +641,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="sparse",
         command="reconstruct",
         about="the model placed in the world",
-        version=14,
+        version=15,
         work="reconstruct.placing.run:run_sparse",
         takes=("reconstruct", "water.index_sigma"),
         needs=("image", "mapping"),

@@ -30,6 +30,10 @@ _CELLS_PER_FOOTPRINT = 20.0
 _LEAST_CELLS = 40_000
 """Fewest cells of a small area, so that its shares are finely resolved."""
 _MOST_CELLS = 16_000_000
+_SIZES = 0.005 * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6])
+"""Changes of a cell's size that are tried."""
+_PLACES = 300
+"""Cells in a row that are looked at for that."""
 _TILE, _TILE_MIB = 2048, 90
 """Cells a side that are worked on at once, and the memory that they take for two cameras."""
 _CHUNK = 8192
@@ -189,14 +193,14 @@ def certificate(
         rig: its cameras, in water.
         stations: where pictures are taken.
         pattern: the overlap requested.
-        cell_m: of the grid; left out, a twentieth of a footprint, less for a small area, and more
-            where that would be over 16 million cells.
+        cell_m: of the grid; left out, about a twentieth of a footprint, less for a small area, and
+            more where that would be over 16 million cells.
         executor: where the parts of a large area are worked on.
 
     Raises:
         PlanError: `cell_m` is not positive, or would make too large a grid.
     """
-    grid = grid_over(area, _cell_m(area, rig, stations, cell_m))
+    grid = grid_over(area, _cell_m(area, rig, stations, pattern, cell_m))
     mask = inside(area, grid)
     if not mask.any():  # the area is a sliver between middles of cells
         raise PlanError(
@@ -243,7 +247,9 @@ def certificate(
     )
 
 
-def _cell_m(area: Area, rig: Rig, stations: Stations, asked_m: float | None) -> float:
+def _cell_m(
+    area: Area, rig: Rig, stations: Stations, pattern: Pattern, asked_m: float | None
+) -> float:
     """The side of a cell.
 
     Raises:
@@ -269,7 +275,28 @@ def _cell_m(area: Area, rig: Rig, stations: Stations, asked_m: float | None) -> 
             f"{_MOST_CELLS / 1e6:.0f} million of them: holes under {1.4 * least_m:.2g} m may be "
             "missed; certify parts of the area, or choose cell_m"
         )
-    return max(fine_m, least_m)
+    return _out_of_step(fine_m, (pattern.step_m, pattern.spacing_m), least_m)
+
+
+def _out_of_step(cell_m: float, periods_m: tuple[float, ...], least_m: float) -> float:
+    """A cell of nearly this size whose grid keeps no time with pictures and lines.
+
+    Where a step is a whole number of cells, all steps are looked at in the same few places, and
+    shares are those of these places (aliasing). Of a few sizes the one is taken at which places
+    within a step are spread most evenly: with the least star discrepancy (Niederreiter 1992,
+    "Random number generation and quasi-Monte Carlo methods", theorem 2.6).
+    """
+    sizes = cell_m * (1.0 + _SIZES)
+    sizes = np.maximum(sizes[sizes >= least_m], least_m) if sizes.max() > least_m else [least_m]
+    even = (np.arange(_PLACES) + 0.5) / _PLACES
+    uneven = [
+        sum(
+            float(np.abs(np.sort(np.arange(_PLACES) * (size / period_m) % 1.0) - even).max())
+            for period_m in periods_m
+        )
+        for size in sizes
+    ]
+    return float(sizes[int(np.argmin(uneven))])
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -8,12 +9,18 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import find_holes
-from missions.coverage.stations import Stations, stations_of_lines, sure_pattern
+from missions.coverage.stations import (
+    Stations,
+    stations_of_lines,
+    stations_of_plan,
+    sure_pattern,
+)
+from missions.plan.planner import plan_survey
 from missions.values.footprint import footprint_size_m
 from missions.values.pattern import Pattern
 from tests.oracles_coverage import (
@@ -288,3 +295,37 @@ def test_cells_grow_where_there_would_be_too_many(
 
     assert (seen.grid.rows - 1) * (seen.grid.columns - 1) <= 10_000
     assert capsys.readouterr().err
+
+
+def test_a_grid_keeps_no_time_with_pictures_and_lines() -> None:
+    """Steps of eight twentieths of a footprint: by closed form 2.8 pictures on 1.39 lines."""
+    rig = pinhole_rig(1.0, 1.12)
+    asked = sure_pattern(rig, 1.0, 0.72, 0.4)
+    stations = stations_of_lines(lawnmower(16, 14.4, 0.72, 0.4, over_m=2.0), 1.0)
+
+    seen = certificate(area_of(shapely.box(0, 0, 16, 14.4)), rig, stations, asked)
+
+    on_a_line, lines = {2: 0.2, 3: 0.8}, {1: 2 - 1 / 0.72, 2: 1 / 0.72 - 1}
+    shares = np.zeros(7)
+    for (n, p), (m, q) in itertools.product(on_a_line.items(), lines.items()):
+        shares[n * m] += p * q
+    (found,) = seen.histograms.values()
+    assert found == pytest.approx(shares, abs=6e-3)
+    (by_lines,) = seen.line_histograms.values()
+    assert by_lines == pytest.approx([0.0, *lines.values()], abs=6e-3)
+
+
+def test_shares_of_the_papers_mission_are_those_of_a_finer_grid() -> None:
+    config = SurveyConfig()
+    planned = plan_survey(config, RIG)
+    seen, stations = planned.certificate, stations_of_plan(planned.plan)
+    fine = certificate(
+        planned.plan.area, RIG, stations, seen.pattern, cell_m=seen.grid.cell_m / 7.37
+    )
+
+    assert seen.inside.sum() < 1.05 * 80_000
+    for kind in ("histograms", "line_histograms"):
+        for name, shares in getattr(fine, kind).items():
+            ours = getattr(seen, kind)[name]
+            assert ours == pytest.approx(shares[: len(ours)], abs=3e-3)
+    assert seen.mean_pictures == pytest.approx(fine.mean_pictures, abs=0.01)

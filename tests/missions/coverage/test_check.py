@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
+from alice_survey.kit.words import share
 from camera_calib.mount import mount_rotation
 from camera_calib.rig import Rig, design_rig, write_rig
 from missions.coverage.certificate import Certificate, certificate
@@ -107,7 +108,7 @@ def test_a_dive_is_compared_with_its_plan(checked: tuple[Path, Plan, str, dict])
     assert len(data["holes"]) == 1
     assert data["holes"][0]["size_m"][0] == pytest.approx(8.0, abs=0.05)
     assert data["holes_m2"] == pytest.approx((1 - seen.share_at_overlap) * 48.0, rel=0.01)
-    assert f"{seen.share_at_overlap:.2%}" in text
+    assert share(seen.share_at_overlap, 2) in text
     assert f"{data['holes'][0]['latitude_deg']:.7f}" in text
     written = json.loads((workspace / "check" / "certificate.json").read_text())
     assert written == {key: data[key] for key in written}
