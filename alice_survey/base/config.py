@@ -4,7 +4,7 @@ import math
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_origin
 
 from pydantic import (
     BaseModel,
@@ -40,7 +40,11 @@ class Config(BaseModel):
     @classmethod
     def _true_is_no_number(cls, value: object, info: ValidationInfo) -> object:
         wanted = cls.model_fields[str(info.field_name)].annotation
-        if wanted is not bool and _holds_bool(value):
+        if isinstance(value, dict) and get_origin(wanted) is dict:
+            value_of = list(value.values())
+        else:
+            value_of = [value]
+        if wanted is not bool and _holds_bool(value_of):
             raise ValueError("true and false are no numbers")
         return value
 
@@ -250,35 +254,40 @@ class PlanConfig(Config):
         return max(self.turn_radius_m, math.ceil(100.0 * least_m) / 100.0)
 
 
-class ThrusterHealth(Config):
-    """Share of maximum thrust that each thruster has left: 0 failed, 1 intact."""
-
-    starboard: Share = 1.0
-    port: Share = 1.0
-    vertical: Share = 1.0
-    bow: Share = 1.0
-    stern: Share = 1.0
-
-    @property
-    def impaired(self) -> dict[str, float]:
-        """Thrusters that are not intact."""
-        return {name: share for name, share in self.model_dump().items() if share < 1.0}
+VEHICLE_FILES = (".toml", ".json")
+"""Endings of the files that describe a vehicle."""
 
 
 class VehicleConfig(Config):
-    """The vehicle and how it is controlled."""
+    """The vehicle and how it is controlled.
 
-    name: Literal["alice", "sparus2"] = "alice"
+    What is left out of battery and hotel load is the vehicle's own.
+    """
+
+    name: str = Field("alice", min_length=1)
+    """Of a known vehicle, or a file that describes one."""
     coefficients: Literal["estimated", "cfd", "calibrated", "computed"] = "calibrated"
     coefficients_file: Path | None = None
     controller: Literal["sway", "los"] = "sway"
     allocation: Literal["exact", "rpi"] = "exact"
-    thruster_health: ThrusterHealth = ThrusterHealth()
+    thruster_health: dict[str, Share] = Field(default_factory=dict)
+    """Share of its greatest thrust that each thruster has left: 0 failed, 1 intact."""
     health_known: bool = True
-    battery_wh: float = Field(1400.0, gt=0, le=100_000)
+    battery_wh: float | None = Field(None, ge=0.01, le=1_000_000)
     battery_reserve: float = Field(0.2, ge=0, lt=1)
-    hotel_w: float = Field(60.0, ge=0, le=5000)
+    hotel_w: float | None = Field(None, ge=0, le=5000)
     dive: int | None = Field(None, ge=1)
+
+    @property
+    def file(self) -> Path | None:
+        """The file that describes the vehicle; None for a known one."""
+        path = Path(self.name)
+        return path if path.suffix.lower() in VEHICLE_FILES else None
+
+    @property
+    def impaired(self) -> dict[str, float]:
+        """Thrusters that are not intact."""
+        return {name: share for name, share in self.thruster_health.items() if share < 1.0}
 
 
 class SeaConfig(Config):
@@ -475,6 +484,9 @@ def _with_resolved_files(settings: dict[str, Any], folder: Path) -> dict[str, An
             if file.exists() and not (file.is_file() or file.is_dir()):
                 raise ConfigError(f"{section}.{key}: {file} is neither a file nor a folder")
             result[section] = {**result[section], key: str(file)}
+    own = settings.get("vehicle")
+    if isinstance(own, dict) and str(own.get("name")).lower().endswith(VEHICLE_FILES):
+        result["vehicle"] = {**result.get("vehicle", own), "name": str(folder / str(own["name"]))}
     return result
 
 

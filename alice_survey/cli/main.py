@@ -171,7 +171,9 @@ def fov(
 def fly(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
-    vehicle: Annotated[Literal["alice", "sparus2"] | None, typer.Option(help="What flies.")] = None,
+    vehicle: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="What flies: alice, sparus2, or a file.")
+    ] = None,
     controller: Annotated[
         Literal["sway", "los"] | None,
         typer.Option(help="Heading held on the line, or towards a point ahead on it."),

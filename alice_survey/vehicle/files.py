@@ -1,9 +1,9 @@
 """Files that describe a vehicle, and files of identified coefficients.
 
 A vehicle file is TOML or JSON with the fields of `Vehicle`: `name`, `rigid_body` as `RigidBody`,
-`coefficients` by SNAME name, `thrusters` as a list of `Thruster`, `density_kg_m3`. Of a thruster
-only name, place and direction are needed where logs give thrusts; speeds need its diameter and k_t
-too.
+`coefficients` by SNAME name, `thrusters` as a list of `Thruster`, `hull` as `Hull`,
+`density_kg_m3`, `depth_rating_m`, `battery_wh`, `hotel_w`. Of a thruster only name, place and
+direction are needed where logs give thrusts; speeds need its diameter and k_t too.
 """
 
 import json
@@ -16,11 +16,12 @@ import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from alice_survey.base.artefacts import write_json
-from alice_survey.base.config import Config
+from alice_survey.base.config import VEHICLE_FILES, Config
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import VehicleError, why
 from alice_survey.vehicle.coefficients import FORCES, Coefficients
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.fleet import OWN_SET, vehicle
+from alice_survey.vehicle.hull import POINT, Hull
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
@@ -48,18 +49,26 @@ class _VehicleFile(Config):
     rigid_body: RigidBody
     coefficients: dict[str, float] = Field(default_factory=dict)
     thrusters: tuple[Annotated[Thruster, BeforeValidator(_with_defaults)], ...] = ()
+    hull: Hull = POINT
     density_kg_m3: float = 1025.0
+    depth_rating_m: float | None = Field(None, gt=0, le=12_000)
+    battery_wh: float | None = Field(None, gt=0)
+    hotel_w: float | None = Field(None, ge=0)
 
 
-def vehicle_from(name_or_file: str) -> Vehicle:
+def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
     """A vehicle known by name, or described by a TOML or JSON file.
+
+    Args:
+        name_or_file: of the vehicle.
+        coefficients: the set of a vehicle known by name; a file has one of its own.
 
     Raises:
         VehicleError: neither is known, or the file does not describe a vehicle.
     """
     path = Path(name_or_file)
-    if path.suffix.lower() not in (".toml", ".json"):
-        return vehicle(name_or_file)
+    if path.suffix.lower() not in VEHICLE_FILES:
+        return vehicle(name_or_file, coefficients)
     return vehicle_from_file(path)
 
 
@@ -79,7 +88,11 @@ def vehicle_from_file(path: Path) -> Vehicle:
         rigid_body=found.rigid_body,
         coefficients=_coefficients(path, path.stem, found.coefficients),
         thrusters=found.thrusters,
+        hull=found.hull,
         density_kg_m3=found.density_kg_m3,
+        depth_rating_m=found.depth_rating_m,
+        battery_wh=found.battery_wh,
+        hotel_w=found.hotel_w,
     )
 
 

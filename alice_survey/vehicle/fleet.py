@@ -24,8 +24,16 @@ from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
 DENSITY = 1025.0
 """Density of sea water, kg/m^3, for which the paper's tables apply."""
+DEPTH_RATING_M = 200.0
+"""Carreras et al. 2018, for SPARUS II; ALICE has its hull."""
+BATTERY_WH = 1400.0
+"""SPARUS II carries 1.4 kWh of Li-ion cells by its maker's data sheet; more in
+`missions.route.energy`, where the hotel load is derived, too."""
+HOTEL_W = 60.0
 GEOMETRIES = {"alice": ALICE, "sparus2": SPARUS2}
 PAPER_SETS = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
+OWN_SET = "calibrated"
+"""The set that is meant where none is named."""
 SETS = (*PAPER_SETS, "computed")
 """Names of the sets of coefficients: the paper's, and `computed` from the vehicle's geometry. The
 paper's are of ALICE; with `sparus2` they stand for a hull 0.4 m shorter."""
@@ -137,7 +145,7 @@ def _computed(name: str) -> Coefficients:
     return estimate(GEOMETRIES[name])
 
 
-def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
+def vehicle(name: str, coefficients: str = OWN_SET) -> Vehicle:
     """A vehicle by its name, `alice` or `sparus2`, with a named set of coefficients.
 
     Args:
@@ -150,7 +158,9 @@ def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
     if coefficients not in SETS:
         raise VehicleError(f"coefficients {coefficients!r} are not known; known: {', '.join(SETS)}")
     if name not in GEOMETRIES:
-        raise VehicleError(f"vehicle {name!r} is not known; known: {', '.join(GEOMETRIES)}")
+        raise VehicleError(
+            f"vehicle {name!r} is not known; known: {', '.join(GEOMETRIES)}, or a TOML file"
+        )
     return Vehicle(
         name=name,
         rigid_body=_rigid_body(GEOMETRIES[name]),
@@ -158,4 +168,7 @@ def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
         thrusters=_thrusters(name),
         hull=GEOMETRIES[name].hull,
         density_kg_m3=DENSITY,
+        depth_rating_m=DEPTH_RATING_M,
+        battery_wh=BATTERY_WH,
+        hotel_w=HOTEL_W,
     )

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from pydantic import ConfigDict
 
 from alice_survey.base.frames import Array
 
@@ -14,6 +15,8 @@ class Hull:
 
     What hangs below it, DVL and ports, is placed by a survey's settings.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     profile_body_m: tuple[tuple[float, float, float], ...]
     """Points in the plane of symmetry, from the nose along the keel to the tail, between which the

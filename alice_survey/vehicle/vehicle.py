@@ -76,6 +76,10 @@ class Vehicle:
     hull: Hull = POINT
     """Extent of the hull; its origin alone for a vehicle that is not flown."""
     density_kg_m3: float = 1025.0
+    depth_rating_m: float | None = None
+    battery_wh: float | None = None
+    hotel_w: float | None = None
+    """Everything but thrusters and strobes."""
 
     @cached_property
     def mass(self) -> Array:

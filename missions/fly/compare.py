@@ -49,7 +49,7 @@ class Variant:
     """A vehicle and how it is steered."""
 
     name: str
-    vehicle: Literal["alice", "sparus2"]
+    vehicle: str
     controller: Literal["sway", "los"]
     look_ahead_m: float | None = None
     """Look-ahead distance of `los`; derived from the vehicle when left out."""

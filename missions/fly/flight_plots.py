@@ -18,7 +18,6 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.pilot.memory import (
     ABORT,
@@ -72,7 +71,7 @@ def draw_flight(path: Path, flight: Flight) -> None:
         [np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in flight.glass_ned.T]
     )
     chart.scatter(places[:, 1], places[:, 0], s=6, color="black", lw=0, zorder=5, label="pictures")
-    _end_chart(chart, f"{flight.plan.name}: the flight of {flight.vehicle}, {flight.ending}")
+    _end_chart(chart, f"{flight.plan.name}: the flight of {flight.vehicle.name}, {flight.ending}")
 
     cross, heading = flight.line_errors
     _draw_cross_track(strips[0], flight, cross)
@@ -86,7 +85,7 @@ def draw_flight(path: Path, flight: Flight) -> None:
 @figure_style()
 def draw_vehicle(path: Path, flight: Flight) -> None:
     """Draw the track, coloured by speed, next to strips of speed, roll, thrusters and power."""
-    craft = vehicle(flight.vehicle)
+    craft = flight.vehicle
     lateral = [t.name for t in craft.thrusters if abs(t.direction_body[1]) > 0.5]
     main = [t.name for t in craft.thrusters if abs(t.direction_body[0]) > 0.5]
     other = [t.name for t in craft.thrusters if t.name not in (*main, *lateral)]
@@ -96,7 +95,7 @@ def draw_vehicle(path: Path, flight: Flight) -> None:
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     _draw_plan(chart, flight.plan)
     _draw_speeds(chart, flight, speed)
-    _end_chart(chart, f"{flight.plan.name}: {flight.vehicle} over the plan")
+    _end_chart(chart, f"{flight.plan.name}: {flight.vehicle.name} over the plan")
 
     _draw_surge(strips[0], flight, velocity[:, 0], speed)
     _draw_roll(strips[1], flight)
@@ -330,7 +329,7 @@ def _draw_roll(axes: Axes, flight: Flight) -> None:
 def _draw_thrusters(axes: Axes, flight: Flight, names: list[str]) -> None:
     """Speeds of some thrusters; their limits as dashes where these are near, else in words."""
     speeds = rpm_of(flight.flown)
-    limits = {u.name: 60.0 * u.most_rps for u in vehicle(flight.vehicle).thrusters}
+    limits = {u.name: 60.0 * u.most_rps for u in flight.vehicle.thrusters}
     reached = max(float(np.abs(speeds[name]).max()) for name in names)
     for name in names:
         colour = _THRUSTERS[list(limits).index(name) % len(_THRUSTERS)]

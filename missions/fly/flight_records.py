@@ -63,7 +63,7 @@ def bag_record(flight: Flight) -> BagRecord:
     heard = np.concatenate([[True], np.any(np.diff(ranges, axis=0) != 0, axis=1)])
     some = slice(None, None, _BAG_EVERY)
     return BagRecord(
-        name=flight.vehicle,
+        name=flight.vehicle.name,
         datum=flight.plan.datum,
         time_s=flown.time_s[some],
         truth=flight.truth.ned_from_body[some],
@@ -104,11 +104,14 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
     speed = np.linalg.norm(true_velocity(flown)[:, :2], axis=1)
     energy_wh = flown.energy_j / 3600.0
     return {
-        "vehicle": vehicle.name,
+        "vehicle": flight.vehicle.name,
         "controller": vehicle.controller,
         "coefficients": vehicle.coefficients,
         "allocation": vehicle.allocation,
-        "thruster_health": vehicle.thruster_health.model_dump(),
+        "thruster_health": {
+            thruster.name: vehicle.thruster_health.get(thruster.name, 1.0)
+            for thruster in flight.vehicle.thrusters
+        },
         "ending": flight.ending,
         "duration_s": float(flown.time_s[-1]),
         "stations": len(flight.trigger_s),

@@ -78,7 +78,7 @@ def _check_pictures(flight: Flight, planned: int) -> None:
     """
     if not len(flight.trigger_s):
         raise VehicleError(
-            f"{flight.vehicle} reached no line of the plan ({flight.ending} after "
+            f"{flight.vehicle.name} reached no line of the plan ({flight.ending} after "
             f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
         )
     if len(flight.trigger_s) < planned:

@@ -174,7 +174,7 @@ def mission_setup(
     # A floor is followed down to two altitudes below the planned one.
     deepest_m = plan.seafloor_depth_m + plan.altitude_m
     # The pilot flies as well as the thrusters allow that he knows to be sound.
-    impaired = settings.vehicle.thruster_health.impaired
+    impaired = settings.vehicle.impaired
     known = impaired if settings.vehicle.health_known else {}
     gains = gains_for(craft.weakened(known), plan.speed_mps)
     guidance = pilot_guidance(
@@ -312,7 +312,7 @@ def flight_of(
         ending = f"broken off after {flown.time_s[-1]:.0f} s"
     return Flight(
         plan=plan,
-        vehicle=setup.vehicle.name,
+        vehicle=setup.vehicle,
         truth=truth,
         glass_ned=truth.ned_from_body.apply(glass_body),
         altitude_m=_altitude(setup.floor, truth.ned_from_body.apply(glass_body)),

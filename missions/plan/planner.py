@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from shapely.geometry import Point
 from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.base.errors import PlanError, heard, warn
 from alice_survey.vehicle.hull import Hull
+from alice_survey.vehicle.vehicle import Vehicle
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
@@ -96,7 +98,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         bathymetry = area_bathymetry(config.area, area, wanted.altitude_m)
         _check_smallest(area, imaging)
         _warn_of_spacing(wanted, imaging, stereo)
-        hull, glass_body_m = sound_craft_of(config.vehicle).hull, config.camera.position_body_m
+        craft, glass_body_m = sound_craft_of(config.vehicle), config.camera.position_body_m
+        hull = craft.hull
         _warn_of_zones(area, config.area.no_go_clearance_m, hull, glass_body_m)
         depth_m = _depth_m(config.area, area, bathymetry)
         _check_depth(wanted.altitude_m, depth_m)
@@ -147,6 +150,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         )
         camera = rig.cameras[rig.reference]
         depths_m, terrain, figures = _terrain(lines, wanted, reach, pattern, camera, bathymetry)
+        _check_rating(craft, max([depth_m - wanted.altitude_m, *chain.from_iterable(depths_m)]))
         plan = Plan(
             name=config.name,
             area=area,
@@ -309,6 +313,14 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
             "(line_heading_deg), or survey the steep part apart"
         )
     return stations.some(np.flatnonzero(near))
+
+
+def _check_rating(craft: Vehicle, deepest_m: float) -> None:
+    if craft.depth_rating_m is not None and deepest_m > craft.depth_rating_m:
+        raise PlanError(
+            f"{craft.name} is built for {craft.depth_rating_m:g} m and would fly at "
+            f"{deepest_m:.0f} m: choose another vehicle.name, or check area.seafloor_depth_m"
+        )
 
 
 def _check_depth(altitude_m: float, depth_m: float) -> None:

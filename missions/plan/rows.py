@@ -12,7 +12,7 @@ from missions.coverage.certificate import Certificate
 from missions.exposure.settings_table import Setting, setting_from_json
 from missions.exposure.storage import raw_bytes
 from missions.lines.sweep import Sweep
-from missions.route.energy import usable_wh
+from missions.route.energy import battery_wh, usable_wh
 from missions.values.plan_file import Plan
 
 _GROUP = "LINES AND DIVES"
@@ -90,7 +90,7 @@ def _dive_rows(plan: Plan, vehicle: VehicleConfig) -> Sequence[Setting]:
         _row(
             "dives", len(plan.dives), "", "least number that the battery holds", "battery_wh",
             f"the longest takes {longest:.0f} of {usable:.0f} Wh "
-            f"({vehicle.battery_reserve:.0%} of {vehicle.battery_wh:.0f} Wh are kept)",
+            f"({vehicle.battery_reserve:.0%} of {battery_wh(vehicle):.0f} Wh are kept)",
         ),
         _row("energy", plan.energy_wh, "Wh", "sum of power x time", "hotel_w, drag, current"),
     )  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 
 from alice_survey.base.config import PlanConfig, SurveyConfig, VehicleConfig
 from alice_survey.base.errors import AliceError, PlanError
+from alice_survey.vehicle.fleet import GEOMETRIES
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import Way, conflict
 from missions.route.energy import (
@@ -131,11 +132,10 @@ def _changes(flown: FlightConditions, own: VehicleConfig, setup: ImagingSetup) -
         other = "los" if own.controller == "sway" else "sway"
         changed = flown.with_vehicle(own.model_copy(update={"controller": other}))
         yield from _tried(changed, setup, f"vehicle.controller = '{other}'", 0.0)
-    if own.coefficients_file is None:  # these are of this vehicle
-        other = "sparus2" if own.name == "alice" else "alice"
-        sound = own.model_copy(
-            update={"name": other, "thruster_health": type(own.thruster_health)()}
-        )
+    if own.file is not None or own.coefficients_file is not None:  # of this vehicle alone
+        return
+    for other in (name for name in GEOMETRIES if name != own.name):
+        sound = own.model_copy(update={"name": other, "thruster_health": {}})
         yield from _tried(flown.with_vehicle(sound), setup, f"vehicle.name = '{other}'", 1.0)
 
 

@@ -33,8 +33,7 @@ from numpy.typing import NDArray
 from alice_survey.base.config import SeaConfig, SurveyConfig, VehicleConfig
 from alice_survey.base.errors import PlanError, VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.files import coefficients_from_file
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import coefficients_from_file, vehicle_from
 from alice_survey.vehicle.limits import STEP_MPS, spot_rate_rad_s
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
@@ -80,7 +79,9 @@ class FlightConditions:
             VehicleError: as `sound_craft_of`.
         """
         craft = craft_of(settings)
-        return replace(self, craft=craft, manner=_manner(craft, settings), hotel_w=settings.hotel_w)
+        return replace(
+            self, craft=craft, manner=_manner(craft, settings), hotel_w=hotel_w(settings)
+        )
 
 
 def flight_conditions(config: SurveyConfig) -> FlightConditions:
@@ -100,7 +101,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         turn_radius_m=plan.arc_radius_m,
         most_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
-        hotel_w=config.vehicle.hotel_w,
+        hotel_w=hotel_w(config.vehicle),
     )
 
 
@@ -153,22 +154,22 @@ def vehicle_costs(
             f"lines on {asked_deg:g} deg cannot be flown both ways (the nearest that can are on "
             f"{nearest_deg:.0f} deg)"
         )
-    hotel_w = conditions.hotel_w
+    hotel = conditions.hotel_w
     arc_w, pace = _arc(conditions)
     step_mps, step_w = _sway_step(craft, courses, current, conditions.manner)
     heave_mps, heave_w = _heave(craft, current)
     return Costs(
         speed_mps=conditions.speed_mps,
-        line_w=lines + hotel_w + imaging_w,
-        way_w=between + hotel_w,
-        spot_w=spot_w + hotel_w,
-        arc_extra_w=(arc_w + hotel_w) / pace - _known_mean(between) - hotel_w,
+        line_w=lines + hotel + imaging_w,
+        way_w=between + hotel,
+        spot_w=spot_w + hotel,
+        arc_extra_w=(arc_w + hotel) / pace - _known_mean(between) - hotel,
         turn_rate_rad_s=turn_rad_s,
         settle_s=SETTLE_S,
         sway_mps=step_mps,
-        sway_w=step_w + hotel_w,
+        sway_w=step_w + hotel,
         heave_mps=heave_mps,
-        heave_w=heave_w + hotel_w,
+        heave_w=heave_w + hotel,
         refused=refused,
     )
 
@@ -204,9 +205,36 @@ def _flies_heading(conditions: FlightConditions) -> bool:
     return bool(np.all(np.isfinite(_line_power(conditions, there_and_back))))
 
 
+def battery_wh(settings: VehicleConfig) -> float:
+    """The battery of a survey's vehicle.
+
+    Raises:
+        VehicleError: neither the settings nor the vehicle state it.
+    """
+    return _stated("battery_wh", settings.battery_wh, settings)
+
+
+def hotel_w(settings: VehicleConfig) -> float:
+    """What a survey's vehicle takes for everything but thrusters and strobes.
+
+    Raises:
+        VehicleError: neither the settings nor the vehicle state it.
+    """
+    return _stated("hotel_w", settings.hotel_w, settings)
+
+
+def _stated(field: str, set_to: float | None, settings: VehicleConfig) -> float:
+    if set_to is not None:
+        return set_to
+    own: float | None = getattr(sound_craft_of(settings), field)
+    if own is None:
+        raise VehicleError(f"{settings.name}: states no {field}: add it, or set vehicle.{field}")
+    return own
+
+
 def usable_wh(settings: VehicleConfig) -> float:
     """What a dive may take of a battery."""
-    return settings.battery_wh * (1.0 - settings.battery_reserve)
+    return battery_wh(settings) * (1.0 - settings.battery_reserve)
 
 
 def sound_craft_of(settings: VehicleConfig) -> Vehicle:
@@ -217,8 +245,8 @@ def sound_craft_of(settings: VehicleConfig) -> Vehicle:
     """
     file = settings.coefficients_file
     if file is None:
-        return vehicle(settings.name, settings.coefficients)
-    return vehicle(settings.name).with_coefficients(coefficients_from_file(file))
+        return vehicle_from(settings.name, settings.coefficients)
+    return vehicle_from(settings.name).with_coefficients(coefficients_from_file(file))
 
 
 def craft_of(settings: VehicleConfig) -> Vehicle:
@@ -228,9 +256,7 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
         VehicleError: as `sound_craft_of`.
     """
     craft = sound_craft_of(settings)
-    lost = settings.thruster_health.impaired if settings.health_known else {}
-    present = {thruster.name for thruster in craft.thrusters}
-    left = craft.weakened({name: left for name, left in lost.items() if name in present})
+    left = craft.weakened(settings.impaired if settings.health_known else {})
     if not left.thrusters:
         raise VehicleError(f"{craft.name} has no thruster left: check vehicle.thruster_health")
     return left

@@ -12,6 +12,7 @@ from alice_survey.base.trajectory import Trajectory
 from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING
 from alice_survey.vehicle.pilot.standing import STOP_M
 from alice_survey.vehicle.simulator import Flown
+from alice_survey.vehicle.vehicle import Vehicle
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
 
@@ -21,8 +22,8 @@ class Flight:
     """A flown plan."""
 
     plan: Plan
-    vehicle: str
-    """Name of the vehicle."""
+    vehicle: Vehicle
+    """What flew, with all its thrust."""
     truth: Trajectory
     """True motion of the body origin."""
     glass_ned: Array

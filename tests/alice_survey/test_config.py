@@ -179,9 +179,21 @@ def test_files_named_in_settings_are_relative_to_them(tmp_path: Path) -> None:
 
 def test_thrusters_have_their_health_by_name() -> None:
     config = parse_config({"vehicle": {"thruster_health": {"stern": 0.0, "bow": 0.5}}}, "test")
-    assert config.vehicle.thruster_health.impaired == {"stern": 0.0, "bow": 0.5}
-    with pytest.raises(ConfigError):
-        parse_config({"vehicle": {"thruster_health": {"warp": 0.0}}}, "test")
+    assert config.vehicle.impaired == {"stern": 0.0, "bow": 0.5}
+    for wrong in (1.5, -0.1, True, "half"):
+        with pytest.raises(ConfigError, match="thruster_health"):
+            parse_config({"vehicle": {"thruster_health": {"bow": wrong}}}, "test")
+
+
+def test_a_vehicle_is_a_name_or_a_file_relative_to_the_settings(tmp_path: Path) -> None:
+    path = tmp_path / "survey.toml"
+    for name, file in (
+        ("rov.toml", tmp_path / "rov.toml"),
+        ("/far/rov.JSON", Path("/far/rov.JSON")),
+    ):
+        path.write_text(f'[vehicle]\nname = "{name}"\n')
+        assert load_config(path).vehicle.file == file
+    assert SurveyConfig().vehicle.file is None
 
 
 @pytest.mark.parametrize(
