@@ -254,6 +254,8 @@ class PlanConfig(Config):
         return max(self.turn_radius_m, math.ceil(100.0 * least_m) / 100.0)
 
 
+_INTACT = dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0)
+"""As workspaces have always recorded it; thrusters that are not named are intact, too."""
 VEHICLE_FILES = (".toml", ".json")
 """Endings of the files that describe a vehicle."""
 
@@ -261,7 +263,7 @@ VEHICLE_FILES = (".toml", ".json")
 class VehicleConfig(Config):
     """The vehicle and how it is controlled.
 
-    What is left out of battery and hotel load is the vehicle's own.
+    Battery and hotel load are ALICE's; of another vehicle its own, where they are not set.
     """
 
     name: str = Field("alice", min_length=1)
@@ -270,12 +272,12 @@ class VehicleConfig(Config):
     coefficients_file: Path | None = None
     controller: Literal["sway", "los"] = "sway"
     allocation: Literal["exact", "rpi"] = "exact"
-    thruster_health: dict[str, Share] = Field(default_factory=dict)
+    thruster_health: dict[str, Share] = Field(default_factory=lambda: dict(_INTACT))
     """Share of its greatest thrust that each thruster has left: 0 failed, 1 intact."""
     health_known: bool = True
-    battery_wh: float | None = Field(None, ge=0.01, le=1_000_000)
+    battery_wh: float = Field(1400.0, ge=0.01, le=1_000_000)
     battery_reserve: float = Field(0.2, ge=0, lt=1)
-    hotel_w: float | None = Field(None, ge=0, le=5000)
+    hotel_w: float = Field(60.0, ge=0, le=5000)
     dive: int | None = Field(None, ge=1)
 
     @property

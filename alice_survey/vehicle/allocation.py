@@ -7,8 +7,9 @@ bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write
   weighted thrust;
 - `allocate_rpi`: the redistributed pseudo-inverse of the paper.
 
-An axis of weight 0 is not requested: gravity handles roll and pitch. The others decide what
-is given up when not all is attainable, by the square of their weights times the squared miss.
+An axis of weight 0 is not requested: gravity handles roll and pitch, unless thrusters can. The
+others decide what is given up when not all is attainable, by the square of their weights times the
+squared miss.
 A failed thruster has the bounds 0 and 0. A wrench that is not a number gives NaN thrusts.
 
 The exact solver: bounded weighted least squares, then least thrust, by two small active sets.
@@ -63,6 +64,9 @@ the pictures square and the thrusters pointing where the controller thinks they 
 the line; surge only costs time. Each counts about ten times the next by the square of its miss, a
 newton metre of yaw, on arms near a metre, as a newton."""
 AXIS_WEIGHTS.setflags(write=False)
+LEVEL_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 30.0, 30.0, 10.0])
+"""The same where thrusters hold roll and pitch: a vehicle that tips over steers no more."""
+LEVEL_WEIGHTS.setflags(write=False)
 
 _MOST_EXPONENT = 9.0
 

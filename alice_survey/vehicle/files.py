@@ -8,7 +8,7 @@ direction are needed where logs give thrusts; speeds need its diameter and k_t t
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -20,7 +20,7 @@ from alice_survey.base.config import VEHICLE_FILES, Config
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import VehicleError, why
 from alice_survey.vehicle.coefficients import FORCES, Coefficients
-from alice_survey.vehicle.fleet import OWN_SET, vehicle
+from alice_survey.vehicle.fleet import GEOMETRIES, OWN_SET, usual_kq, vehicle
 from alice_survey.vehicle.hull import POINT, Hull
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
@@ -33,13 +33,26 @@ _THRUSTER_DEFAULTS: Mapping[str, Any] = {
     "time_constant_s": 0.1,
 }  # fmt: skip
 """Defaults of a thruster in a file: its thrusts are given, its speeds have no meaning."""
+_DESCRIBED = {
+    path.stem: path for path in sorted((Path(__file__).parent / "fleet_files").glob("*.toml"))
+}
+"""Files of the vehicles that are known by name, but for those that are computed (`fleet`)."""
 _MOST_FAULTS = 3
 """Faults of a file that one message names."""
 _NEEDED_FOR_SPEEDS = ("diameter_m", "kt_forward", "kt_reverse", "time_constant_s")
+_NEEDED_TO_FLY = (*_NEEDED_FOR_SPEEDS, "most_rps")
 
 
 def _with_defaults(table: object) -> object:
-    return {**_THRUSTER_DEFAULTS, **table} if isinstance(table, dict) else table
+    if not isinstance(table, dict):
+        return table
+    found = {**_THRUSTER_DEFAULTS, **table}
+    if "diameter_m" in table:  # else thrusts are given, and torques are not known
+        for way in ("forward", "reverse"):
+            kt = table.get(f"kt_{way}")
+            if isinstance(kt, int | float) and kt > 0 and f"kq_{way}" not in table:
+                found[f"kq_{way}"] = usual_kq(kt)
+    return found
 
 
 class _VehicleFile(Config):
@@ -67,9 +80,14 @@ def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
         VehicleError: neither is known, or the file does not describe a vehicle.
     """
     path = Path(name_or_file)
-    if path.suffix.lower() not in VEHICLE_FILES:
+    if path.suffix.lower() in VEHICLE_FILES:
+        return vehicle_from_file(path)
+    if name_or_file in GEOMETRIES:
         return vehicle(name_or_file, coefficients)
-    return vehicle_from_file(path)
+    if name_or_file in _DESCRIBED:
+        return vehicle_from_file(_DESCRIBED[name_or_file])
+    known = ", ".join([*GEOMETRIES, *_DESCRIBED])
+    raise VehicleError(f"vehicle {name_or_file!r} is not known; known: {known}, or a TOML file")
 
 
 def vehicle_from_file(path: Path) -> Vehicle:
@@ -96,11 +114,26 @@ def vehicle_from_file(path: Path) -> Vehicle:
     )
 
 
-def speeds_missing(path: Path) -> list[str]:
+def vehicle_to_fly(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
+    """A vehicle as `vehicle_from`, of which all is known that flying takes.
+
+    Raises:
+        VehicleError: as there; or a file leaves out what its thrusters can.
+    """
+    craft, path = vehicle_from(name_or_file, coefficients), Path(name_or_file)
+    if path.suffix.lower() in VEHICLE_FILES:
+        lacking = speeds_missing(path, _NEEDED_TO_FLY)
+        if lacking or not craft.thrusters:
+            what = f"of thrusters {'; '.join(lacking)}" if lacking else "thrusters"
+            raise VehicleError(f"{path}: to be flown it needs {what}")
+    return craft
+
+
+def speeds_missing(path: Path, needed: Sequence[str] = _NEEDED_FOR_SPEEDS) -> list[str]:
     """Thrusters of a vehicle file that do not define what their speeds mean, in words."""
     lacking = []
     for thruster in read_table(path).get("thrusters", []):
-        missing = [field for field in _NEEDED_FOR_SPEEDS if field not in thruster]
+        missing = [field for field in needed if field not in thruster]
         if missing:
             lacking.append(f"{thruster.get('name')} ({', '.join(missing)})")
     return lacking

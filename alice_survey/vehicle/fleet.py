@@ -70,7 +70,8 @@ _T200_KT, _T200_KT_REVERSE = 0.472, 0.398
 51.5 N: what it reaches on 16 V."""
 
 
-def _kq(kt: float) -> float:
+def usual_kq(kt: float) -> float:
+    """k_q of a propeller of this k_t that is as good as the one above."""
     return float(_MERIT * kt**1.5)
 
 
@@ -82,9 +83,9 @@ def _t200(name: str, x_m: float) -> Thruster:
     return Thruster(
         name=name, kind="tunnel", position_body_m=(x_m, 0.0, 0.0), direction_body=(0.0, 1.0, 0.0),
         diameter_m=0.076, kt_forward=_T200_KT, kt_reverse=_T200_KT_REVERSE,
-        kq_forward=_kq(_T200_KT), kq_reverse=_kq(_T200_KT_REVERSE), handedness=1,
+        kq_forward=usual_kq(_T200_KT), kq_reverse=usual_kq(_T200_KT_REVERSE), handedness=1,
         most_rps=56.5, dead_band_rps=5.0, time_constant_s=0.15,
-        advance_slope=_T200_KT * _KT_FALL, torque_slope=_kq(_T200_KT) * _KQ_FALL,
+        advance_slope=_T200_KT * _KT_FALL, torque_slope=usual_kq(_T200_KT) * _KQ_FALL,
         jet_loss=_JET_LOSS, jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
     )  # fmt: skip
 
@@ -93,10 +94,10 @@ def _main(name: str, x_m: float, y_m: float, handedness: Literal[-1, 1]) -> Thru
     """A horizontal thruster: place, k_t, 3000 rpm (model) and lag (Toulon); dead band inferred."""
     return Thruster(
         name=name, kind="open", position_body_m=(x_m, y_m, 0.0), direction_body=(1.0, 0.0, 0.0),
-        diameter_m=0.08, kt_forward=0.698, kt_reverse=0.293, kq_forward=_kq(0.698),
-        kq_reverse=_kq(0.293), handedness=handedness, most_rps=50.0,
+        diameter_m=0.08, kt_forward=0.698, kt_reverse=0.293, kq_forward=usual_kq(0.698),
+        kq_reverse=usual_kq(0.293), handedness=handedness, most_rps=50.0,
         dead_band_rps=2.0, time_constant_s=0.8, advance_slope=0.698 * _KT_FALL,
-        torque_slope=_kq(0.698) * _KQ_FALL, thrust_deduction=_DEDUCTION, wake_fraction=_WAKE,
+        torque_slope=usual_kq(0.698) * _KQ_FALL, thrust_deduction=_DEDUCTION, wake_fraction=_WAKE,
         efficiency=_EFFICIENCY,
     )  # fmt: skip
 
@@ -104,8 +105,8 @@ def _main(name: str, x_m: float, y_m: float, handedness: Literal[-1, 1]) -> Thru
 _HEAVE = Thruster(
     name="vertical", kind="tunnel", position_body_m=(0.0, 0.0, 0.07),
     direction_body=(0.0, 0.0, 1.0), diameter_m=0.08, kt_forward=0.537, kt_reverse=0.278,
-    kq_forward=_kq(0.537), kq_reverse=_kq(0.278), handedness=1, most_rps=50.0, dead_band_rps=2.0,
-    time_constant_s=0.4, advance_slope=0.537 * _KT_FALL, torque_slope=_kq(0.537) * _KQ_FALL,
+    kq_forward=usual_kq(0.537), kq_reverse=usual_kq(0.278), handedness=1, most_rps=50.0,
+    dead_band_rps=2.0, time_constant_s=0.4, advance_slope=0.537 * _KT_FALL, torque_slope=usual_kq(0.537) * _KQ_FALL,
     jet_loss=_JET_LOSS, jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
 )  # fmt: skip
 """Place, k_t, 3000 rpm (model) and lag (Toulon). Down is its strong side, as in Toulon."""

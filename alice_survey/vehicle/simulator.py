@@ -17,6 +17,7 @@ from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.allocation import (
     AXIS_WEIGHTS,
+    LEVEL_WEIGHTS,
     AllocationScratch,
     allocate_exact,
     allocate_rpi,
@@ -392,8 +393,9 @@ def _allocation(setup: Setup) -> Allocation:
     health = setup.vehicle.health_of(left)
     believed = setup.believed or setup.vehicle
     matrix = np.ascontiguousarray(believed.configuration_matrix)
+    weights = LEVEL_WEIGHTS if setup.gains.holds_level else AXIS_WEIGHTS
     return Allocation(
-        setup.exact_allocation, believed.plant.propulsion, matrix, AXIS_WEIGHTS.copy(), health,
+        setup.exact_allocation, believed.plant.propulsion, matrix, weights.copy(), health,
         lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
         command_rps=np.zeros(n), scratch=allocation_scratch(n),
     )  # fmt: skip

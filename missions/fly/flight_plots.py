@@ -86,8 +86,10 @@ def draw_flight(path: Path, flight: Flight) -> None:
 def draw_vehicle(path: Path, flight: Flight) -> None:
     """Draw the track, coloured by speed, next to strips of speed, roll, thrusters and power."""
     craft = flight.vehicle
-    lateral = [t.name for t in craft.thrusters if abs(t.direction_body[1]) > 0.5]
     main = [t.name for t in craft.thrusters if abs(t.direction_body[0]) > 0.5]
+    lateral = [
+        t.name for t in craft.thrusters if abs(t.direction_body[1]) > 0.5 and t.name not in main
+    ]
     other = [t.name for t in craft.thrusters if t.name not in (*main, *lateral)]
     groups = [group for group in (main, lateral, other) if group]
     figure, chart, strips = _sheet(4 + len(groups))

@@ -91,7 +91,7 @@ def flight_settings(config: SurveyConfig) -> FlightSettings:
 
 def with_values(section: _Section, **values: Any) -> _Section:
     """A section of settings with some values replaced and checked."""
-    return type(section).model_validate({**section.model_dump(), **values})
+    return type(section).model_validate({**section.model_dump(exclude_unset=True), **values})
 
 
 class SeaFloor(Protocol):

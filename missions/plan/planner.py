@@ -17,7 +17,7 @@ from shapely.geometry import Point
 
 from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.base.errors import PlanError, heard, warn
-from alice_survey.vehicle.hull import Hull
+from alice_survey.vehicle.hull import POINT, Hull
 from alice_survey.vehicle.vehicle import Vehicle
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
@@ -100,6 +100,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         _warn_of_spacing(wanted, imaging, stereo)
         craft, glass_body_m = sound_craft_of(config.vehicle), config.camera.position_body_m
         hull = craft.hull
+        if hull == POINT:
+            warn(f"{craft.name} has no [hull]: distances to floor and zones are those of one point")
         _warn_of_zones(area, config.area.no_go_clearance_m, hull, glass_body_m)
         depth_m = _depth_m(config.area, area, bathymetry)
         _check_depth(wanted.altitude_m, depth_m)

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from alice_survey.base.config import SeaConfig, SurveyConfig, VehicleConfig
 from alice_survey.base.errors import PlanError, VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.files import coefficients_from_file, vehicle_from
+from alice_survey.vehicle.files import coefficients_from_file, vehicle_to_fly
 from alice_survey.vehicle.limits import STEP_MPS, spot_rate_rad_s
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
@@ -211,7 +211,7 @@ def battery_wh(settings: VehicleConfig) -> float:
     Raises:
         VehicleError: neither the settings nor the vehicle state it.
     """
-    return _stated("battery_wh", settings.battery_wh, settings)
+    return _stated("battery_wh", settings)
 
 
 def hotel_w(settings: VehicleConfig) -> float:
@@ -220,12 +220,13 @@ def hotel_w(settings: VehicleConfig) -> float:
     Raises:
         VehicleError: neither the settings nor the vehicle state it.
     """
-    return _stated("hotel_w", settings.hotel_w, settings)
+    return _stated("hotel_w", settings)
 
 
-def _stated(field: str, set_to: float | None, settings: VehicleConfig) -> float:
-    if set_to is not None:
-        return set_to
+def _stated(field: str, settings: VehicleConfig) -> float:
+    if field in settings.model_fields_set:
+        stated: float = getattr(settings, field)
+        return stated
     own: float | None = getattr(sound_craft_of(settings), field)
     if own is None:
         raise VehicleError(f"{settings.name}: states no {field}: add it, or set vehicle.{field}")
@@ -245,8 +246,8 @@ def sound_craft_of(settings: VehicleConfig) -> Vehicle:
     """
     file = settings.coefficients_file
     if file is None:
-        return vehicle_from(settings.name, settings.coefficients)
-    return vehicle_from(settings.name).with_coefficients(coefficients_from_file(file))
+        return vehicle_to_fly(settings.name, settings.coefficients)
+    return vehicle_to_fly(settings.name).with_coefficients(coefficients_from_file(file))
 
 
 def craft_of(settings: VehicleConfig) -> Vehicle:

@@ -386,8 +386,16 @@ diameter_m = 0.076
 kt_forward = 0.47
 kt_reverse = 0.40
 time_constant_s = 0.15
+[[thrusters]]
+name = "vertical"
+position_body_m = [0.0, 0.0, 0.0]
+direction_body = [0.0, 0.0, 1.0]
+diameter_m = 0.076
+kt_forward = 0.47
+kt_reverse = 0.40
+time_constant_s = 0.15
 """
-"""A vehicle with two thrusters; what its owner knows of it stands in the page on it."""
+"""A vehicle with three thrusters; what its owner knows of it stands in the page on it."""
 
 
 def own_logs(folder: Path) -> None:
@@ -401,7 +409,7 @@ def own_logs(folder: Path) -> None:
     def asked(time_s: float) -> Array:
         surge = (22.0, 34.0, 14.0, -18.0)[int(time_s // 8.0) % 4]
         turn = (6.0, -9.0, 0.0)[int(time_s // 5.0) % 3]
-        return np.array([surge + turn, surge - turn])
+        return np.array([surge + turn, surge - turn, 0.0])
 
     for name, seconds, heading_rad in (("dive1.csv", 48.0, 0.4), ("dive2.csv", 30.0, 2.0)):
         log = fly(truth, duration_s=seconds, asked=asked, attitude_rad=(0.0, 0.0, heading_rad))

@@ -35,9 +35,10 @@ rate, which with the feed-forward of drag moves the zero onto a pole at -omega.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
@@ -45,10 +46,13 @@ from alice_survey.vehicle.dynamics import Body, coriolis_matrix
 from alice_survey.vehicle.propulsion import thrust_limits
 from alice_survey.vehicle.vehicle import Vehicle
 
-SURGE, SWAY, HEAVE, YAW = 0, 1, 2, 3
+SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = range(6)
 """Rows of `Gains.axes`."""
 DEGREES = (0, 1, 2, 5)
-"""Which of the 6 degrees of freedom each row is."""
+"""Which of the 6 degrees of freedom each of the first rows is: those that a mission steers."""
+STEERED = len(DEGREES)
+LEVEL = (3, 4)
+"""The same of the rows after them, which are held level: by thrusters that can, else by gravity."""
 _LATERAL = [1, 5]
 
 MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
@@ -70,6 +74,8 @@ LEAST_HEADING_DAMPING = 0.5
 """Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
 PASSING_DAMPING = 0.2
 """Reduction of the heading loop's damping below the survey's speed (inferred)."""
+_AT_REST_PER_S = 1e-9
+"""Poles nearer to 0 do not move."""
 _RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
 _PLACE_FACTORS = np.geomspace(0.5, 16.0, 61)
 _SLOWER = (0.0, 0.5)
@@ -84,7 +90,13 @@ class Gains(NamedTuple):
     body: Body
     """Inertia and damping, for feed-forward."""
     axes: Array
-    """(4, 11) rows SURGE, SWAY, HEAVE, YAW; an axis that no thruster moves has zero gains."""
+    """(6, 11) rows SURGE, SWAY, HEAVE, YAW, ROLL, PITCH; an axis that no thruster moves has zero
+    gains, and so have roll and pitch where the thrusters cannot hold both and steer as well."""
+
+    @property
+    def holds_level(self) -> bool:
+        """Whether thrusters hold roll and pitch."""
+        return bool(np.all(self.axes[[ROLL, PITCH], MASS] > 0.0))
 
 
 def gains_for(
@@ -111,13 +123,16 @@ def gains_for(
     lower, upper = np.zeros(count), np.zeros(count)
     cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
     thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
-    configuration = vehicle.configuration_matrix[list(DEGREES)]
+    degrees = (*DEGREES, *LEVEL)
+    configuration = vehicle.configuration_matrix[list(degrees)]
+    if not _holds(configuration, lower, upper):
+        configuration = configuration[:STEERED]
     slowness_s = np.array([thruster.time_constant_s for thruster in vehicle.thrusters])
     damping = linear_damping(plant.body, cruise)
-    axes = np.zeros((4, 11))
+    axes = np.zeros((6, 11))
     fastest_rad_s = 2 * math.pi * navigation_hz / SAMPLES_PER_PERIOD
     gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
-    for axis, degree in enumerate(DEGREES):
+    for axis, degree in enumerate(degrees[: len(configuration)]):
         inertia = float(vehicle.mass[degree, degree])
         least, most = authority(configuration, lower, upper, axis)
         axes[axis, [MASS, LEAST, MOST]] = inertia, least, most
@@ -133,6 +148,10 @@ def gains_for(
         lag_s = effective_lag_s(configuration, lower, upper, slowness_s, axis, gyradius_m)
         lag_s += tick_s / 2
         decay = float(damping[degree, degree]) / inertia
+        if axis >= STEERED:  # attitude and its rates are known at every tick
+            omega, rate, place = placed(lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * tick_s))
+            axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
+            continue
         omega, rate, place = placed(lag_s, decay, fastest_rad_s)
         axes[axis, [RATE, PLACE]] = rate, place
         axes[axis, INNER] = min(rate, 1.0 / (4.0 * lag_s)) if axis == SWAY else rate
@@ -159,6 +178,20 @@ def gains_for(
             axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
     axes[YAW, FASTEST] = min(axes[YAW, FASTEST], most_turn_rad_s)
     return Gains(plant.body, axes)
+
+
+def _holds(configuration: Array, lower: Array, upper: Array) -> bool:
+    """Whether thrusters can turn the vehicle both ways in roll and pitch, and do nothing else.
+
+    Args:
+        configuration: (6, n) rows as of `Gains.axes`.
+        lower: (n,) least thrust.
+        upper: (n,) greatest thrust.
+    """
+    if np.linalg.matrix_rank(configuration[[0, 2, 3, 4, 5]]) < 5:
+        return False
+    ends = [authority(configuration, lower, upper, axis) for axis in (ROLL, PITCH)]
+    return all(min(-least, most) > 1e-6 for least, most in ends)
 
 
 def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[float, float, float]:
@@ -226,8 +259,17 @@ def heading_loop(body: Body, speed_mps: float, row: Array) -> Array:
 
 def damping_ratio(loop: Array) -> float:
     """Least damping ratio of a state matrix's modes; negative if one grows."""
-    poles = np.linalg.eigvals(loop)
-    return float(np.min(-poles.real / np.abs(poles)))
+    return float(_mode_damping(np.linalg.eigvals(loop)).min())
+
+
+def _mode_damping(poles: NDArray[Any]) -> Array:
+    """Damping ratio of each pole; 1 of one at rest: a sway that no water damps is its own loop's.
+
+    Args:
+        poles: complex.
+    """
+    size = np.abs(poles)
+    return np.where(size > _AT_REST_PER_S, -poles.real / np.maximum(size, _AT_REST_PER_S), 1.0)
 
 
 def _damped_together(
@@ -270,7 +312,7 @@ def _damped_together(
             loops = loops[:, [[0], [1], [3], [4]], [0, 1, 3, 4]]
         poles = np.linalg.eigvals(loops)
         size = np.abs(poles)
-        ratio = (-poles.real / size).min(axis=1)
+        ratio = _mode_damping(poles).min(axis=1)
         fast = np.any((np.abs(poles.imag) > 0.0) & (size > sampled_rad_s), axis=1)
         if share < 1.0:
             ratio += PASSING_DAMPING
@@ -308,7 +350,7 @@ def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tu
     """Least and greatest force on one axis while the other axes get none: a linear programme.
 
     Args:
-        configuration: (4, n) force on each axis by thrust.
+        configuration: (A, n) force on each axis by thrust.
         lower: (n,) least thrust.
         upper: (n,) greatest thrust.
         axis: row.
@@ -343,14 +385,15 @@ def effective_lag_s(
     thruster plays a part by all that it does, as when one cancels the yaw of another.
 
     Args:
-        configuration: (4, n) force on each axis by thrust.
+        configuration: (A, n) force on each axis by thrust, A 4 or 6.
         lower: (n,) least thrust.
         upper: (n,) greatest thrust.
         time_constant_s: (n,) of the thrusters.
         axis: row.
         gyradius_m: by which moments are divided to be compared with forces.
     """
-    scaled = configuration / np.array([1.0, 1.0, 1.0, gyradius_m])[:, None]
+    arms = np.array([1.0, 1.0, 1.0, gyradius_m, gyradius_m, gyradius_m])
+    scaled = configuration / arms[: len(configuration), None]
     strength = np.minimum(-lower, upper)
     thrust = strength * np.linalg.pinv(scaled * strength)[:, axis]
     part = np.abs(thrust) * np.linalg.norm(scaled, axis=0)

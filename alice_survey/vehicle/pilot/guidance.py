@@ -56,6 +56,7 @@ from alice_survey.vehicle.pilot.steering import (
     go_to,
     head_for,
     hear_floor,
+    hold_level,
     sink_to,
     surge_at,
     write_point,
@@ -132,6 +133,7 @@ def steer(
             if phase == ASCEND:
                 report[slot.PHASE] = DONE
     write_wrench(gains, pilot, wrench)
+    hold_level(estimate, gains, pilot, wrench)
     if guidance.sway == 0.0:
         wrench[1] = 0.0
 

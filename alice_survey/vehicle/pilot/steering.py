@@ -28,8 +28,11 @@ from alice_survey.vehicle.pilot.gains import (
     LEAST,
     MASS,
     MOST,
+    PITCH,
     PLACE,
     RATE,
+    ROLL,
+    STEERED,
     SURGE,
     SWAY,
     WEIGHT,
@@ -134,7 +137,7 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
     Args:
         gains: the vehicle.
         pilot: its demand is read, and the notes are written into it.
-        wrench: (6,) N and N m is written. Roll and pitch are not controlled.
+        wrench: (6,) N and N m is written; of roll and pitch see `hold_level`.
     """
     body, demand, motion, force = gains.body, pilot.demand, pilot.motion, pilot.force
     for i in range(6):
@@ -153,6 +156,29 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
         least, most = gains.axes[axis, LEAST], gains.axes[axis, MOST]
         demand[slot.FULL_SURGE + axis] = 1.0 if asked > most else (-1.0 if asked < least else 0.0)
         wrench[i] = min(max(asked, least), most)
+
+
+@kernel
+def hold_level(estimate: Array, gains: Gains, pilot: PilotState, wrench: Array) -> None:
+    """Add the moments that hold roll and pitch level, where thrusters can: PD and computed torque.
+
+    The computed part is what the wanted motion and the centre of gravity do at level attitude,
+    which is why `write_wrench` comes first. What gravity rights by itself comes on top.
+    """
+    body = gains.body
+    for axis in (ROLL, PITCH):
+        row = gains.axes[axis]
+        if row[MASS] == 0.0:
+            continue
+        i = 3 if axis == ROLL else 4
+        angle = estimate[vector.ROLL] if axis == ROLL else estimate[vector.PITCH]
+        rate = estimate[vector.P] if axis == ROLL else estimate[vector.Q]
+        asked = -row[MASS] * (row[PLACE] * angle + row[RATE] * rate) - pilot.force[i]
+        for other in range(STEERED):
+            k = other if other < 3 else 5
+            asked += body.mass[i, k] * pilot.demand[slot.ACC_SURGE + other]
+        asked += body.weight_n * (-body.cg[1] if axis == ROLL else body.cg[0])
+        wrench[i] = min(max(asked, row[LEAST]), row[MOST])
 
 
 DEPTH_KEPT_M = 0.2

@@ -109,7 +109,7 @@ class Flight:
         rows = np.zeros((round(seconds / TICK_S), 34))
         thrusters = len(self.state) - 13
         lag_s = np.zeros(6)
-        lag_s[list(DEGREES)] = np.maximum(self.gains.axes[:, LAG] - TICK_S / 2, 0.0)
+        lag_s[list(DEGREES)] = np.maximum(self.gains.axes[: len(DEGREES), LAG] - TICK_S / 2, 0.0)
         keep = np.exp(-TICK_S / STEPS / np.maximum(lag_s, 1e-6))
         _fly(
             self.ticks, self.state, self.load, self.floor, keep, self.plant, self.current,
