@@ -106,7 +106,8 @@ _HEAVE = Thruster(
     name="vertical", kind="tunnel", position_body_m=(0.0, 0.0, 0.07),
     direction_body=(0.0, 0.0, 1.0), diameter_m=0.08, kt_forward=0.537, kt_reverse=0.278,
     kq_forward=usual_kq(0.537), kq_reverse=usual_kq(0.278), handedness=1, most_rps=50.0,
-    dead_band_rps=2.0, time_constant_s=0.4, advance_slope=0.537 * _KT_FALL, torque_slope=usual_kq(0.537) * _KQ_FALL,
+    dead_band_rps=2.0, time_constant_s=0.4, advance_slope=0.537 * _KT_FALL,
+    torque_slope=usual_kq(0.537) * _KQ_FALL,
     jet_loss=_JET_LOSS, jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
 )  # fmt: skip
 """Place, k_t, 3000 rpm (model) and lag (Toulon). Down is its strong side, as in Toulon."""
