@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError
+from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum
 from missions.logs.dataflash import LogTable, Mask, read_dataflash
 from missions.logs.dive import DATED_AFTER_S, LoggedDive
@@ -30,6 +30,16 @@ _DOWN = 25
 """ROTATION_PITCH_270: a range finder that looks down."""
 _GOOD = 4
 """RangeFinder status: in range."""
+_SUBMARINE = 12
+_KINDS = {
+    1: "an aeroplane", 2: "a quadrotor", 3: "a coaxial helicopter", 4: "a helicopter",
+    10: "a ground vehicle", 11: "a boat", 13: "a hexarotor", 14: "an octorotor",
+    **dict.fromkeys(range(19, 26), "an aeroplane that starts upright"),
+}  # fmt: skip
+"""What moves, by MAV_TYPE (mavlink.io/en/messages/minimal.html)."""
+_NO_VEHICLES = {0, 5, 6, 18, 26, 27, 30}
+"""Generic parts, antenna trackers, ground stations, companion computers, gimbals, ADS-B, cameras.
+"""
 _REBOOT_S = 1.0
 """A clock since boot that goes back by more has been started again."""
 
@@ -158,8 +168,10 @@ def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read a ground station's log; arguments and errors as of `read_ardusub_bin`."""
     lost: Counter[str] = Counter()
     wanted = {source.message for sources in _TLOG.values() for source in sources}
-    tables, present = read_tlog(path, wanted, lost)
+    tables, present = read_tlog(path, {*wanted, "HEARTBEAT"}, lost)
+    beats = tables.pop("HEARTBEAT", None)
     vehicle = _vehicle(path, tables, present)
+    _warn_of_other_kinds(path, beats, vehicle)
     offset: dict[str, LogTable] = {}
     for name, table in tables.items():
         own = table.rows(table.columns[SYSTEM] == vehicle)
@@ -211,6 +223,17 @@ def _vehicle(path: Path, tables: Tables, present: Sequence[str]) -> float:
         raise NavigationError(f"{path}: no message of a vehicle; it has {', '.join(present)}")
     systems, counts = np.unique(tables[name].columns[SYSTEM], return_counts=True)
     return float(systems[np.argmax(counts)])
+
+
+def _warn_of_other_kinds(path: Path, beats: LogTable | None, vehicle: float) -> None:
+    """Warn where the vehicle calls itself something else than a submarine."""
+    if beats is None or not beats.has("type"):
+        return
+    kinds = set(beats.columns["type"][beats.columns[SYSTEM] == vehicle].astype(int).tolist())
+    own = sorted(kinds - _NO_VEHICLES)
+    if own and _SUBMARINE not in own:
+        names = " and ".join(_KINDS.get(kind, f"a vehicle of MAV_TYPE {kind}") for kind in own)
+        warn(f"{path}: the log is of {names}, not of a submarine: depths are minus its heights")
 
 
 def _tlog_times(table: LogTable) -> Array:

@@ -23,6 +23,8 @@ _NAMED = 8
 _JSON = (".json", ".jsonl", ".log", ".txt", "")
 """What files of JSON reports are called."""
 _LONGEST_S = 1e9
+_MOST_OUT_OF_WATER_M = 2.0
+"""A vehicle on deck, or a barometer that is off, seldom is higher."""
 _MICRO = 1e6
 
 
@@ -128,6 +130,7 @@ def import_log(
         lost["rows without any reading"] += int((~useful).sum())
     logged_s, time_s = logged_s[useful], time_s[useful]
     columns = {name: column[useful] for name, column in columns.items()}
+    _warn_of_height(path, columns["depth_m"])
     try:
         texts = [_date(t) if dated else f"{t:.6f}" for t in time_s.tolist()]
         write_navigation_rows(out, texts, columns, "time_utc" if dated else "time_s")
@@ -137,6 +140,17 @@ def import_log(
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     tidal = isinstance(tide, Signal) or tide != 0.0
     return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
+
+
+def _warn_of_height(path: Path, depth_m: Array) -> None:
+    """Warn of places that no submarine gets to."""
+    dry = depth_m < -_MOST_OUT_OF_WATER_M
+    if dry.any():
+        warn(
+            f"{path}: {int(dry.sum())} of {len(dry)} rows lie above the water, by "
+            f"{-np.nanmin(depth_m):.1f} m at most: check the log's zero of depth, its vehicle, and "
+            "the tide; --start and --end leave parts out"
+        )
 
 
 def dead_reckoned(path: Path, dive: LoggedDive, options: ImportOptions) -> LoggedDive:

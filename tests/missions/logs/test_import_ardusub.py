@@ -455,3 +455,34 @@ def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -
             outcomes.append(report["rows"])
     # Damage is local: most of the rows of most logs are still there.
     assert np.median(outcomes) >= 15
+
+
+def test_what_is_no_submarine_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "flight.tlog"
+    log.write_bytes(tlog(telemetry()))
+    imported(tmp_path, log)
+    assert "submarine" not in capsys.readouterr().err
+    high = []
+    for i, (t, message) in enumerate(telemetry()):
+        if message.msgname == "HEARTBEAT":
+            message = mavlink.MAVLink_heartbeat_message(21, 3, 81, 0, 3, 3)
+        if message.msgname == "GLOBAL_POSITION_INT":
+            message = mavlink.MAVLink_global_position_int_message(
+                message.time_boot_ms, message.lat, message.lon, 0, 63_400 - i, 0, 0, 0, 65535
+            )
+        high.append((t, message))
+    log.write_bytes(tlog(high))
+    data = imported(tmp_path, log)
+    said = capsys.readouterr().err
+    assert "the log is of an aeroplane that starts upright, not of a submarine" in said
+    assert f"{data['rows']} of {data['rows']} rows lie above the water, by 63.4 m" in said
+
+
+def test_a_ground_station_beside_a_submarine_is_no_vehicle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "dive.tlog"
+    beats = [(t, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)) for t, _ in telemetry(2)]
+    log.write_bytes(tlog(telemetry()) + tlog(beats) + tlog(beats, system=255))
+    imported(tmp_path, log)
+    assert "submarine" not in capsys.readouterr().err
