@@ -60,6 +60,10 @@ _POOR = 0.25
 """Relative sigma of a coefficient that the logs hardly determine."""
 
 
+_AS_GOOD = 1.0
+"""Points of fit by which two predictions may differ and be equally good."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class IdentifyOptions:
     """Options of `vehicle identify`."""
@@ -125,15 +129,16 @@ def identify_report(
     parameters = free_parameters(used, free, _held(options.held))
     how = Simulation(hold=options.hold_input)
     result = _identify(windows, parameters, how, options.method)
-    validation, drift = None, None
+    validation, started, drift = None, None, None
     if options.validate is not None:
         shorter = _windows(options.validate, vehicle, options, _VALIDATION_WINDOW_S)
         of_windows([*windows, *shorter], vehicle)
-        values, drift = _with_its_current(shorter, result, how)
+        values, drift = _with_its_current(shorter, parameters, result.values, how)
         validation = validate(shorter, parameters, values, simulation=how)
+        started = _from_start(shorter, parameters, how)
     own = validate(windows, parameters, result.values, simulation=how, horizons_s=())
-    text = _text(vehicle, logs, result, thrust, own, validation, drift, options)
-    data = _data(vehicle, logs, result, thrust, own, validation)
+    text = _text(vehicle, logs, result, thrust, own, validation, started, drift, options)
+    data = _data(vehicle, logs, result, thrust, own, validation, started)
     try:
         out.mkdir(parents=True, exist_ok=True)
         identified = parameters.coefficients(result.values, "identified")
@@ -194,8 +199,19 @@ def _identify(
     return _Identified(parameters=parameters, values=fit.values, sigma=fit.sigma, fit=fit, steps=())
 
 
+def _from_start(
+    windows: Sequence[Window], parameters: Parameters, how: Simulation
+) -> MotionValidation | None:
+    """Motions of another log by the values that the fit began with; None if they do not last."""
+    try:
+        values, _ = _with_its_current(windows, parameters, parameters.start, how)
+        return validate(windows, parameters, values, simulation=how, horizons_s=())
+    except VehicleError:
+        return None
+
+
 def _with_its_current(
-    windows: Sequence[Window], result: _Identified, how: Simulation
+    windows: Sequence[Window], parameters: Parameters, found: Array, how: Simulation
 ) -> tuple[Array, Array | None]:
     """Values for another log: coefficients are the vehicle's, a current is the day's.
 
@@ -204,21 +220,16 @@ def _with_its_current(
     Returns:
         (P,) values, and the current (2,) towards north and east, if it was fitted.
     """
-    parameters = result.parameters
     if not set(CURRENTS) <= set(parameters.names):
-        return result.values, None
+        return found, None
     others = {
-        name: value
-        for name, value in parameters.others(result.values).items()
-        if name not in CURRENTS
+        name: value for name, value in parameters.others(found).items() if name not in CURRENTS
     }
-    identified = parameters.vehicle.with_coefficients(
-        parameters.coefficients(result.values, "identified")
-    )
+    identified = parameters.vehicle.with_coefficients(parameters.coefficients(found, "identified"))
     drift = fit_output_error(
         windows, free_parameters(identified, CURRENTS, others), simulation=how
     ).values
-    values = result.values.copy()
+    values = found.copy()
     for name, value in zip(CURRENTS, drift, strict=True):
         values[parameters.names.index(name)] = value
     return values, drift
@@ -251,6 +262,7 @@ def _text(
     thrust: Sequence[ThrustCoefficient],
     own: MotionValidation,
     validation: MotionValidation | None,
+    started: MotionValidation | None,
     drift: Array | None,
     options: IdentifyOptions,
 ) -> str:
@@ -284,7 +296,14 @@ def _text(
     lines += _remarks(result)
     lines += ["", *_fit_lines("Simulated over the same logs", own)]
     if validation is not None:
-        lines += ["", *_fit_lines(f"Validated on {validation.source}", validation)]
+        lines += ["", *_fit_lines(f"Validated on {validation.source}", validation, started)]
+        worse = _worse(validation, started)
+        if worse:
+            lines.append(
+                f"Worse than the values that the fit began with in {', '.join(worse)}: there the "
+                "logs say less than is known of the vehicle; free fewer coefficients, or log "
+                "manoeuvres that excite these motions"
+            )
     if drift is not None:
         lines.append(
             f"The current of that log, fitted to it with all else held: {drift[0]:.3f} m/s to the "
@@ -355,18 +374,31 @@ def high_correlations(fit: OutputErrorFit) -> list[tuple[str, str, float]]:
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
-def _fit_lines(title: str, found: MotionValidation) -> list[str]:
+def _worse(found: MotionValidation, started: MotionValidation | None) -> list[str]:
+    """Motions that the start predicts better than the fit."""
+    if started is None:
+        return []
+    gain = found.fit_percent - started.fit_percent
+    return [name for name, g in zip(CHANNEL_NAMES[:6], gain, strict=True) if g < -_AS_GOOD]
+
+
+def _fit_lines(
+    title: str, found: MotionValidation, started: MotionValidation | None = None
+) -> list[str]:
     """Fit of each motion, and the errors of forecasts."""
     names = CHANNEL_NAMES[:6]
     lines = [
         f"{title}, in stretches of at most {found.window_s:.4g} s, each from its first row",
-        "fit = 100 (1 - |y - model| / |y - mean y|) %; constant: that row's velocity is kept",
+        "fit = 100 (1 - |y - model| / |y - mean y|) %; constant: that row's velocity is kept"
+        + ("; start: the values that the fit began with" if started is not None else ""),
     ]
     fits, constant = found.fit_percent, found.constant_fit_percent
     rows = [
         ("model", *(_cell(value, ".1f") for value in fits)),
         ("constant", *(_cell(value, ".1f") for value in constant)),
     ]
+    if started is not None:
+        rows.insert(1, ("start", *(_cell(value, ".1f") for value in started.fit_percent)))
     lines += _table(("fit, %", *names), rows)
     if found.forecasts:
         rows = [
@@ -391,6 +423,7 @@ def _data(
     thrust: Sequence[ThrustCoefficient],
     own: MotionValidation,
     validation: MotionValidation | None,
+    started: MotionValidation | None,
 ) -> dict[str, Any]:
     """The same as JSON values; unknown ones are null."""
 
@@ -454,7 +487,11 @@ def _data(
         }
         data["covariance"] = [[float(value) for value in row] for row in fit.covariance]
     if validation is not None:
-        data["validation"] = fits(validation)
+        data["validation"] = {
+            **fits(validation),
+            "start_fit_percent": None if started is None else motions(started.fit_percent),
+            "worse_than_start": _worse(validation, started),
+        }
     return data
 
 

@@ -44,6 +44,10 @@ def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: P
     assert found["current_north_mps"]["factor"] is None
     assert min(data["validation"]["fit_percent"].values()) > 80.0
     assert data["validation"]["constant_fit_percent"]["u"] < 50.0
+    fits, before = (data["validation"][key] for key in ("fit_percent", "start_fit_percent"))
+    assert before["u"] < fits["u"] - 1.0 and before["r"] < fits["r"] - 1.0
+    assert data["validation"]["worse_than_start"] == []
+    assert any(line.split()[0] == "start" for line in text.splitlines() if line)
     for name in ("report.txt", "coefficients.json", "fit.png", "validation.png"):
         assert (tmp_path / "out" / name).stat().st_size > 500
     lines = text.splitlines()
@@ -58,6 +62,18 @@ def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: P
     for name in ("coefficients.json", "report.txt", "fit.png"):
         again = (tmp_path / "again" / name).read_bytes()
         assert again == (tmp_path / "out" / name).read_bytes()
+
+
+def test_a_fit_that_is_worse_than_its_start_is_said_to_be(
+    logs: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Identified from a vehicle with other drag, and validated on the one it is."""
+    log = fly(hidden({}), duration_s=24.0, asked=lambda time_s: survey_like(time_s + 53))
+    write_vehicle_log(tmp_path / "own.csv", measured(log, np.random.default_rng(4)))
+    options = IdentifyOptions(free=("X_uu", "N_rr", "current"), validate=tmp_path / "own.csv")
+    text, data = identify_report([logs[0]], tmp_path / "out", options)
+    assert set(data["validation"]["worse_than_start"]) >= {"u", "r"}
+    assert "Worse than the values that the fit began with in u" in text
 
 
 @pytest.mark.parametrize("method", ["joint", "two-step"])
