@@ -1,5 +1,6 @@
 """The `plan` commands: plan a survey, and what goes with it before and after a dive."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -91,6 +92,7 @@ def solve(
     from alice_survey.survey import settings
     from missions.exposure.settings import ImagingSetup
     from missions.exposure.solve import solve_report
+    from missions.plan.strength import endurance_s
 
     config = settings(workspace, survey, needed=False)
     if bend is not None:
@@ -106,6 +108,7 @@ def solve(
             config.area.seafloor_depth_m,
             resolution_mm=resolution,
             dive_s=dive,
+            battery_s=math.inf if dive is None else endurance_s(config),
             rate_hz=rate,
             lenses=lens or (12.5, 25.0),
         ),

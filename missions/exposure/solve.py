@@ -87,6 +87,7 @@ def solve_report(
     *,
     resolution_mm: float | None = None,
     dive_s: float | None = None,
+    battery_s: float = math.inf,
     rate_hz: float | None = None,
     lenses: Sequence[float] = (12.5, 25.0),
 ) -> tuple[str, dict[str, Any]]:
@@ -99,6 +100,7 @@ def solve_report(
             lens.
         dive_s: time of a dive: find the area that fits; with a resolution, at its altitude and
             lens.
+        battery_s: how long the battery lasts: no dive is longer.
         rate_hz: pictures a second: find the speed.
         lenses: available focal lengths, mm.
 
@@ -115,8 +117,13 @@ def solve_report(
         data["lenses"] = json_values(options)
         dived = with_lens(setup, options[0])
     if dive_s is not None:
-        area = area_for_dive(dived, seafloor_depth_m, dive_s)
+        area = area_for_dive(dived, seafloor_depth_m, min(dive_s, battery_s))
         parts.append(_area_text(area, dived))
+        if battery_s < dive_s:
+            parts.append(
+                f"the battery lasts {battery_s:.0f} s of the {dive_s:g} s (vehicle.battery_wh, "
+                "battery_reserve, hotel_w)"
+            )
         data["dive"] = asdict(area)
     if rate_hz is not None:
         rates = speeds_for_rate(setup, rate_hz, lenses)
@@ -464,7 +471,7 @@ def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
 
 def _area_text(area: DiveArea, setup: ImagingSetup) -> str:
     return (
-        f"a dive of {area.dive_s:g} s holds {area.area_m2:.0f} m2, such as {area.side_m:.1f} x "
+        f"a dive of {area.dive_s:.6g} s holds {area.area_m2:.0f} m2, such as {area.side_m:.1f} x "
         f"{area.side_m:.1f} m: {area.lines} lines {area.line_spacing_m:.3g} m apart at "
         f"{area.speed_mps:g} m/s, {area.cross_lines} across, turns of {area.turn_s:.0f} s, descent "
         f"and ascent; {setup.camera.focal_mm:g} mm lens at {setup.plan.altitude_m:.2f} m"

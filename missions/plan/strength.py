@@ -18,6 +18,7 @@ from missions.route.energy import (
     flight_conditions,
     has_sway,
     motion,
+    usable_wh,
     vehicle_costs,
 )
 from missions.values.costs import Costs
@@ -38,6 +39,16 @@ def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
     flown = flight_conditions(config)
     refused = partial(too_strong, flown, config.vehicle, ImagingSetup.of(config))
     return vehicle_costs(flown, refused=refused, imaging_w=imaging_w)
+
+
+def endurance_s(config: SurveyConfig) -> float:
+    """How long a dive may take of the battery, at the mean power on lines of all headings.
+
+    Raises:
+        PlanError: as `survey_costs`.
+    """
+    power_w = np.asarray(survey_costs(config).line_w)
+    return 3600.0 * usable_wh(config.vehicle) / float(power_w[np.isfinite(power_w)].mean())
 
 
 def turn_rate_deg_s(plan: PlanConfig) -> float:

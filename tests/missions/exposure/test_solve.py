@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import ConfigError, PlanError
 from camera_calib.rig import design_rig
 from missions.exposure.settings import imaging_settings
@@ -16,6 +16,7 @@ from missions.exposure.solve import (
     turn_s,
 )
 from missions.plan.planner import plan_survey
+from missions.plan.strength import endurance_s
 from missions.values.costs import SETTLE_S
 from missions.values.footprint import footprint_size_m
 from tests.missions.exposure.surveys import survey
@@ -145,3 +146,22 @@ def test_the_report_has_a_part_for_each_question() -> None:
     json.dumps(data, allow_nan=False)
     with pytest.raises(ConfigError):
         solve_report(config, DEPTH_M)
+
+
+def test_no_dive_is_longer_than_the_battery_lasts() -> None:
+    _, config = survey()
+    short = solve_report(config, DEPTH_M, dive_s=1800.0)[1]["dive"]
+    text, data = solve_report(config, DEPTH_M, dive_s=1e5, battery_s=1800.0)
+    assert data["dive"] == short
+    assert "the battery lasts 1800 s of the 100000 s" in text
+    ample = solve_report(config, DEPTH_M, dive_s=1800.0, battery_s=1e5)
+    assert ample[1]["dive"] == short and "battery" not in ample[0]
+
+
+def test_a_battery_lasts_as_its_power_says() -> None:
+    """1,400 Wh of which a fifth is kept, at 60 W and what the thrusters take in still water."""
+    still = {"sea": {"current_mps": 0.0}}
+    lasts_s = endurance_s(parse_config(still, "test"))
+    assert 0.5 * 1120 / 60 < lasts_s / 3600 < 1120 / 60
+    double = endurance_s(parse_config({**still, "vehicle": {"battery_wh": 2800.0}}, "test"))
+    assert double == pytest.approx(2.0 * lasts_s)
