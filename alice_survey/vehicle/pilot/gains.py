@@ -151,6 +151,7 @@ def gains_for(
         if axis >= STEERED:  # attitude and its rates are known at every tick
             omega, rate, place = placed(lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * tick_s))
             axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
+            axes[axis, INTEGRAL] = _integral(rate, place, omega, decay)
             continue
         omega, rate, place = placed(lag_s, decay, fastest_rad_s)
         axes[axis, [RATE, PLACE]] = rate, place

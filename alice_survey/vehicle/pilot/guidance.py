@@ -133,7 +133,7 @@ def steer(
             if phase == ASCEND:
                 report[slot.PHASE] = DONE
     write_wrench(gains, pilot, wrench)
-    hold_level(estimate, gains, pilot, wrench)
+    hold_level(estimate, dt_s, gains, pilot, wrench)
     if guidance.sway == 0.0:
         wrench[1] = 0.0
 

@@ -159,8 +159,10 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
 
 
 @kernel
-def hold_level(estimate: Array, gains: Gains, pilot: PilotState, wrench: Array) -> None:
-    """Add the moments that hold roll and pitch level, where thrusters can: PD and computed torque.
+def hold_level(
+    estimate: Array, dt_s: float, gains: Gains, pilot: PilotState, wrench: Array
+) -> None:
+    """Add the moments that hold roll and pitch level, where thrusters can: PID and computed torque.
 
     The computed part is what the wanted motion and the centre of gravity do at level attitude,
     which is why `write_wrench` comes first. What gravity rights by itself comes on top.
@@ -173,12 +175,17 @@ def hold_level(estimate: Array, gains: Gains, pilot: PilotState, wrench: Array) 
         i = 3 if axis == ROLL else 4
         angle = estimate[vector.ROLL] if axis == ROLL else estimate[vector.PITCH]
         rate = estimate[vector.P] if axis == ROLL else estimate[vector.Q]
-        asked = -row[MASS] * (row[PLACE] * angle + row[RATE] * rate) - pilot.force[i]
+        place = slot.ROLL_SUM if axis == ROLL else slot.PITCH_SUM
+        total = pilot.memory[place]
+        asked = -row[MASS] * (row[PLACE] * angle + row[RATE] * rate + total) - pilot.force[i]
         for other in range(STEERED):
             k = other if other < 3 else 5
             asked += body.mass[i, k] * pilot.demand[slot.ACC_SURGE + other]
         asked += body.weight_n * (-body.cg[1] if axis == ROLL else body.cg[0])
         wrench[i] = min(max(asked, row[LEAST]), row[MOST])
+        if (asked - wrench[i]) * angle >= 0.0:  # not cut, or on the way back
+            step = row[INTEGRAL] * angle * dt_s
+            pilot.memory[place] = clamped(total + step, max(-row[LEAST], row[MOST]) / row[MASS])
 
 
 DEPTH_KEPT_M = 0.2
