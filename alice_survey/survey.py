@@ -32,7 +32,7 @@ class FlightChanges:
     current: str | None = None
     """SPEED@DIRECTION."""
     failed: Sequence[str] | None = None
-    """NAME of a thruster that has failed, or NAME=SHARE that is left of it."""
+    """NAME of a thruster that has failed, NAME=SHARE that is left of it, either @SECONDS."""
     dive: int | None = None
     """Number of the dive to fly, from 1."""
 
@@ -47,10 +47,11 @@ class FlightChanges:
             sea = config.sea.model_copy(update={"current_file": None})
             config = config.model_copy(update={"sea": sea})
         config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
+        health = parse_health(self.failed)
         return changed(
             config, "vehicle",
             name=self.vehicle, controller=self.controller,
-            thruster_health=parse_health(self.failed), dive=self.dive,
+            thruster_health=health.at_start, failures=health.later, dive=self.dive,
         )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import math
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_origin
 
 from pydantic import (
     BaseModel,
@@ -25,6 +25,7 @@ Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 Latitude = Annotated[float, Field(ge=-85, le=85)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Seconds = Annotated[float, Field(ge=0, le=1e6)]
 Ring = tuple[tuple[float, float], ...]
 GeoRing = tuple[tuple[Latitude, Longitude], ...]
 Gust = Annotated[float, Field(ge=0, le=1000)]
@@ -275,6 +276,10 @@ class VehicleConfig(Config):
     thruster_health: dict[str, Share] = Field(default_factory=lambda: dict(_INTACT))
     """Share of its greatest thrust that each thruster has left: 0 failed, 1 intact."""
     health_known: bool = True
+    failures: tuple[tuple[str, Seconds, Share], ...] = Field((), exclude_if=lambda f: not f)
+    """Thrusters that fail on the way: name, seconds from the start, share that is left."""
+    finds_failures: bool = Field(True, exclude_if=bool)
+    """Whether the vehicle watches how its thrusters turn."""
     battery_wh: float = Field(1400.0, ge=0.01, le=1_000_000)
     battery_reserve: float = Field(0.2, ge=0, lt=1)
     hotel_w: float = Field(60.0, ge=0, le=5000)
@@ -536,25 +541,38 @@ def parse_current(text: str | None) -> tuple[float | None, float | None]:
         ) from None
 
 
-def parse_health(texts: Sequence[str] | None) -> dict[str, float] | None:
-    """Thrusters and what is left of them, from `NAME` (nothing) or `NAME=SHARE`; None of none.
+class Health(NamedTuple):
+    """What is left of thrusters."""
+
+    at_start: dict[str, float] | None
+    """Shares by name; None of none."""
+    later: list[tuple[str, float, float]] | None
+    """Name, seconds from the start, share."""
+
+
+def parse_health(texts: Sequence[str] | None) -> Health:
+    """Thrusters and what is left of them, from `NAME` (nothing), `NAME=SHARE` and `...@SECONDS`.
 
     Raises:
-        ConfigError: a share is not a number.
+        ConfigError: a share or a time is not a number.
     """
-    if not texts:
-        return None
-    health = {}
-    for text in texts:
-        name, _, share = text.partition("=")
+    at_start: dict[str, float] = {}
+    later: list[tuple[str, float, float]] = []
+    for text in texts or ():
+        what, at, seconds = text.partition("@")
+        name, _, share = what.partition("=")
         try:
-            health[name] = float(share or 0.0)
+            left = float(share or 0.0)
+            if at:
+                later.append((name, float(seconds), left))
+            else:
+                at_start[name] = left
         except ValueError:
             raise ConfigError(
                 f"thruster {text!r}: give NAME, or NAME=SHARE of its thrust that is left, as "
-                "stern=0.5"
+                "stern=0.5, and @SECONDS for a failure on the way, as stern@600"
             ) from None
-    return health
+    return Health(at_start or None, later or None)
 
 
 def _one_line(error: ValidationError) -> str:

@@ -165,6 +165,7 @@ def fov(
         "fly -w reef --vehicle alice --controller sway --current 0.1@90",
         "fly -w before --vehicle sparus2 --controller los",
         "fly -w reef --fail stern --fail bow=0.5 --json",
+        "fly -w reef --fail stern@600",
         "fly -w reef --dive 2",
     )
 )
@@ -184,7 +185,7 @@ def fly(
     ] = None,
     fail: Annotated[
         list[str] | None,
-        typer.Option(help="A thruster that does not turn, or is weak: stern, bow=0.5."),
+        typer.Option(help="A thruster that fails or is weak: stern, bow=0.5, stern@600 (s)."),
     ] = None,
     dive: Annotated[
         int | None, typer.Option(min=1, help="Fly this dive of the plan; all when not given.")

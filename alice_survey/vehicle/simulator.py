@@ -6,13 +6,14 @@ five Runge-Kutta steps of 10 ms.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from alice_survey.base.compiled import note_compiling
+from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.allocation import (
@@ -37,7 +38,7 @@ from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.navigation.filter import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
-from alice_survey.vehicle.pilot.gains import Gains
+from alice_survey.vehicle.pilot.gains import INNER, SWAY, Gains
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import (
     ABORT,
@@ -46,12 +47,16 @@ from alice_survey.vehicle.pilot.memory import (
     PHASE,
     REASON,
     REPORT,
+    SWAY_SUM_E,
+    SWAY_SUM_N,
+    YAW_SUM,
     PilotState,
     new_pilot,
 )
 from alice_survey.vehicle.pilot.path import Path
-from alice_survey.vehicle.pilot.safety import TOUCHED
+from alice_survey.vehicle.pilot.safety import THRUSTER_LOST, TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure, ThrusterWatch
 from alice_survey.vehicle.propulsion import (
     Propulsion,
     electrical_power,
@@ -67,6 +72,7 @@ TICK_S = 0.05
 STEPS = 5
 """Runge-Kutta steps in a tick."""
 _CHUNK_TICKS = 1200
+_WATCHED_TICKS = round(WATCHED_S / TICK_S)
 
 
 class Sea(NamedTuple):
@@ -267,6 +273,21 @@ class Setup:
     given."""
     start_ne_m: tuple[float, float] = (0.0, 0.0)
     start_heading_rad: float = 0.0
+    failures: tuple["Failure", ...] = ()
+    """Thrusters that fail on the way."""
+    without: Callable[[Mapping[str, float]], tuple[Gains, Guidance]] | None = None
+    """How to fly with what thrusters have left, once failures are found; not looked for if None. A
+    `VehicleError`: not at all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A thruster that fails on the way."""
+
+    time_s: float
+    thruster: str
+    left: float
+    """Share of its greatest speed squared that is left."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -289,6 +310,8 @@ class Flown:
     power_w: Array
     """(T, n) electrical power."""
     thrusters: tuple[str, ...]
+    found: tuple[FoundFailure, ...] = ()
+    """Failures that the vehicle found."""
 
     @property
     def attitude_rad(self) -> Array:
@@ -337,24 +360,31 @@ def simulate(
     note_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[TickRows] = []
     total = math.ceil((expected_s or longest_s) / TICK_S / _CHUNK_TICKS)
-    flying = _chunks(setup, rng, sea_rng or rng, longest_s)
+    found: list[FoundFailure] = []
+    flying = _chunks(setup, rng, sea_rng or rng, longest_s, found)
     for chunk in progress(flying, label, total) if label else flying:
         chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator
     rows = TickRows(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
     return Flown(
         time_s=TICK_S * np.arange(len(rows.state), dtype=np.float64),
         thrusters=tuple(t.name for t in setup.vehicle.thrusters),
+        found=tuple(found),
         **rows._asdict(),
     )
 
 
 def _chunks(
-    setup: Setup, rng: np.random.Generator, sea_rng: np.random.Generator, longest_s: float
+    setup: Setup,
+    rng: np.random.Generator,
+    sea_rng: np.random.Generator,
+    longest_s: float,
+    found: list[FoundFailure],
 ) -> Iterator[TickRows]:
-    """Rows of a minute each, until the mission is over."""
+    """Rows of a minute each at most, until the mission is over; adds failures that are found."""
     vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
-    plant = vehicle.plant
-    plant = Plant(plant.body, weakened(plant.propulsion, vehicle.health_of(setup.health)))
+    sound = vehicle.plant
+    left = dict(setup.health)
+    plant = Plant(sound.body, weakened(sound.propulsion, vehicle.health_of(left)))
     world = _new_world(setup, n)
     navigation = new_navigation(setup.sensors, world.now, rng)
     pilot, allocation, scratch = new_pilot(), _allocation(setup), scratch_for(n)
@@ -362,17 +392,55 @@ def _chunks(
     sea = Sea(
         setup.current, np.array(gusts.sigma), math.exp(-TICK_S / max(gusts.correlation_s, 1e-9))
     )
-    last = math.ceil(longest_s / TICK_S)
-    for first in range(0, last, _CHUNK_TICKS):
-        rows = _new_rows(min(_CHUNK_TICKS, last - first), n)
+    last, first = math.ceil(longest_s / TICK_S), 0
+    gains, guidance = setup.gains, setup.guidance
+    known = dict(setup.health if setup.known_health is None else setup.known_health)
+    sees = ThrusterWatch(vehicle.thrusters, TICK_S)
+    most = _CHUNK_TICKS if setup.without is None else _WATCHED_TICKS
+    waiting = sorted(setup.failures, key=lambda failure: failure.time_s)
+    while first < last:
+        while waiting and round(waiting[0].time_s / TICK_S) <= first:
+            left[waiting[0].thruster] = waiting[0].left
+            plant = Plant(sound.body, weakened(sound.propulsion, vehicle.health_of(left)))
+            del waiting[0]
+        end = min(first + most, last)
+        if waiting:
+            end = min(end, round(waiting[0].time_s / TICK_S))
+        rows = _new_rows(end - first, n)
         flown = _fly_ticks(
             first, plant, sea, setup.floor, setup.sensors, navigation, setup.path,
-            setup.guidance, setup.gains, pilot, allocation, world, scratch, rng, sea_rng,
-            rows,
+            guidance, gains, pilot, allocation, world, scratch, rng, sea_rng, rows,
         )  # fmt: skip
         yield TickRows(*(part[:flown] for part in rows))
         if flown < len(rows.state) or pilot.report[REASON] == TOUCHED:
             return
+        first = end
+        if setup.without is None:
+            continue
+        new = sees.judge(first * TICK_S, rows.command_rps, rows.state[:, STATE:])
+        for failure in new:
+            found.append(failure)
+            known[failure.thruster] = min(failure.left, known.get(failure.thruster, 1.0))
+        if new:
+            allocation.health[:] = vehicle.health_of(known)
+            try:
+                before, (gains, guidance) = gains, setup.without(known)
+                _carry_over(pilot, before, gains)
+            except VehicleError:
+                if pilot.report[PHASE] != ABORT:
+                    pilot.report[PHASE], pilot.report[REASON] = ABORT, THRUSTER_LOST
+
+
+def _carry_over(pilot: PilotState, before: Gains, after: Gains) -> None:
+    """Let the pilot's memory mean the same with other gains, in place.
+
+    Integrals are kept as speeds, of which the inner loops make accelerations: what holds against
+    the current goes on. That of yaw has learned of what the lost thruster left undone.
+    """
+    pilot.memory[YAW_SUM] = 0.0
+    inner = after.axes[SWAY, INNER]
+    factor = before.axes[SWAY, INNER] / inner if inner > 0.0 else 0.0
+    pilot.memory[[SWAY_SUM_N, SWAY_SUM_E]] *= factor
 
 
 def _new_world(setup: Setup, thrusters: int) -> World:

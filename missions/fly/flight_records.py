@@ -1,6 +1,7 @@
 """A flight as logs that other tools read, and as summary figures."""
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
             thruster.name: vehicle.thruster_health.get(thruster.name, 1.0)
             for thruster in flight.vehicle.thrusters
         },
+        "failures_found": [asdict(one) for one in flown.found],
         "ending": flight.ending,
         "duration_s": float(flown.time_s[-1]),
         "stations": len(flight.trigger_s),

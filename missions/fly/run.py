@@ -19,11 +19,13 @@ from missions.fly.flight_records import bag_record, believed_log, flight_summary
 from missions.fly.flight_route import one_dive, stations_of_dives
 from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
 from missions.logs.bag import write_bag
-from missions.values.flight import Flight
+from missions.values.flight import Flight, rms
 from missions.values.navigation import write_navigation
 from missions.values.plan_file import read_plan
 
 _SEED_STREAM = 20
+MOST_HEADING_DEG = 10.0
+"""A picture of 4 by 3 turned by so much covers a strip narrower by a tenth."""
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
@@ -81,6 +83,12 @@ def _check_pictures(flight: Flight, planned: int) -> None:
             f"{flight.vehicle.name} reached no line of the plan ({flight.ending} after "
             f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
         )
+    for one in flight.flown.found:
+        warn(
+            f"{one.thruster} did not turn as commanded, found after {one.time_s:.0f} s: from there "
+            f"on {flight.vehicle.name} counted on {one.left:.0%} of its thrust"
+        )
+    _warn_of_heading(flight)
     if len(flight.trigger_s) < planned:
         warn(
             f"{len(flight.trigger_s)} of {planned} stations were reached: the mission "
@@ -91,6 +99,16 @@ def _check_pictures(flight: Flight, planned: int) -> None:
             f"{flight.stations_off_line} of {len(flight.trigger_s)} pictures were taken more than "
             f"{flight.allowed_cross_track_m:.2f} m off their lines, where neighbouring lines may "
             "leave gaps: choose more side_overlap, less current or another controller"
+        )
+
+
+def _warn_of_heading(flight: Flight) -> None:
+    """Warn where pictures are turned so far that they leave the strip of their line."""
+    heading = np.rad2deg(flight.line_errors[1])
+    if np.isfinite(heading).any() and rms(heading) > MOST_HEADING_DEG:
+        warn(
+            f"on lines the heading was off by {rms(heading):.0f} deg rms, "
+            f"{np.nanmax(np.abs(heading)):.0f} at most: pictures do not lie square to their lines"
         )
 
 

@@ -1,6 +1,7 @@
 """A plan, flown by the simulated vehicle over a sea floor."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -28,10 +29,10 @@ from alice_survey.vehicle.navigation.sensors import (
     UsblSpec,
 )
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
-from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.vehicle.pilot.gains import Gains, gains_for
 from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
-from alice_survey.vehicle.pilot.settings import pilot_guidance
+from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
 from alice_survey.vehicle.sea import (
     Current,
     Disturbance,
@@ -39,9 +40,10 @@ from alice_survey.vehicle.sea import (
     sheared_current,
     varying_current,
 )
-from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.vehicle.simulator import Failure, Flown, Setup, simulate
 from alice_survey.vehicle.stability import pitch_divergence_speed_mps
 from alice_survey.vehicle.swell import with_swell
+from alice_survey.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import path_of, room_behind_m, turns_on_the_spot
 from missions.route.energy import sound_craft_of
 from missions.values.flight import Flight, trigger_times
@@ -176,24 +178,27 @@ def mission_setup(
     # The pilot flies as well as the thrusters allow that he knows to be sound.
     impaired = settings.vehicle.impaired
     known = impaired if settings.vehicle.health_known else {}
-    gains = gains_for(craft.weakened(known), plan.speed_mps)
-    guidance = pilot_guidance(
-        gains,
-        path,
-        settings.vehicle.controller,
-        most_depth_m=deepest_m,
-        point_body_m=settings.camera.position_body_m,
-        spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
-        limits=SafetyLimits(
-            0.5 * plan.altitude_m,
-            deepest_m,
-            longest_s=longest_s,
-            blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
-        ),
-    )
-    guidance = guidance._replace(
-        way_in_m=min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
-    )
+
+    def piloted(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
+        gains = gains_for(craft.weakened(left), plan.speed_mps)
+        guidance = pilot_guidance(
+            gains,
+            path,
+            settings.vehicle.controller,
+            most_depth_m=deepest_m,
+            point_body_m=settings.camera.position_body_m,
+            spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
+            limits=SafetyLimits(
+                0.5 * plan.altitude_m,
+                deepest_m,
+                longest_s=longest_s,
+                blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
+            ),
+        )
+        way_in_m = min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
+        return gains, guidance._replace(way_in_m=way_in_m)
+
+    gains, guidance = piloted(known)
     gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
     glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(settings.camera.position_body_m)
@@ -214,6 +219,21 @@ def mission_setup(
         known_health=known,
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
+        failures=_failures(craft, settings.vehicle),
+        without=piloted if settings.vehicle.finds_failures else None,
+    )
+
+
+def _failures(craft: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
+    """Thrusters that fail on the way.
+
+    Raises:
+        VehicleError: one is not the vehicle's.
+    """
+    craft.health_of({name: share for name, _, share in settings.failures})
+    return tuple(
+        Failure(thruster=name, time_s=time_s, left=share)
+        for name, time_s, share in settings.failures
     )
 
 

@@ -275,3 +275,43 @@ def test_a_shear_through_the_water_does_not_throw_the_vehicle_off() -> None:
     flight = fly(sheared)
     assert flight.ending == "complete"
     assert 0.002 < rms(flight.line_errors[0]) <= 0.12
+
+
+def heading_deg(flight: Flight, after_s: float) -> float:
+    """Root mean square of the heading's error on lines, from a time on."""
+    return float(np.rad2deg(rms(flight.line_errors[1][flight.truth.time_s > after_s])))
+
+
+def test_a_thruster_that_fails_on_the_way_is_found_and_flown_without() -> None:
+    at_s = 70.0
+    lost = {"failures": [["stern", at_s, 0.0]]}
+    found, blind = (
+        fly(survey(vehicle={**lost, "finds_failures": finds})) for finds in (True, False)
+    )
+    (one,) = found.flown.found
+    assert (one.thruster, one.left) == ("stern", 0.0)
+    assert at_s + 5.0 <= one.time_s <= at_s + 40.0
+    assert found.ending == "complete"
+    assert blind.flown.found == ()
+    assert heading_deg(found, one.time_s + 20.0) < 12.0
+    assert heading_deg(blind, at_s + 20.0) > 3.0 * heading_deg(found, one.time_s + 20.0)
+    before = found.truth.time_s < at_s
+    whole = fly(survey())
+    np.testing.assert_array_equal(found.flown.state[before], whole.flown.state[: before.sum()])
+
+
+def test_nothing_is_found_where_nothing_fails() -> None:
+    other = {"name": "sparus2", "controller": "los"}
+    for changes in ({}, {"sea": {"current_mps": 0.3}}, {"vehicle": other}):
+        assert fly(survey(**changes)).flown.found == ()
+
+
+def test_a_vehicle_that_loses_its_only_vertical_thruster_gives_up() -> None:
+    flight = fly(survey(vehicle={"failures": [["vertical", 60.0, 0.0]]}))
+    assert flight.ending == "aborted: a thruster failed without which it cannot fly a survey"
+    assert flight.flown.found[0].thruster == "vertical"
+
+
+def test_failures_of_unknown_thrusters_are_named() -> None:
+    with pytest.raises(VehicleError, match="no thruster 'warp'"):
+        fly(survey(vehicle={"failures": [["warp", 10.0, 0.0]]}))

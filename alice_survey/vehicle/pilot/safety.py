@@ -24,8 +24,8 @@ from alice_survey.vehicle.pilot.memory import (
 
 (
     NONE, TOO_LOW, TOO_STEEP, NO_BOTTOM, NO_DIVE, NO_APPROACH, NO_PROGRESS, LOST_PATH, TOO_DEEP,
-    TOO_LONG, NO_NAVIGATION, TOUCHED,
-) = range(12)  # fmt: skip
+    TOO_LONG, NO_NAVIGATION, TOUCHED, THRUSTER_LOST,
+) = range(13)  # fmt: skip
 
 REASONS = {
     NONE: "not aborted",
@@ -40,6 +40,7 @@ REASONS = {
     TOO_LONG: "the mission took longer than is allowed",
     NO_NAVIGATION: "the navigation gave no position",
     TOUCHED: "the hull touched the sea floor",
+    THRUSTER_LOST: "a thruster failed without which it cannot fly a survey",
 }
 """Meaning of the codes of `REASON` in a report."""
 
