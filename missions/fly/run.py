@@ -55,7 +55,7 @@ def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]
     yield "sea floor"
     rng = np.random.default_rng([survey.seed, _SEED_STREAM])
     flight = simulate_plan(plan, flight_settings(survey), floor, rng)
-    _check_pictures(flight, planned)
+    _check_pictures(flight, planned, "swell" if survey.sea.swell_m > 0.0 else "current")
     yield "flight"
     write_track(folder / "truth" / "track.csv", flight.truth)
     write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
@@ -72,8 +72,13 @@ def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]
     yield "plots"
 
 
-def _check_pictures(flight: Flight, planned: int) -> None:
+def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
     """Warn of stations that were missed or lie off their lines.
+
+    Args:
+        flight: to judge.
+        planned: stations.
+        sea: what may have carried the vehicle off.
 
     Raises:
         VehicleError: no picture was taken.
@@ -81,7 +86,7 @@ def _check_pictures(flight: Flight, planned: int) -> None:
     if not len(flight.trigger_s):
         raise VehicleError(
             f"{flight.vehicle.name} reached no line of the plan ({flight.ending} after "
-            f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
+            f"{flight.truth.time_s[-1]:.0f} s): change the {sea}, the thrusters or the plan"
         )
     for one in flight.flown.found:
         warn(

@@ -36,7 +36,7 @@ from missions.exposure.storage import raw_bytes
 from missions.lines.lay import lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.plan.rows import plan_rows
-from missions.plan.strength import arcs_fit, survey_costs, turn_rate_deg_s
+from missions.plan.strength import arcs_fit, survey_costs, turn_rate_deg_s, warn_of_swell
 from missions.route.dives import split_dives
 from missions.route.energy import sound_craft_of, usable_wh
 from missions.route.terrain import (
@@ -107,6 +107,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         _check_depth(wanted.altitude_m, depth_m)
         ways, home = Ways(area.allowed), _home(wanted.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
+        warn_of_swell(config, depth_m)
         sweep = None
         if wanted.line_heading_deg is None:
             sweep = best_heading(

@@ -8,8 +8,9 @@ from functools import partial
 import numpy as np
 
 from alice_survey.base.config import PlanConfig, SurveyConfig, VehicleConfig
-from alice_survey.base.errors import AliceError, PlanError
+from alice_survey.base.errors import AliceError, PlanError, warn
 from alice_survey.vehicle.fleet import GEOMETRIES
+from alice_survey.vehicle.swell import orbital_speed_mps
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import Way, conflict
 from missions.route.energy import (
@@ -49,6 +50,30 @@ def endurance_s(config: SurveyConfig) -> float:
     """
     power_w = np.asarray(survey_costs(config).line_w)
     return 3600.0 * usable_wh(config.vehicle) / float(power_w[np.isfinite(power_w)].mean())
+
+
+def warn_of_swell(config: SurveyConfig, depth_m: float) -> None:
+    """Warn where swell moves the water faster, with the current, than the vehicle holds.
+
+    Args:
+        config: of the survey.
+        depth_m: of the sea floor.
+    """
+    sea = config.sea
+    if sea.swell_m == 0.0:
+        return
+    flown, below_m = flight_conditions(config), depth_m - config.plan.altitude_m
+    swell_mps = float(orbital_speed_mps(sea.swell_m, sea.swell_period_s, depth_m, below_m))
+    towards = math.radians(sea.swell_towards_deg)
+    way = np.array([math.cos(towards), math.sin(towards)])
+    crests = [flown.current_ne_mps + sign * swell_mps * way for sign in (1.0, -1.0)]
+    if all(flies_everywhere(replace(flown, current_ne_mps=crest)) for crest in crests):
+        return
+    warn(
+        f"swell of {sea.swell_m:g} m every {sea.swell_period_s:g} s moves the water by up to "
+        f"{swell_mps:.2f} m/s where {flown.craft.name} flies, more than it holds: it is carried "
+        "off its lines and back by every wave; wait for less swell, or raise side_overlap"
+    )
 
 
 def turn_rate_deg_s(plan: PlanConfig) -> float:

@@ -284,3 +284,11 @@ def test_a_broken_plan_file_is_an_error_in_one_line(workspace: Path, tmp_path: P
     path.write_text(json.dumps({k: v for k, v in good.items() if k != "interval_s"}))
     with pytest.raises(PlanError, match="interval_s"):
         read_plan(path)
+
+
+def test_swell_is_judged_as_the_current_is(capsys: pytest.CaptureFixture[str]) -> None:
+    for height_m, warned in ((0.5, False), (2.5, True)):
+        planned(area=SMALL["area"], sea={"swell_m": height_m, "swell_period_s": 8.0})
+        assert (
+            "swell of 2.5 m every 8 s moves the water by up to" in capsys.readouterr().err
+        ) is warned

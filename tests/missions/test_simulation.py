@@ -315,3 +315,17 @@ def test_a_vehicle_that_loses_its_only_vertical_thruster_gives_up() -> None:
 def test_failures_of_unknown_thrusters_are_named() -> None:
     with pytest.raises(VehicleError, match="no thruster 'warp'"):
         fly(survey(vehicle={"failures": [["warp", 10.0, 0.0]]}))
+
+
+@pytest.mark.parametrize("height_m", [1.2, 1.5])
+def test_in_long_swell_the_first_line_is_reached(height_m: float) -> None:
+    """Water moves by +-0.4 m and more at the floor: no place is kept to 0.2 m for 2 s."""
+    deep = {"length_m": 6.0, "width_m": 4.0, "heading_deg": 20.0, "seafloor_depth_m": 15.0}
+    swell = {"swell_m": height_m, "swell_period_s": 8.0, "swell_towards_deg": 110.0}
+    config = survey(area=deep, sea={"current_mps": 0.0, **swell})
+    plan = planned(config)
+    for seed in (1, 2):
+        flight = flown(plan, config, None, seed)
+        assert flight.ending == "complete"
+        assert len(flight.trigger_s) == plan.stations
+        assert 0.1 < rms(flight.line_errors[0]) < 0.35

@@ -66,6 +66,11 @@ from alice_survey.vehicle.pilot.steering import (
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
 """A dive without bottom lock stops at least this far above the greatest depth."""
+_MEAN_S = 12.0
+"""Swings are averaged over about this time, and must be about the goal for as long: longer than the
+period of a long swell."""
+_SWING = 3.0
+"""The path is entered from within so many times the distance that counts as near."""
 _SETTLE_S = 2.0
 _QUICKEST = 2.0
 """Greatest progress along the path over the wanted speed: a projection may not jump."""
@@ -211,6 +216,7 @@ def _on_the_way(
     report[slot.CROSS] = de * math.cos(heading) - dn * math.sin(heading)
     report[slot.PATH_HEADING], report[slot.LINE] = heading, -1.0
 
+    swings = False
     if phase == DIVE:
         settled = (
             memory[slot.FLOOR_KNOWN] > 0.0
@@ -218,17 +224,40 @@ def _on_the_way(
             and abs(point[slot.SINK_SPEED]) < _DEPTH_SPEED_KEPT_MPS
         )
     else:
-        settled = distance < guidance.capture_m and (
-            guidance.sway == 0.0 or abs(error) < HEADING_KEPT_RAD
-        )
+        heads = guidance.sway == 0.0 or abs(error) < HEADING_KEPT_RAD
+        settled = distance < guidance.capture_m and heads
+        swings = _is_near_on_the_mean(dn, de, dt_s, guidance.capture_m, pilot) and heads
     memory[slot.SETTLED_S] = memory[slot.SETTLED_S] + dt_s if settled else 0.0
     if phase == DIVE and memory[slot.SETTLED_S] > _SETTLE_S:
         _enter(pilot, APPROACH)
-    elif phase == APPROACH and memory[slot.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0):
+    elif phase == APPROACH and (
+        swings or memory[slot.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0)
+    ):
         memory[slot.STANDING] = 0.0
         if not stands(path, int(report[slot.LEG])):
             report[slot.ALONG] -= guidance.way_in_m
         _enter(pilot, FOLLOW)
+
+
+@kernel
+def _is_near_on_the_mean(
+    dn: float, de: float, dt_s: float, near_m: float, pilot: PilotState
+) -> bool:
+    """Whether the followed point swings about its goal: in swell it never stays there.
+
+    Args:
+        dn: how far it is north of the goal, m.
+        de: how far east.
+        dt_s: the tick.
+        near_m: how far it may be off on the mean.
+        pilot: its memory is written.
+    """
+    memory, share = pilot.memory, dt_s / _MEAN_S
+    memory[slot.MEAN_N] += share * (dn - memory[slot.MEAN_N])
+    memory[slot.MEAN_E] += share * (de - memory[slot.MEAN_E])
+    near = math.hypot(memory[slot.MEAN_N], memory[slot.MEAN_E]) < near_m
+    memory[slot.NEAR_S] = memory[slot.NEAR_S] + dt_s if near else 0.0
+    return bool(memory[slot.NEAR_S] > _MEAN_S and math.hypot(dn, de) < _SWING * near_m)
 
 
 @kernel
