@@ -89,8 +89,7 @@ def solve(
     """
     from alice_survey.base.errors import ConfigError
     from alice_survey.survey import settings
-    from missions.exposure.settings import ImagingSetup
-    from missions.exposure.solve import solve_report
+    from missions.plan.solve import solve_report
 
     config = settings(workspace, survey, needed=False)
     if bend is not None:
@@ -102,8 +101,7 @@ def solve(
         return
     print_result(
         *solve_report(
-            ImagingSetup.of(config),
-            config.area.seafloor_depth_m,
+            config,
             resolution_mm=resolution,
             dive_s=dive,
             rate_hz=rate,

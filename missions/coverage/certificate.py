@@ -287,7 +287,7 @@ def _out_of_step(cell_m: float, periods_m: tuple[float, ...], least_m: float) ->
     "Random number generation and quasi-Monte Carlo methods", theorem 2.6).
     """
     sizes = cell_m * (1.0 + _SIZES)
-    sizes = np.maximum(sizes[sizes >= least_m], least_m) if sizes.max() > least_m else [least_m]
+    sizes = np.unique(np.maximum(sizes, least_m)) if sizes.min() < least_m else sizes
     even = (np.arange(_PLACES) + 0.5) / _PLACES
     uneven = [
         sum(
