@@ -74,7 +74,9 @@ def solve(
         float | None, typer.Option(min=1e-3, max=1e3, help="Size of a pixel on the sea floor, mm.")
     ] = None,
     dive: Annotated[float | None, typer.Option(min=1, max=1e6, help="Length of a dive, s.")] = None,
-    rate: Annotated[float | None, typer.Option(min=1e-3, help="Fixed frame rate, Hz.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=1e-3, max=1e4, help="Fixed frame rate, Hz.")
+    ] = None,
     lens: Annotated[list[float] | None, typer.Option(help="Focal lengths at hand, mm.")] = None,
     bend: Annotated[
         str | None,

@@ -230,6 +230,8 @@ def _check_kind(path: Path) -> None:
     Raises:
         PlanError: it is one, or cannot be read.
     """
+    if path.exists() and not path.is_file():
+        raise PlanError(f"{path}: is not a file")
     try:
         with path.open("rb") as file:
             start = file.read(_LOOKED_AT).lstrip(b"\xef\xbb\xbf \t\r\n\0")
