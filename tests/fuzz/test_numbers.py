@@ -13,7 +13,7 @@ from alice_survey.base.config import load_config
 from alice_survey.base.errors import AliceError
 from alice_survey.cli.main import app
 from tests.fuzz import areas
-from tests.fuzz.judge import Sandbox, judge
+from tests.fuzz.judge import LONGEST_S, Sandbox, bounded, judge
 from tests.fuzz.workspace import read_and_check_survey
 
 pytestmark = pytest.mark.slow
@@ -40,11 +40,20 @@ NUMBERS = (
 )
 
 
+@pytest.fixture(scope="module", autouse=True)
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Load libraries and compile kernels: neither counts."""
+    path = tmp_path_factory.mktemp("loaded") / "survey.toml"
+    path.write_text("")
+    read_and_check_survey(path)
+
+
 @pytest.mark.parametrize("words", OPTIONS, ids=" ".join)
 def test_odd_numbers_of_options_are_used_or_refused(words: tuple[str, ...], tmp_path: Path) -> None:
     for number in ODD:
         where = ["-w", str(tmp_path)] if words[0] == "plan" else []
-        done = CliRunner().invoke(app, [*words, number, *where])
+        with bounded(LONGEST_S):
+            done = CliRunner().invoke(app, [*words, number, *where])
         error = done.exception
         assert error is None or isinstance(error, SystemExit | AliceError), (number, repr(error))
         assert not re.search(r"\d{25}", f"{done.output}{error}"), number
