@@ -191,7 +191,8 @@ def _planned(config: SurveyConfig, rig: Rig) -> Planned:
                 f"and {1 - seen.every_camera_share:.2%} is not seen by every camera: look at "
                 "map.png, and give the vehicle more room, or raise the overlaps"
             )
-        about = _details(imaging, sweep, stereo, rig, wanted) | {"terrain": figures}
+        about = _details(imaging, sweep, stereo, rig, wanted)
+        about |= {"terrain": figures, "warnings": warnings}
         details = json.loads(json.dumps(about))  # as they are read back
         finished = replace(plan, coverage=seen.share_at_overlap, details=details)
         planned = Planned(

@@ -56,3 +56,13 @@ def test_a_conflict_that_nothing_tried_resolves_says_so() -> None:
     text = str(caught.value)
     assert len(text.splitlines()) == 1
     assert "no value of one of plan.forward_overlap, plan.speed_mps, plan.altitude_m" in text
+
+
+def test_what_a_plan_warns_of_is_in_its_file_too() -> None:
+    ring = "LINESTRING (0 0, 8 0, 8 5, 0 5, 0 0)"
+    found = planned(survey(area={"wkt": ring, "corridor_width_m": 2.0}, plan={"speed_mps": 0.3}))
+    assert found.plan.details["warnings"] == list(found.warnings)
+    for said in ("closed_lines = 'inside'", "arcs are planned with 0.58 m"):
+        assert [said in warning for warning in found.warnings].count(True) == 1
+    assert found.plan.turn_radius_m == 0.58
+    assert found.certificate.stereo_share > 0.999
