@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_origin
 
@@ -515,12 +515,31 @@ def changed(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:
     Raises:
         ConfigError: a value is out of range.
     """
-    given = {key: value for key, value in values.items() if value is not None}
-    if not given:
+    return with_settings(
+        config, {f"{section}.{key}": value for key, value in values.items() if value is not None}
+    )
+
+
+def with_settings(
+    config: SurveyConfig, values: Mapping[str, Any], origin: str = "command line"
+) -> SurveyConfig:
+    """A survey with settings changed.
+
+    Args:
+        config: of the survey.
+        values: by names such as `plan.speed_mps`.
+        origin: of the values, in messages.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    if not values:
         return config
     settings = config.model_dump(mode="json", exclude_unset=True)
-    settings[section] = {**settings.get(section, {}), **given}
-    return parse_config(settings, "command line")
+    for name, value in values.items():
+        section, key = name.split(".")
+        settings[section] = {**settings.get(section, {}), key: value}
+    return parse_config(settings, origin)
 
 
 def parse_current(text: str | None) -> tuple[float | None, float | None]:

@@ -1,6 +1,5 @@
 """The `plan` commands: plan a survey, and what goes with it before and after a dive."""
 
-import math
 from pathlib import Path
 from typing import Annotated
 
@@ -75,7 +74,9 @@ def solve(
         float | None, typer.Option(min=1e-3, max=1e3, help="Size of a pixel on the sea floor, mm.")
     ] = None,
     dive: Annotated[float | None, typer.Option(min=1, max=1e6, help="Length of a dive, s.")] = None,
-    rate: Annotated[float | None, typer.Option(min=1e-3, help="Fixed frame rate, Hz.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=1e-3, max=1e4, help="Fixed frame rate, Hz.")
+    ] = None,
     lens: Annotated[list[float] | None, typer.Option(help="Focal lengths at hand, mm.")] = None,
     bend: Annotated[
         str | None,
@@ -90,9 +91,7 @@ def solve(
     """
     from alice_survey.base.errors import ConfigError
     from alice_survey.survey import settings
-    from missions.exposure.settings import ImagingSetup
-    from missions.exposure.solve import solve_report
-    from missions.plan.strength import endurance_s
+    from missions.plan.solve import solve_report
 
     config = settings(workspace, survey, needed=False)
     if bend is not None:
@@ -104,11 +103,9 @@ def solve(
         return
     print_result(
         *solve_report(
-            ImagingSetup.of(config),
-            config.area.seafloor_depth_m,
+            config,
             resolution_mm=resolution,
             dive_s=dive,
-            battery_s=math.inf if dive is None else endurance_s(config),
             rate_hz=rate,
             lenses=lens or (12.5, 25.0),
         ),

@@ -230,6 +230,8 @@ def _check_kind(path: Path) -> None:
     Raises:
         PlanError: it is one, or cannot be read.
     """
+    if path.exists() and not path.is_file():
+        raise PlanError(f"{path}: is not a file")
     try:
         with path.open("rb") as file:
             start = file.read(_LOOKED_AT).lstrip(b"\xef\xbb\xbf \t\r\n\0")
@@ -275,6 +277,23 @@ def _pixels(from_pixel: tuple[float, ...], x: Array, y: Array) -> Array:
     return np.column_stack([(e * right - b * up) / size, (a * up - d * right) / size])
 
 
+def _pixels_at(file: Any, crs: str, lat_lon: Array) -> Array:
+    """(N, 2) column and row of (N, 2) degrees."""
+    x, y = _transformer(crs).transform(lat_lon[:, 1], lat_lon[:, 0])
+    return _pixels(tuple(file.transform)[:6], np.asarray(x), np.asarray(y))
+
+
+def _if_swapped(file: Any, crs: str, datum: Datum) -> str:
+    """What speaks for it that an area is off because its latitude and longitude are swapped."""
+    if abs(datum.longitude_deg) > 90.0:
+        return ""
+    swapped = np.array([[datum.longitude_deg, datum.latitude_deg]])
+    ((column, row),) = _pixels_at(file, crs, swapped)
+    if not (0.0 <= column <= file.width and 0.0 <= row <= file.height):
+        return ""
+    return "; with latitude and longitude swapped the area lies in it"
+
+
 def _transformer(crs: str) -> Any:
     from pyproj import Transformer
 
@@ -318,11 +337,12 @@ def _window(
             np.column_stack([np.full_like(t, north_1), east]),
         ])  # fmt: skip
         geodetic = datum.geodetic_from_ned(np.hstack([edge, np.zeros((len(edge), 1))]))
-        x, y = _transformer(crs).transform(geodetic[:, 1], geodetic[:, 0])
-        pixels = _pixels(tuple(file.transform)[:6], np.asarray(x), np.asarray(y))
-        columns, rows = pixels.T
+        columns, rows = _pixels_at(file, crs, geodetic[:, :2]).T
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(rows))):
-            raise PlanError(f"{path}: its coordinate system does not reach the survey area")
+            raise PlanError(
+                f"{path}: its coordinate system does not reach the survey area"
+                f"{_if_swapped(file, crs, datum)}"
+            )
         first_c = max(math.floor(columns.min()) - _PAD_CELLS, 0)
         first_r = max(math.floor(rows.min()) - _PAD_CELLS, 0)
         last_c = min(math.ceil(columns.max()) + _PAD_CELLS, file.width)
@@ -332,7 +352,7 @@ def _window(
                 f"{path}: does not reach the survey area, which is at columns "
                 f"{columns.min():.0f} to {columns.max():.0f} and rows {rows.min():.0f} to "
                 f"{rows.max():.0f} of its {file.width} x {file.height}: check the "
-                "area's datum and area.bathymetry_file"
+                f"area's datum and area.bathymetry_file{_if_swapped(file, crs, datum)}"
             )
         window = (first_c, first_r, last_c - first_c, last_r - first_r)
     cells = window[2] * window[3]

@@ -87,10 +87,17 @@ class LocalFrame:
         where = (
             "" if not raw.geographic else f" at ({corners[worst][0]:.6g}, {corners[worst][1]:.6g})"
         )
-        if raw.geographic and not self.datum_is_given:
-            advice = "the area is too large, or a corner is wrong"
-        elif raw.geographic and _distance_m(corners[:, ::-1], self.datum).max() <= FARTHEST_M:
+        swapped = (
+            raw.geographic
+            and far.min() > FARTHEST_M
+            and _distance_m(corners[:, ::-1], self.datum).max() <= FARTHEST_M
+        )
+        if swapped and self.datum_is_given:
             advice = "latitude and longitude are swapped"
+        elif swapped:
+            advice = "latitude and longitude are swapped here or in the area"
+        elif raw.geographic and not self.datum_is_given:
+            advice = "the area is too large, or a corner is wrong"
         elif raw.geographic:
             advice = (
                 "move the datum (latitude_deg, longitude_deg) or leave it out, or check the corner "

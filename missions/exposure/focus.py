@@ -22,7 +22,13 @@ from camera_calib.fov.focus import (
 )
 from camera_calib.water import WAVELENGTH_NM
 from missions.exposure.settings_table import Setting, settings_of
-from missions.exposure.ways_out import HIGHEST_ALTITUDE_M, Way, conflict, least_that_fits
+from missions.exposure.ways_out import (
+    HIGHEST_ALTITUDE_M,
+    MOST_BLUR_PX,
+    Way,
+    conflict,
+    least_that_fits,
+)
 
 _GREEN_M = float(WAVELENGTH_NM[1]) * 1e-9
 _AIRY = 2.44
@@ -175,8 +181,9 @@ def _cannot_focus(
                 change=f"altitude_m {shown:g} instead of {plan.altitude_m:g}",
                 price=f"a pixel grows {shown / plan.altitude_m:.2f} times",
                 cost=shown / plan.altitude_m - 1.0,
+                settings={"plan.altitude_m": shown},
             )
-        sharp_px = least_that_fits(partial(fits, "sharp_px"), plan.sharp_px, 20.0)
+        sharp_px = least_that_fits(partial(fits, "sharp_px"), plan.sharp_px, MOST_BLUR_PX)
         if sharp_px is not None:
             shown = math.ceil(10 * sharp_px) / 10
             changed = plan.model_copy(update={"sharp_px": shown})
@@ -186,6 +193,7 @@ def _cannot_focus(
                 f"{f_number:g}",
                 price=f"detail under {shown:g} px is lost at the top and bottom of the relief",
                 cost=shown / plan.sharp_px - 1.0,
+                settings={"plan.sharp_px": shown, "camera.f_number": f_number},
             )
         lower_m = least_that_fits(
             lambda lower_m: fits("relief_m", plan.relief_m - lower_m), 0.0, plan.relief_m
@@ -196,6 +204,7 @@ def _cannot_focus(
                 change=f"relief_m {shown:g} instead of {plan.relief_m:g}",
                 price="ground that is higher or lower is not sharp",
                 cost=1.0 - shown / plan.relief_m,
+                settings={"plan.relief_m": shown},
             )
 
     return conflict(

@@ -15,7 +15,13 @@ from camera_calib.camera import Camera
 from camera_calib.fov.focus import axial_pixel_m
 from camera_calib.rig import Rig
 from missions.exposure.settings_table import Setting, settings_of
-from missions.exposure.ways_out import LEAST_ALTITUDE_M, Way, conflict
+from missions.exposure.ways_out import (
+    HIGHEST_ALTITUDE_M,
+    LEAST_ALTITUDE_M,
+    Way,
+    conflict,
+    least_that_fits,
+)
 from missions.values.footprint import (
     camera_swath,
     common_swath,
@@ -135,16 +141,19 @@ def top_altitude_m(plan: PlanConfig) -> float:
                 price=f"least_clearance_m of {plan.least_clearance_m:g} m is kept, a pixel grows "
                 f"{safe_m / plan.altitude_m:.1f} times",
                 cost=safe_m / plan.altitude_m - 1.0,
+                settings={"plan.altitude_m": safe_m},
             ),
             Way(
                 change=f"relief_m {flat_m:g}, where the site is as flat as that",
                 price="a wrong guess ends the dive",
                 cost=1.0 - flat_m / plan.relief_m,
+                settings={"plan.relief_m": flat_m},
             ),
             Way(
                 change="area.bathymetry_file, so that lines follow the terrain",
                 price="relief_m is then only what the chart does not show",
                 cost=1.0,
+                settings={"plan.relief_m": 0.0},
             ),
         ],
     )
@@ -235,26 +244,30 @@ def _spacing(
 
 def _no_common_view(rig: Rig, plan: PlanConfig, altitude_m: float, step_m: float) -> Exception:
     """The cameras' views do not meet on both sides of a line."""
-    needed_m = altitude_m
-    while common_swath(rig, needed_m, step_m).half_across_m <= 0:
-        needed_m *= 1.05
-    raised_m = math.ceil(100 * (plan.altitude_m + needed_m - altitude_m)) / 100
-    return conflict(
-        f"from {altitude_m:.2f} m the cameras, {rig.baseline_m:g} m apart, have no view in common "
-        "on both sides of a line",
-        ("camera.baseline_m", "altitude_m"),
-        [
+    above_m = plan.altitude_m - altitude_m
+    needed_m = least_that_fits(
+        lambda higher_m: (
+            common_swath(rig, higher_m, step_m * higher_m / altitude_m).half_across_m > 0
+        ),
+        altitude_m,
+        HIGHEST_ALTITUDE_M - above_m,
+    )
+    ways = []
+    if needed_m is not None:
+        raised_m = math.ceil(100 * (needed_m + above_m)) / 100
+        ways.append(
             Way(
                 change=f"altitude_m {raised_m:g}",
                 price=f"a pixel grows {raised_m / plan.altitude_m:.2f} times",
                 cost=raised_m / plan.altitude_m - 1.0,
-            ),
-            Way(
-                change="camera.focal_mm shorter, in the ratio of the altitudes",
-                price=f"a pixel grows {raised_m / plan.altitude_m:.2f} times",
-                cost=raised_m / plan.altitude_m - 1.0,
-            ),
-        ],
+                settings={"plan.altitude_m": raised_m},
+            )
+        )
+    return conflict(
+        f"from {altitude_m:.2f} m the cameras, {rig.baseline_m:g} m apart, have no view in common "
+        "on both sides of a line",
+        ("camera.baseline_m", "altitude_m"),
+        ways,
     )
 
 
@@ -262,27 +275,31 @@ def _too_far_off_track(
     rig: Rig, plan: PlanConfig, print_: FootprintAt, widest_m: float, step_m: float
 ) -> Exception:
     """The allowance for track errors leaves nothing of the spacing."""
-    allowed_m = 0.25 * widest_m
-    ratio = plan.track_error_m / allowed_m
-    fits = max(0.0, 1.0 - 4.0 * plan.track_error_m / print_.across_m)
+    allowed_m = math.floor(250 * widest_m) / 1000
+    ratio = plan.track_error_m / (0.25 * widest_m)
+    higher_m = math.ceil(10 * plan.altitude_m * ratio) / 10
+    fits = math.floor(100 * (1.0 - 4.0 * plan.track_error_m / print_.across_m)) / 100
     ways = [
         Way(
-            change=f"track_error_m {math.floor(1000 * allowed_m) / 1000:g}",
+            change=f"track_error_m {allowed_m:g}",
             price="the vehicle must hold its lines so well; half the spacing is allowance",
             cost=1.0 - 1.0 / ratio,
+            settings={"plan.track_error_m": allowed_m},
         ),
         Way(
-            change=f"altitude_m {math.ceil(10 * plan.altitude_m * ratio) / 10:g}",
+            change=f"altitude_m {higher_m:g}",
             price=f"a pixel grows {ratio:.1f} times",
             cost=ratio - 1.0,
+            settings={"plan.altitude_m": higher_m},
         ),
     ]
     if fits > 0:
         ways.append(
             Way(
-                change=f"side_overlap {math.floor(100 * fits) / 100:g}",
+                change=f"side_overlap {fits:g}",
                 price=f"instead of {plan.side_overlap:.0%}",
                 cost=(plan.side_overlap - fits) / max(plan.side_overlap, 1e-9),
+                settings={"plan.side_overlap": fits},
             )
         )
     return conflict(

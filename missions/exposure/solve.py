@@ -1,24 +1,26 @@
-"""The plan solved the other way: from a resolution, a dive's length or a frame rate to settings."""
+"""The plan solved the other way: from a resolution or a frame rate to settings."""
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import PlanConfig
-from alice_survey.base.errors import AliceError, ConfigError, PlanError
+from alice_survey.base.errors import AliceError, PlanError
 from alice_survey.base.text_table import text_table
-from alice_survey.vehicle.limits import spot_rate_rad_s
 from missions.exposure.focus import largest_f_number, needed_f_number
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import LEAST_SNR, light_for_snr_e, too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
-from missions.exposure.ways_out import HIGHEST_ALTITUDE_M, Way, conflict, less_overlap
-from missions.values.costs import time_costs
+from missions.exposure.ways_out import (
+    HIGHEST_ALTITUDE_M,
+    MOST_BLUR_PX,
+    Way,
+    conflict,
+    less_overlap,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,74 +66,6 @@ class RateOption:
     made."""
     fits: bool = False
     why: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class DiveArea:
-    """The area that a dive covers."""
-
-    dive_s: float
-    area_m2: float
-    side_m: float
-    """Side of a square of that area."""
-    lines: int
-    line_spacing_m: float
-    speed_mps: float
-    turn_s: float
-    cross_lines: int
-
-
-def solve_report(
-    setup: ImagingSetup,
-    seafloor_depth_m: float,
-    *,
-    resolution_mm: float | None = None,
-    dive_s: float | None = None,
-    battery_s: float = math.inf,
-    rate_hz: float | None = None,
-    lenses: Sequence[float] = (12.5, 25.0),
-) -> tuple[str, dict[str, Any]]:
-    """Settings for what is given, as text and as JSON values; each that is given has its part.
-
-    Args:
-        setup: all else of cameras, water, strobes and plan.
-        seafloor_depth_m: below the surface.
-        resolution_mm: size of a pixel on the sea floor at the mean altitude: find altitude and
-            lens.
-        dive_s: time of a dive: find the area that fits; with a resolution, at its altitude and
-            lens.
-        battery_s: how long the battery lasts: no dive is longer.
-        rate_hz: pictures a second: find the speed.
-        lenses: available focal lengths, mm.
-
-    Raises:
-        ConfigError: nothing is given.
-        PlanError: no lens fits; the message names what conflicts and the ways out.
-    """
-    parts: list[str] = []
-    data: dict[str, Any] = {}
-    dived = setup
-    if resolution_mm is not None:
-        options = lenses_for_resolution(setup, seafloor_depth_m, resolution_mm, lenses)
-        parts.append(_lens_text(options, resolution_mm))
-        data["lenses"] = json_values(options)
-        dived = with_lens(setup, options[0])
-    if dive_s is not None:
-        area = area_for_dive(dived, seafloor_depth_m, min(dive_s, battery_s))
-        parts.append(_area_text(area, dived))
-        if battery_s < dive_s:
-            parts.append(
-                f"the battery lasts {battery_s:.0f} s of the {dive_s:g} s (vehicle.battery_wh, "
-                "battery_reserve, hotel_w)"
-            )
-        data["dive"] = asdict(area)
-    if rate_hz is not None:
-        rates = speeds_for_rate(setup, rate_hz, lenses)
-        parts.append(_rate_text(rates, rate_hz, setup.plan.speed_mps))
-        data["rates"] = json_values(rates)
-    if not parts:
-        raise ConfigError("say what is given: a resolution (mm), a dive (s) or a rate (Hz)")
-    return "\n\n".join(parts), data
 
 
 def least_altitude_m(plan: PlanConfig) -> float:
@@ -251,44 +185,61 @@ def _lens_ways(
                 change=f"resolution {nearest.pixel_mm:.3g} mm with the {option.lens_mm:g} mm lens",
                 price=f"{ratio:.2f} times {word}, from {nearest.altitude_m:.2f} m",
                 cost=ratio - 1.0,
+                settings={"camera.focal_mm": option.lens_mm},
             )
+
+    def fits(changed: ImagingSetup, lens_mm: float) -> bool:
+        return _lens_option(changed, deepest, resolution_mm, lens_mm).fits
+
     noise_e = setup.camera.read_noise_e
     for option in options:
         if math.isnan(option.snr):
             continue
         times = light_for_snr_e(LEAST_SNR, noise_e) / light_for_snr_e(option.snr, noise_e)
         blur_px = math.ceil(100 * plan.allowed_blur_px * times) / 100
+        blurred = setup.with_plan(allowed_blur_px=blur_px)
+        if blur_px > MOST_BLUR_PX or not fits(blurred, option.lens_mm):
+            continue
         yield Way(
             change=f"allowed_blur_px {blur_px:g} with the {option.lens_mm:g} mm lens from "
             f"{option.altitude_m:.2f} m",
             price=f"{times:.2f} times the exposure and the blur",
             cost=times - 1.0,
+            settings={"camera.focal_mm": option.lens_mm, "plan.allowed_blur_px": blur_px},
         )
     lowest, highest = (f(option.altitude_m for option in options) for f in (min, max))
     # At no distance in front of the port there is no lens to scale.
     if 0.0 < highest < least:
         lens = max(option.lens_mm for option in options)
         longer = math.ceil(10 * lens * least / highest) / 10
-        yield Way(
-            change=f"a lens of about {longer:g} mm, from {least:.2f} m",
-            price=f"a footprint and its lines are {longer / lens:.2f} times smaller than "
-            f"{lens:g} mm gives there",
-            cost=longer / lens - 1.0,
-        )
+        if fits(setup, longer):
+            yield Way(
+                change=f"a lens of about {longer:g} mm, from {least:.2f} m",
+                price=f"a footprint and its lines are {longer / lens:.2f} times smaller than "
+                f"{lens:g} mm gives there",
+                cost=longer / lens - 1.0,
+                settings={"camera.focal_mm": longer},
+            )
     elif lowest > deepest:
         lens = min(option.lens_mm for option in options)
         shorter = math.floor(10 * lens * deepest / lowest) / 10
-        yield Way(
-            change=f"a lens of about {shorter:g} mm, from {deepest:g} m",
-            price="a wider view through the flat port",
-            cost=lens / shorter - 1.0,
-        )
+        if fits(setup, shorter):
+            yield Way(
+                change=f"a lens of about {shorter:g} mm, from {deepest:g} m",
+                price="a wider view through the flat port",
+                cost=lens / shorter - 1.0,
+                settings={"camera.focal_mm": shorter},
+            )
     clearance = math.floor(100 * (highest - plan.relief_m)) / 100
-    if 0.1 <= clearance < plan.least_clearance_m:
+    nearer = setup.with_plan(least_clearance_m=clearance)
+    if 0.1 <= clearance < plan.least_clearance_m and any(
+        fits(nearer, option.lens_mm) for option in options
+    ):
         yield Way(
             change=f"least_clearance_m {clearance:g}",
             price=f"flown from {highest:.2f} m, nearer to the ground",
             cost=1.0 - clearance / plan.least_clearance_m,
+            settings={"plan.least_clearance_m": clearance},
         )
 
 
@@ -332,6 +283,7 @@ def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
             change=f"a rate of {most_hz:g} Hz",
             price=f"{share:.0%} of the speed that {rate_hz:g} Hz would allow",
             cost=1.0 / share - 1.0,
+            settings={},
         ),
         *less_overlap(
             plan, 1.0 - (1.0 - plan.forward_overlap) / share, f"{most_hz:g} Hz and ",
@@ -341,13 +293,22 @@ def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
             change=f"{most_hz:g} Hz and altitude_m {higher_m:g} instead of {plan.altitude_m:g}",
             price=f"the same speed, a pixel grows {1 / share:.2f} times",
             cost=(1.0 / share) ** 2 - 1.0,
+            settings={"plan.altitude_m": higher_m},
         ),
     ]  # fmt: skip
+    lens = setup.camera.focal_mm
+
+    def goes(way: Way) -> bool:
+        changes = {name.removeprefix("plan."): value for name, value in way.settings.items()}
+        if changes.get("altitude_m", 0.0) > HIGHEST_ALTITUDE_M:
+            return False
+        return math.isfinite(_rate_option(setup.with_plan(**changes), most_hz, lens).exposure_ms)
+
     return conflict(
         f"{rate_hz:g} pictures a second are more than the {most_hz:g} that cameras and trigger "
         "take",
         ("the rate requested", "camera.shortest_interval_s"),
-        ways,
+        filter(goes, ways),
     )
 
 
@@ -377,71 +338,8 @@ def _rate_option(setup: ImagingSetup, rate_hz: float, lens_mm: float) -> RateOpt
     )
 
 
-def area_for_dive(setup: ImagingSetup, seafloor_depth_m: float, dive_s: float) -> DiveArea:
-    """The largest square that a dive holds, with its turns, cross lines, descent and ascent.
-
-    Lines of length a lie s apart: `n = ceil(a / s)` of them and `n - 1` turns, the cross lines and
-    the way home at the survey's speed. A real area takes longer the more it is cut up: then
-    `alice-survey plan` gives the time.
-
-    Raises:
-        PlanError: the dive is too short for one line of one picture's length.
-    """
-    settings, plan = imaging_settings(setup.rig, setup, quiet=True), setup.plan
-    costs = time_costs(plan.speed_mps)
-    dive_down_s = costs.dive_s(seafloor_depth_m - plan.altitude_m)
-    spacing = settings.line_spacing_m
-    turn = turn_s(plan, spacing)
-
-    def needed_s(side_m: float) -> float:
-        lines = max(1, math.ceil(side_m / spacing - 1e-9))
-        crossing = plan.cross_lines * (side_m / plan.speed_mps + turn)
-        home = side_m / plan.speed_mps
-        flown = lines * side_m / plan.speed_mps + (lines - 1) * turn
-        return dive_down_s + flown + crossing + home
-
-    smallest = settings.footprint_along_m
-    if needed_s(smallest) > dive_s:
-        raise PlanError(
-            f"a dive of {dive_s:g} s is too short: {dive_down_s:.0f} s go down and up, and one "
-            f"picture's length takes {needed_s(smallest):.0f} s in all: give a longer dive"
-        )
-    low, high = smallest, 2.0 * math.sqrt(dive_s * plan.speed_mps * spacing) + smallest
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (middle, high) if needed_s(middle) <= dive_s else (low, middle)
-    return DiveArea(
-        dive_s=dive_s,
-        area_m2=low * low,
-        side_m=low,
-        lines=max(1, math.ceil(low / spacing - 1e-9)),
-        line_spacing_m=spacing,
-        speed_mps=plan.speed_mps,
-        turn_s=turn,
-        cross_lines=plan.cross_lines,
-    )
-
-
-def turn_s(plan: PlanConfig, spacing_m: float) -> float:
-    """Time from the end of a line to the start of the next, with its run-in.
-
-    Arcs of radius R: a half circle and a straight where lines are 2 R apart or more, else Dubins'
-    three arcs `R (pi + 4 acos((2 R + s) / (4 R)))`; on the spot: two right angles and the way
-    between. `turns = "auto"` takes the quicker.
-    """
-    rate_rad_s = spot_rate_rad_s(plan.turn_rate_limit_deg_s)
-    costs, radius = time_costs(plan.speed_mps, turn_rate_rad_s=rate_rad_s), plan.arc_radius_m
-    if spacing_m >= 2 * radius:
-        arcs = math.pi * radius + spacing_m - 2 * radius
-    else:
-        arcs = radius * (math.pi + 4 * math.acos((2 * radius + spacing_m) / (4 * radius)))
-    run_in = plan.run_in_m / plan.speed_mps
-    by_arcs = arcs / plan.speed_mps + run_in
-    by_spot = 2 * costs.spot_j(math.pi / 2) + spacing_m / plan.speed_mps + run_in
-    return {"arcs": by_arcs, "spot": by_spot}.get(plan.turns, min(by_arcs, by_spot))
-
-
-def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
+def lens_text(options: list[LensOption], resolution_mm: float) -> str:
+    """A table of lenses, and the one to take."""
     best = options[0]
     rows = [
         [
@@ -469,16 +367,8 @@ def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
     ])  # fmt: skip
 
 
-def _area_text(area: DiveArea, setup: ImagingSetup) -> str:
-    return (
-        f"a dive of {area.dive_s:.6g} s holds {area.area_m2:.0f} m2, such as {area.side_m:.1f} x "
-        f"{area.side_m:.1f} m: {area.lines} lines {area.line_spacing_m:.3g} m apart at "
-        f"{area.speed_mps:g} m/s, {area.cross_lines} across, turns of {area.turn_s:.0f} s, descent "
-        f"and ascent; {setup.camera.focal_mm:g} mm lens at {setup.plan.altitude_m:.2f} m"
-    )
-
-
-def _rate_text(options: list[RateOption], rate_hz: float, speed_mps: float) -> str:
+def rate_text(options: list[RateOption], rate_hz: float, speed_mps: float) -> str:
+    """A table of speeds by lens."""
     rows = [
         [
             f"{o.lens_mm:g} mm", f"{o.speed_mps:.3f} m/s", f"{o.forward_overlap:.1%}",

@@ -117,6 +117,7 @@ def _too_long(
                 change=f"strobe_lead_s {lead_s:g} instead of {plan.strobe_lead_s:g}",
                 price="the strobe has less time to reach its brightness",
                 cost=1.0 - lead_s / plan.strobe_lead_s,
+                settings={"plan.strobe_lead_s": lead_s},
             )
         if longest_s > 2 * plan.strobe_lead_s:
             share = (longest_s - 2 * plan.strobe_lead_s) / exposure_s
@@ -125,6 +126,7 @@ def _too_long(
                 change=f"allowed_blur_px {blur_px:g} instead of {plan.allowed_blur_px:g}",
                 price=f"{share:.2f} of the light: {-20 * math.log10(share):.1f} dB more gain",
                 cost=1.0 - share,
+                settings={"plan.allowed_blur_px": blur_px},
             )
         yield from less_overlap(plan, 1.0 - (1.0 - plan.forward_overlap) * slower)
         lumens = math.floor(imaging.strobe_lumens / slower / 100) * 100
@@ -132,6 +134,7 @@ def _too_long(
             change=f"strobe_lumens {lumens:g} instead of {imaging.strobe_lumens:g}",
             price=f"{20 * math.log10(slower):.1f} dB more gain",
             cost=1.0 - 1.0 / slower,
+            settings={"imaging.strobe_lumens": lumens},
         )
 
     return conflict(

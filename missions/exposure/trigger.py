@@ -89,6 +89,7 @@ def too_fast(camera: Camera, limits: CameraConfig, plan: PlanConfig, along_m: fl
                 change=f"speed_mps {speed:g} instead of {plan.speed_mps:g}",
                 price=f"lines take {plan.speed_mps / speed:.2f} times as long",
                 cost=plan.speed_mps / speed - 1.0,
+                settings={"plan.speed_mps": speed},
             )
         yield from less_overlap(plan, 1.0 - plan.speed_mps * shortest_s / along_m)
         longer_m = shortest_s * plan.speed_mps / (1.0 - plan.forward_overlap)
@@ -102,6 +103,7 @@ def too_fast(camera: Camera, limits: CameraConfig, plan: PlanConfig, along_m: fl
                 change=f"altitude_m {altitude_m:g} instead of {plan.altitude_m:g}",
                 price=f"a pixel grows {altitude_m / plan.altitude_m:.2f} times and light falls",
                 cost=(altitude_m / plan.altitude_m) ** 2 - 1.0,
+                settings={"plan.altitude_m": altitude_m},
             )
 
     return conflict(

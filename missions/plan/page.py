@@ -122,12 +122,12 @@ def _coverage(seen: Certificate) -> Table:
     passes = seen.pattern.passes
     rows = (
         ("In at least one picture", share(seen.covered_share, 3)),
-        ("Seen by every camera", f"{seen.every_camera_share:.3%}"),
-        ("Seen by all cameras at once (stereo)", f"{seen.stereo_share:.3%}"),
+        ("Seen by every camera", share(seen.every_camera_share, 3)),
+        ("Seen by all cameras at once (stereo)", share(seen.stereo_share, 3)),
         (
             f"At the requested overlap: on {passes} line(s) and in "
             f"{passes * seen.pattern.pictures} picture(s) of every camera",
-            f"{seen.share_at_overlap:.3%}",
+            share(seen.share_at_overlap, 3),
         ),
         ("Fewest pictures of a camera anywhere", f"{seen.fewest_pictures}"),
         ("Pictures of all cameras, mean", f"{seen.mean_pictures:.1f}"),

@@ -33,10 +33,12 @@ from missions.coverage.stations import (
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.settings_table import Setting
 from missions.exposure.storage import raw_bytes
+from missions.exposure.ways_out import ConflictError
 from missions.lines.lay import lay_lines
 from missions.lines.sweep import Sweep, best_heading
+from missions.plan.ready import check_depth, check_turns, gap_m, with_tried_ways
 from missions.plan.rows import plan_rows
-from missions.plan.strength import arcs_fit, survey_costs, turn_rate_deg_s, warn_of_swell
+from missions.plan.strength import survey_costs, turn_rate_deg_s, warn_of_swell
 from missions.route.dives import split_dives
 from missions.route.energy import sound_craft_of, usable_wh
 from missions.route.terrain import (
@@ -83,12 +85,20 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         rig: its cameras in water.
 
     Raises:
-        PlanError: no plan meets the settings; the message names the numbers.
+        PlanError: no plan meets the settings; the message names the numbers, and of ways out
+            those that were tried up to where lines are laid.
     """
+    try:
+        return _planned(config, rig)
+    except ConflictError as found:
+        raise with_tried_ways(found, config, rig) from None
+
+
+def _planned(config: SurveyConfig, rig: Rig) -> Planned:
     with heard() as warnings:
         wanted = config.plan
         imaging = imaging_settings(rig, ImagingSetup.of(config))
-        _check_turns(wanted)
+        check_turns(wanted)
         step_m = imaging.station_spacing_m
         stereo = common_swath(rig, wanted.altitude_m, step_m)
         pattern = sure_pattern(rig, wanted.altitude_m, imaging.line_spacing_m, step_m)
@@ -104,7 +114,7 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             warn(f"{craft.name} has no [hull]: distances to floor and zones are those of one point")
         _warn_of_zones(area, config.area.no_go_clearance_m, hull, glass_body_m)
         depth_m = _depth_m(config.area, area, bathymetry)
-        _check_depth(wanted.altitude_m, depth_m)
+        check_depth(wanted.altitude_m, depth_m)
         ways, home = Ways(area.allowed), _home(wanted.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
         warn_of_swell(config, depth_m)
@@ -188,7 +198,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
                 f"and {1 - seen.every_camera_share:.2%} is not seen by every camera: look at "
                 "map.png, and give the vehicle more room, or raise the overlaps"
             )
-        about = _details(imaging, sweep, stereo, rig, wanted) | {"terrain": figures}
+        about = _details(imaging, sweep, stereo, rig, wanted)
+        about |= {"terrain": figures, "warnings": warnings}
         details = json.loads(json.dumps(about))  # as they are read back
         finished = replace(plan, coverage=seen.share_at_overlap, details=details)
         planned = Planned(
@@ -326,30 +337,6 @@ def _check_rating(craft: Vehicle, deepest_m: float) -> None:
         )
 
 
-def _check_depth(altitude_m: float, depth_m: float) -> None:
-    if altitude_m >= depth_m:
-        raise PlanError(
-            f"altitude_m {altitude_m:g} is not below the surface over a sea floor at "
-            f"{depth_m:g} m: lower plan.altitude_m or check area.seafloor_depth_m"
-        )
-
-
-def _check_turns(plan: PlanConfig) -> None:
-    if not arcs_fit(plan):
-        raise PlanError(
-            f"turns of {plan.turn_radius_m:g} m radius at {plan.speed_mps:g} m/s need "
-            f"{turn_rate_deg_s(plan):.0f} deg/s; turn_rate_limit_deg_s is "
-            f"{plan.turn_rate_limit_deg_s:g}: raise turn_radius_m, lower speed_mps or set "
-            "turns = 'auto'"
-        )
-    if plan.arc_radius_m > plan.turn_radius_m:
-        warn(
-            f"turn_radius_m {plan.turn_radius_m:g} at {plan.speed_mps:g} m/s is beyond "
-            f"turn_rate_limit_deg_s {plan.turn_rate_limit_deg_s:g}: arcs are planned with "
-            f"{plan.arc_radius_m:g} m"
-        )
-
-
 def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
     least_m = min(imaging.footprint_across_m, imaging.footprint_along_m)
     north_0, east_0, north_1, east_1 = area.survey.bounds
@@ -378,10 +365,10 @@ def _warn_of_zones(
 
 def _warn_of_spacing(plan: PlanConfig, imaging: ImagingSettings, stereo: Swath) -> None:
     spacing_m, reached = imaging.line_spacing_m, imaging.spacing.mean_overlap
-    if spacing_m > 2 * stereo.half_across_m:
+    gap = gap_m(imaging, stereo)
+    if gap > 0:
         warn(
-            f"lines {spacing_m:g} m apart leave gaps of "
-            f"{spacing_m - 2 * stereo.half_across_m:.2f} m in stereo; at most "
+            f"lines {spacing_m:g} m apart leave gaps of {gap:.2f} m in stereo; at most "
             f"{2 * stereo.half_across_m:.2f} m apart do not"
         )
     needed_m = imaging.footprint_across_m * (1 - plan.side_overlap)

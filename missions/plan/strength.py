@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -12,14 +13,13 @@ from alice_survey.base.errors import AliceError, PlanError, warn
 from alice_survey.vehicle.fleet import GEOMETRIES
 from alice_survey.vehicle.swell import orbital_speed_mps
 from missions.exposure.settings import ImagingSetup, imaging_settings
-from missions.exposure.ways_out import Way, conflict
+from missions.exposure.ways_out import Settings, Way, conflict
 from missions.route.energy import (
     FlightConditions,
     flies_everywhere,
     flight_conditions,
     has_sway,
     motion,
-    usable_wh,
     vehicle_costs,
 )
 from missions.values.costs import Costs
@@ -40,16 +40,6 @@ def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
     flown = flight_conditions(config)
     refused = partial(too_strong, flown, config.vehicle, ImagingSetup.of(config))
     return vehicle_costs(flown, refused=refused, imaging_w=imaging_w)
-
-
-def endurance_s(config: SurveyConfig) -> float:
-    """How long a dive may take of the battery, at the mean power on lines of all headings.
-
-    Raises:
-        PlanError: as `survey_costs`.
-    """
-    power_w = np.asarray(survey_costs(config).line_w)
-    return 3600.0 * usable_wh(config.vehicle) / float(power_w[np.isfinite(power_w)].mean())
 
 
 def warn_of_swell(config: SurveyConfig, depth_m: float) -> None:
@@ -145,38 +135,50 @@ def _waits(flown: FlightConditions, held_mps: float) -> Iterator[Way]:
     """Wait for a weaker current; with a heading requested, also with all others."""
     size = math.hypot(*flown.current_ne_mps)
 
-    def wait(most_mps: float, also: str) -> Way:
+    towards_deg = math.degrees(math.atan2(*flown.current_ne_mps[::-1])) % 360.0
+    weaker = {"sea.current_file": None, "sea.current_towards_deg": towards_deg}
+
+    def wait(most_mps: float, also: str, more: Settings) -> Way:
         return Way(
             change=f"wait for a current of {most_mps:.2f} m/s (sea.current_mps){also}",
             price=f"{1.0 - most_mps / size:.0%} less current",
             cost=1.0 - most_mps / size,
+            settings={**weaker, "sea.current_mps": most_mps, **more},
         )
 
     if held_mps > 0.0:
-        yield wait(held_mps, "")
+        yield wait(held_mps, "", {})
     if flown.line_heading_deg is not None:
         most_mps = held_current_mps(replace(flown, line_heading_deg=None))
         if held_mps < most_mps < size:
-            yield wait(most_mps, " and leave plan.line_heading_deg out")
+            yield wait(
+                most_mps, " and leave plan.line_heading_deg out", {"plan.line_heading_deg": None}
+            )
 
 
 def _changes(flown: FlightConditions, own: VehicleConfig, setup: ImagingSetup) -> Iterator[Way]:
     """Another heading, speed, controller or vehicle that flies in this current."""
     yield from _headings(flown)
-    yield from _speeds(flown, setup, "", 0.0)
+    yield from _speeds(flown, setup)
     if has_sway(flown.craft):
         other = "los" if own.controller == "sway" else "sway"
         changed = flown.with_vehicle(own.model_copy(update={"controller": other}))
-        yield from _tried(changed, setup, f"vehicle.controller = '{other}'", 0.0)
+        named = f"vehicle.controller = '{other}'"
+        yield from _tried(changed, setup, named, 0.0, {"vehicle.controller": other})
     if own.file is not None or own.coefficients_file is not None:  # of this vehicle alone
         return
     for other in (name for name in GEOMETRIES if name != own.name):
-        sound = own.model_copy(update={"name": other, "thruster_health": {}})
-        yield from _tried(flown.with_vehicle(sound), setup, f"vehicle.name = '{other}'", 1.0)
+        changed = flown.with_vehicle(own.model_copy(update={"name": other, "thruster_health": {}}))
+        named = f"vehicle.name = '{other}'"
+        settings: dict[str, Any] = {"vehicle.name": other}
+        if own.impaired:
+            named += " without vehicle.thruster_health"
+            settings["vehicle.thruster_health"] = {}
+        yield from _tried(changed, setup, named, 1.0, settings)
 
 
 def _tried(
-    changed: FlightConditions, setup: ImagingSetup, change: str, cost: float
+    changed: FlightConditions, setup: ImagingSetup, change: str, cost: float, settings: Settings
 ) -> Iterator[Way]:
     """A change by itself if it works, else with another speed."""
     if flies_everywhere(changed):
@@ -184,9 +186,11 @@ def _tried(
         price = f"heading off the course by up to {math.degrees(math.acos(1 - lost)):.0f} deg"
         if changed.manner == "held":
             price = "lines held by sway"
-        yield Way(change=change, price=price, cost=cost + lost)
-    else:
-        yield from _speeds(changed, setup, f"{change} and ", cost)
+        yield Way(change=change, price=price, cost=cost + lost, settings=settings)
+        return
+    alone = Way(change=change, price="", cost=cost, settings=settings)
+    for way in _speeds(changed, setup):
+        yield replace(alone.then(way), price=way.price)
 
 
 def _headings(flown: FlightConditions) -> Iterator[Way]:
@@ -201,13 +205,12 @@ def _headings(flown: FlightConditions) -> Iterator[Way]:
                     change=f"plan.line_heading_deg {heading:g} instead of {wanted_deg:g}",
                     price=f"lines turned by {turned:g} deg",
                     cost=turned / 90.0,
+                    settings={"plan.line_heading_deg": float(heading)},
                 )
                 return
 
 
-def _speeds(
-    flown: FlightConditions, setup: ImagingSetup, change: str, cost: float
-) -> Iterator[Way]:
+def _speeds(flown: FlightConditions, setup: ImagingSetup) -> Iterator[Way]:
     """The speed nearest to the plan's that flies, and at which cameras and trigger keep up.
 
     With it the radius of turns, where the arcs would be too quick.
@@ -215,11 +218,12 @@ def _speeds(
     own = flown.speed_mps
     for speed in sorted(_SPEEDS_MPS, key=lambda each: abs(math.log(each / own))):
         plan = setup.plan.model_copy(update={"speed_mps": speed})
-        wider = ""
+        settings, wider = {"plan.speed_mps": speed}, ""
         if not arcs_fit(plan):
             limit_rad_s = math.radians(plan.turn_rate_limit_deg_s)
             radius_m = math.ceil(10.0 * speed / limit_rad_s) / 10.0
             plan = plan.model_copy(update={"turn_radius_m": radius_m})
+            settings["plan.turn_radius_m"] = radius_m
             wider = f" and plan.turn_radius_m {radius_m:g}"
         faster = replace(flown, speed_mps=speed, turn_radius_m=plan.arc_radius_m)
         if speed == own or not flies_everywhere(faster) or not _images(replace(setup, plan=plan)):
@@ -231,9 +235,10 @@ def _speeds(
             else f"lines take {1.0 / ratio:.2g} times as long"
         )
         yield Way(
-            change=f"{change}plan.speed_mps {speed:g} instead of {own:g}{wider}",
+            change=f"plan.speed_mps {speed:g} instead of {own:g}{wider}",
             price=price,
-            cost=cost + max(ratio, 1.0 / ratio) - 1.0 + _swath_lost(faster),
+            cost=max(ratio, 1.0 / ratio) - 1.0 + _swath_lost(faster),
+            settings=settings,
         )
         return
 

@@ -12,6 +12,8 @@ from alice_survey.base.config import SurveyConfig
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.steady import drag_power
 from missions.exposure.settings import ImagingSetup, imaging_settings
+from missions.exposure.ways_out import ConflictError
+from missions.plan.ready import with_tried_ways
 from missions.route.energy import (
     FlightConditions,
     Manner,
@@ -184,7 +186,10 @@ def current_report(config: SurveyConfig, plot: Path | None) -> tuple[str, dict[s
         PlanError: cameras and strobes cannot do it, or the picture cannot be written.
     """
     setup, flown = ImagingSetup.of(config), flight_conditions(config)
-    imaging_w = imaging_settings(setup.rig, setup, quiet=True).imaging_w
+    try:
+        imaging_w = imaging_settings(setup.rig, setup, quiet=True).imaging_w
+    except ConflictError as found:
+        raise with_tried_ways(found, config, setup.rig) from None
     text, data = energy_report(flown, usable_wh(config.vehicle), imaging_w=imaging_w)
     if plot is None:
         return text, data

@@ -71,6 +71,8 @@ class FlightConditions:
     """The left port's outer glass, about which a vehicle with sway turns."""
     hotel_w: float
     """Everything but thrusters and strobes."""
+    needs_arcs: bool = False
+    """Whether the plan turns in no other way."""
 
     def with_vehicle(self, settings: VehicleConfig) -> "FlightConditions":
         """The same conditions for another vehicle or controller.
@@ -102,6 +104,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         most_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=hotel_w(config.vehicle),
+        needs_arcs=plan.turns == "arcs",
     )
 
 
@@ -156,6 +159,8 @@ def vehicle_costs(
         )
     hotel = conditions.hotel_w
     arc_w, pace = _arc(conditions)
+    if conditions.needs_arcs and not math.isfinite(arc_w):
+        raise refused(f"arcs of {conditions.turn_radius_m:g} m radius cannot be flown")
     step_mps, step_w = _sway_step(craft, courses, current, conditions.manner)
     heave_mps, heave_w = _heave(craft, current)
     return Costs(
@@ -471,16 +476,18 @@ def flies_everywhere(conditions: FlightConditions) -> bool:
     """Whether any survey can be flown, whatever way between lines it takes.
 
     That is: lines both ways, on the heading requested if there is one; all courses between lines;
-    turns on the spot; descent and ascent.
+    turns on the spot, arcs where the plan has no other turns; descent and ascent.
     """
     current = conditions.current_ne_mps
+    try:
+        _heave(conditions.craft, current)
+    except PlanError:
+        return False
     downstream = math.atan2(current[1], current[0])
     between = _between(conditions, downstream + _courses())
     lines = _both_ways(_line_power(conditions, _courses()))
     if not np.all(np.isfinite(between)) or not np.any(lines) or not _flies_heading(conditions):
         return False
-    try:
-        _heave(conditions.craft, current)
-    except PlanError:
+    if conditions.needs_arcs and not math.isfinite(_arc(conditions)[0]):
         return False
     return math.isfinite(_spot(conditions)[0])

@@ -9,6 +9,7 @@ from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.kit.figure import figure_style, save_figure
+from alice_survey.kit.words import share
 from missions.coverage.drawing import (
     draw_counts,
     draw_polygons,
@@ -131,8 +132,8 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     lines = [
         f"{found.plan.name}: {found.record.registered} of {found.record.total} pictures in the "
         f"model; {good} of {counted(good + spoilt, 'station')} of use, they see "
-        f"{found.seen.covered_share:.2%} and {found.seen.share_at_overlap:.2%} at the overlap "
-        "asked for"
+        f"{share(found.seen.covered_share, 2)} and {share(found.seen.share_at_overlap, 2)} at the "
+        "overlap asked for"
     ]
     if len(found.record.models) > 1:
         sizes = " and ".join(map(str, found.record.models))

@@ -103,7 +103,7 @@ def judge(
     outcome: Literal["value", "refused", "fault"] = "value"
     message = trace = place = ""
     try:
-        with sandbox.entered(), _bounded(longest_s), warnings.catch_warnings():
+        with sandbox.entered(), bounded(longest_s), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read(path)
     except AliceError as error:
@@ -129,7 +129,7 @@ def judge(
 
 
 @contextlib.contextmanager
-def _bounded(longest_s: float) -> Iterator[None]:
+def bounded(longest_s: float) -> Iterator[None]:
     """Less memory than there is, and an alarm.
 
     The alarm cannot stop a library's own loop.

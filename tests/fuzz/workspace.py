@@ -1,5 +1,6 @@
 """Files of a workspace that a user writes, and references of other programs."""
 
+import re
 from collections.abc import Callable
 from functools import partial
 from importlib import resources
@@ -31,6 +32,23 @@ def read_survey(path: Path) -> object:
     from alice_survey.base.config import load_config
 
     return load_config(path)
+
+
+def read_and_check_survey(path: Path) -> object:
+    """The settings, used up to where lines are laid; what planning refuses is one line here."""
+    from alice_survey.base.config import load_config
+    from alice_survey.base.errors import ConfigError, PlanError, VehicleError
+    from camera_calib.rig import design_rig
+    from missions.plan.ready import check_ready
+
+    config = load_config(path)
+    try:
+        return check_ready(config, design_rig(config.camera, config.water), {})
+    except (PlanError, VehicleError) as error:
+        said = str(error).split("; ways out")[0]
+        if re.search(r"\d{20}|\b(nan|inf)\b", said):
+            raise ValueError(f"no number to read: {said}") from None
+        raise ConfigError(f"{path}: {said}") from None
 
 
 def _control(folder: Path) -> None:
@@ -152,6 +170,10 @@ TARGETS = (
     ),
     _target(
         "survey.toml, demo", "toml", "survey.toml", partial(_survey, name="demo.toml"), read_survey
+    ),
+    _target(
+        "survey.toml, used", "toml", "survey.toml", partial(_survey, name="survey.toml"),
+        read_and_check_survey, examples=60,
     ),
     _target("control.csv", "csv", "control.csv", _control, read_control),
     _target("picks.csv", "csv", "picks.csv", _picks, read_picks),

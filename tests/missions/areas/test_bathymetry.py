@@ -295,3 +295,15 @@ def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
     path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
     with pytest.raises(PlanError, match=r"a\.xyz"):
         read_bathymetry(path, DATUM, crs=UTM, sense="depths")
+
+
+def test_an_area_that_lies_in_the_raster_when_swapped_is_said_to_be(tmp_path: Path) -> None:
+    path = _written(tmp_path / "d.tif", _plane())
+    for place, is_swapped in (
+        (Datum(DATUM.longitude_deg, DATUM.latitude_deg), True),
+        (Datum(34.9, 32.8236), False),
+        (Datum(-33.0, 151.0), False),
+    ):
+        with pytest.raises(PlanError, match="does not reach the survey area") as caught:
+            read_bathymetry(path, place, bounds_ne=(0.0, 0.0, 5.0, 5.0))
+        assert ("latitude and longitude swapped" in str(caught.value)) is is_swapped

@@ -174,6 +174,14 @@ def test_an_allowed_area_may_leave_out_some_but_not_all(
             r"corner 2 at \(10, 20\.001\) is \d+ km",
         ),
         ({"polygon_latlon_deg": ((10, 20), (10, 21), (11, 20))}, r"corner \d at .* km"),
+        (  # without a datum, another layer shows it
+            {"polygon_latlon_deg": RING, "no_go_latlon_deg": (tuple(c[::-1] for c in RING),)},
+            r"no_go_latlon_deg.* swapped here or in the area",
+        ),
+        (
+            {"polygon_latlon_deg": RING, "no_go_latlon_deg": (((40, 20), (40, 21), (41, 20)),)},
+            r"no_go_latlon_deg.* the area is too large, or a corner is wrong",
+        ),
         ({"polygon_ne_m": ((0, 0), (10, 0), (10, 1e6))}, "corner 3 is 1000 km"),
     ],
 )

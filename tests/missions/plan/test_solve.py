@@ -1,0 +1,115 @@
+import json
+import math
+from typing import Any
+
+import pytest
+
+from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.errors import ConfigError, PlanError
+from camera_calib.rig import design_rig
+from missions.exposure.ways_out import ConflictError
+from missions.plan.planner import plan_survey
+from missions.plan.solve import area_for_dive, solve_report, turn_s
+from missions.values.costs import SETTLE_S
+
+
+def survey(**sections: Any) -> SurveyConfig:
+    return parse_config(sections, "survey")
+
+
+def test_a_dive_at_a_resolution_is_solved_at_its_altitude() -> None:
+    config = survey()
+    data = solve_report(config, resolution_mm=0.33, dive_s=1800.0)[1]
+    best = data["lenses"][0]
+    assert data["dive"]["line_spacing_m"] == pytest.approx(best["spacing_m"])
+    lower = survey(
+        plan={"altitude_m": best["altitude_m"]},
+        camera={"focal_mm": best["lens_mm"], "f_number": best["f_number"]},
+    )
+    assert data["dive"]["area_m2"] == pytest.approx(area_for_dive(lower, 1800.0).area_m2)
+    assert data["dive"]["area_m2"] < 0.9 * area_for_dive(config, 1800.0).area_m2
+
+
+@pytest.mark.parametrize("dive_s", [600.0, 3600.0, 20_000.0])
+def test_the_area_of_a_dive_takes_the_dive(dive_s: float) -> None:
+    config = survey(plan={"side_overlap": 0.45})
+    area = area_for_dive(config, dive_s)
+    assert area.area_m2 == pytest.approx(area.side_m**2)
+    assert area.lines == math.ceil(area.side_m / area.line_spacing_m)
+    lines = area.lines + area.cross_lines
+    flown = (lines + 1) * area.side_m / 0.2 + (lines - 1) * area.turn_s + 2 * 13.0 / 0.15
+    assert flown <= dive_s + 1e-6
+    # A line more does not fit: the next area that is longer than the dive is near.
+    assert flown + area.side_m / 0.2 + area.turn_s > dive_s - 1.0
+
+
+def test_turns_are_half_circles_where_lines_are_wide_apart() -> None:
+    config = survey(plan={"turns": "arcs"})
+    assert turn_s(config.plan, 1.0) == pytest.approx((math.pi * 0.5 + 0.5) / 0.2)
+    # Dubins' three arcs join half circles where lines are two radii apart, and 7/3 pi R at none.
+    assert turn_s(config.plan, 1.0 - 1e-9) == pytest.approx(turn_s(config.plan, 1.0), abs=1e-3)
+    assert turn_s(config.plan, 0.0) == pytest.approx((7 / 3 * math.pi * 0.5 + 0.5) / 0.2)
+    spot = survey(plan={"turns": "spot"})
+    # Two right angles at 15 deg/s, and the time of each stop.
+    assert turn_s(spot.plan, 1.0) == pytest.approx(2 * (6.0 + SETTLE_S) + 1.0 / 0.2 + 0.5 / 0.2)
+    auto = survey()
+    assert turn_s(auto.plan, 1.0) == min(turn_s(config.plan, 1.0), turn_s(spot.plan, 1.0))
+
+
+def test_a_dive_that_is_too_short_is_refused() -> None:
+    with pytest.raises(PlanError, match="173 s"):
+        area_for_dive(survey(), 150.0)
+
+
+def test_the_planner_takes_about_as_long_for_the_area_of_a_dive() -> None:
+    config = survey(plan={"side_overlap": 0.45})
+    side_m = area_for_dive(config, 3600.0).side_m
+    square = SurveyConfig.model_validate(
+        {
+            "plan": {"side_overlap": 0.45, "closing_line": False},
+            "area": {"length_m": side_m, "width_m": side_m},
+        }
+    )
+    rig = design_rig(square.camera, square.water)
+    assert plan_survey(square, rig).plan.duration_s == pytest.approx(3600.0, rel=0.05)
+
+
+def test_the_report_has_a_part_for_each_question() -> None:
+    config = survey(plan={"side_overlap": 0.45})
+    data = solve_report(config, resolution_mm=0.5, dive_s=3600, rate_hz=0.25)[1]
+    assert set(data) == {"lenses", "dive", "rates"}
+    json.dumps(data, allow_nan=False)
+    with pytest.raises(ConfigError):
+        solve_report(config)
+
+
+@pytest.mark.parametrize("battery_wh", [60.0, 140.0])
+def test_the_battery_ends_a_dive_as_it_does_for_the_planner(battery_wh: float) -> None:
+    config = survey(plan={"side_overlap": 0.45}, vehicle={"battery_wh": battery_wh})
+    area = area_for_dive(config, 100_000.0)
+    square = survey(
+        plan={"side_overlap": 0.45, "closing_line": False},
+        area={"length_m": area.side_m, "width_m": area.side_m},
+    )
+
+    plan = plan_survey(square, design_rig(square.camera, square.water)).plan
+
+    assert area.usable_wh == pytest.approx(0.8 * battery_wh)
+    assert plan.energy_wh == pytest.approx(area.energy_wh, rel=0.1)
+    assert plan.duration_s == pytest.approx(area.dive_s, rel=0.1)
+    assert area.energy_wh == pytest.approx(area.usable_wh, rel=0.05)
+
+
+def test_what_ends_a_dive_is_said() -> None:
+    text, data = solve_report(survey(), dive_s=1e6)
+    assert text.startswith(f"the battery ends a dive after {data['dive']['dive_s']:.0f} of 1e+06 s")
+    assert solve_report(survey(), dive_s=3600.0)[0].startswith("a dive of 3600 s holds")
+    with pytest.raises(PlanError, match=r"raise vehicle\.battery_wh"):
+        area_for_dive(survey(vehicle={"battery_wh": 1.0}), 3600.0)
+
+
+def test_ways_out_of_a_dive_that_cannot_be_are_tried() -> None:
+    with pytest.raises(ConflictError) as caught:
+        area_for_dive(survey(plan={"speed_mps": 2.0, "forward_overlap": 0.95}), 3600.0)
+    (way,) = caught.value.ways
+    assert list(way.settings) == ["plan.speed_mps"]
