@@ -26,7 +26,7 @@ from missions.values.costs import Costs
 from missions.values.line import Line, LineKind
 from missions.values.pattern import Pattern
 
-MOST_STATIONS = 100_000
+MOST_STATIONS = 2_000_000
 """Most stations of a plan. Chosen: days of flight, and terabytes of pictures."""
 KINDS: tuple[LineKind, ...] = ("survey", "cross", "closing", "fill")
 SURVEY, CROSS, CLOSING, FILL = range(len(KINDS))

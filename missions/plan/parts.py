@@ -85,6 +85,11 @@ def plan_parts(
             f"{len(parts)} parts are surveyed by {len(whole.dives)} dives, each launched and "
             "recovered in its part: fly them one by one (vehicle.dive)"
         )
+    if len(whole.dives) > len(parts) and not wanted.cross_lines:
+        warn(
+            f"{len(whole.dives)} dives are tied by the overlap of neighbouring lines "
+            "alone: plan.cross_lines = 1 crosses the lines of all of them"
+        )
     return whole
 
 

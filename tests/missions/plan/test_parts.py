@@ -3,14 +3,17 @@
 import math
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import shapely
+from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, box
 
 from alice_survey.base.config import parse_config
 from alice_survey.base.errors import PlanError
 from missions.fly.flight_route import one_dive, path_of
 from missions.plan.parts import parts_of
+from missions.values.line import Line
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import planned
 from tests.oracles_lines import area_of
@@ -69,3 +72,27 @@ def test_parts_that_touch_are_one() -> None:
     assert first.survey.bounds == (0, 0, 5, 5)
     assert second.survey.bounds == (20, 0, 25, 5)
     assert (home, entry) == ((0.0, 0.0), (19.0, 0.0))
+
+
+def _as_string(line: Line) -> LineString:
+    return LineString([line.start_ne_m, line.end_ne_m])
+
+
+@pytest.mark.parametrize("cross_lines", [0, 1])
+def test_cross_lines_tie_all_dives(cross_lines: int, capsys: pytest.CaptureFixture[str]) -> None:
+    wanted = {"dive_s": 500.0, "cross_lines": cross_lines}
+    plan = planned(parse_config({"plan": wanted}, "test"))
+    assert len(plan.dives) >= 4
+    owner = [
+        number
+        for number, dive in enumerate(plan.dives)
+        for _ in range(dive.first_line, dive.last_line + 1)
+    ]
+    ties = np.zeros((len(plan.dives), len(plan.dives)))
+    for i, line in enumerate(plan.lines):
+        for j, other in enumerate(plan.lines):
+            if line.kind == "cross" and _as_string(line).intersects(_as_string(other)):
+                ties[owner[i], owner[j]] = 1
+    together, _ = connected_components(ties, directed=False)
+    assert together == (1 if cross_lines else len(plan.dives))
+    assert ("tied" in capsys.readouterr().err) == (not cross_lines)
