@@ -47,7 +47,7 @@ class Ways:
         """
         self.allowed = allowed
         self.fence: Fence = fence_of(allowed)
-        self._from_node: dict[int, tuple[Array, NDArray[np.int32]]] = {}
+        self._from_node: dict[int, Array] = {}
 
     def free(self, a: Place, b: Place) -> bool:
         """Whether the straight between two places is inside."""
@@ -142,25 +142,14 @@ class Ways:
                     f"the place {place[0]:.2f} m north, {place[1]:.2f} m east is outside of the "
                     "allowed area: move it, or widen area.turn_margin_m or the allowed area"
                 )
-        best_m, best = math.inf, (-1, -1)
-        if len(self._nodes):
-            seen_a, seen_b = self._seen(np.array([a]))[0], self._seen(np.array([b]))[0]
-            used, goals = np.flatnonzero(np.isfinite(seen_a)), np.flatnonzero(np.isfinite(seen_b))
-            through = seen_a[used, None] + self._between(used, goals) + seen_b[goals]
-            if through.size:
-                first, last = np.unravel_index(int(np.argmin(through)), through.shape)
-                best_m, best = float(through[first, last]), (int(used[first]), int(goals[last]))
+        best_m, chain = self._over_nodes(np.array([a]), np.array([b]))
         if math.isinf(best_m):
             raise PlanError(
                 f"no way inside the allowed area from {a[0]:.2f} m north, {a[1]:.2f} m east to "
                 f"{b[0]:.2f} m north, {b[1]:.2f} m east: its parts are not connected; widen "
                 "the allowed area (area.turn_margin_m), or survey the parts one by one"
             )
-        before = self._from_node[best[0]][1]
-        chain = [best[1]]
-        while chain[-1] != best[0]:
-            chain.append(int(before[chain[-1]]))
-        path = np.concatenate([[a], self._nodes[chain[::-1], :2], [b]])
+        path = np.concatenate([[a], self._nodes[chain, :2], [b]])
         moved = np.linalg.norm(np.diff(path, axis=0), axis=1) > TOUCH_M
         moved[-1] |= not moved.any()
         kept = np.concatenate([[True], moved])
@@ -169,6 +158,32 @@ class Ways:
             kept[np.flatnonzero(kept[:-1])[-1]] = False  # a corner that is the goal itself
         result: Array = path[kept]
         return result
+
+    def _over_nodes(self, a: Array, b: Array) -> tuple[float, list[int]]:
+        """The shortest way over corners between two places, (1, 2) each: length, and which."""
+        size = len(self._nodes)
+        if size == 0:
+            return math.inf, []
+        seen_a, seen_b = self._seen(a)[0], self._seen(b)[0]
+        near, graph = np.flatnonzero(np.isfinite(seen_a)), self._graph
+        # The place is one more corner; an edge of no length would be none.
+        joint = csr_array(
+            (
+                np.append(graph.data, np.maximum(seen_a[near], 1e-12)),
+                np.append(graph.indices, near),
+                np.append(graph.indptr, graph.nnz + len(near)),
+            ),
+            shape=(size + 1, size + 1),
+        )
+        far, before = dijkstra(joint, directed=False, indices=size, return_predecessors=True)
+        through = far[:size] + seen_b
+        node = int(np.argmin(through))
+        if math.isinf(through[node]):
+            return math.inf, []
+        chain = [node]
+        while before[chain[-1]] != size:
+            chain.append(int(before[chain[-1]]))
+        return float(through[node]), chain[::-1]
 
     @cached_property
     def _nodes(self) -> Array:
@@ -197,11 +212,9 @@ class Ways:
         """(U, V) lengths of the shortest ways from corners to corners; ways to all are kept."""
         new = [node for node in nodes.tolist() if node not in self._from_node]
         if new:
-            distances, before = dijkstra(
-                self._graph, directed=False, indices=new, return_predecessors=True
-            )
-            self._from_node |= dict(zip(new, zip(distances, before, strict=True), strict=True))
-        rows = [self._from_node[node][0][goals] for node in nodes.tolist()]
+            distances = dijkstra(self._graph, directed=False, indices=new)
+            self._from_node |= dict(zip(new, distances, strict=True))
+        rows = [self._from_node[node][goals] for node in nodes.tolist()]
         return np.array(rows).reshape(len(rows), len(goals))
 
     def _round_corners(
