@@ -175,7 +175,8 @@ class Ways:
             ),
             shape=(size + 1, size + 1),
         )
-        far, before = dijkstra(joint, directed=False, indices=size, return_predecessors=True)
+        found = dijkstra(joint, directed=False, indices=[size], return_predecessors=True)
+        far, before = found[0][0], found[1][0]
         through = far[:size] + seen_b
         node = int(np.argmin(through))
         if math.isinf(through[node]):
