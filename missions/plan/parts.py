@@ -30,7 +30,7 @@ Place = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flown:
+class PlannedDives:
     """Lines in the order of flight, and the dives along them."""
 
     lines: tuple[Line, ...]
@@ -48,7 +48,7 @@ def plan_parts(
     *,
     usable_wh: float,
     depth_m: float,
-) -> Flown:
+) -> PlannedDives:
     """Lay the lines of all parts and divide them into dives.
 
     Args:
@@ -71,11 +71,11 @@ def plan_parts(
             f"the vehicle may be in {len(parts)} parts and cannot pass between them in one dive: "
             "set split_dives = true, or widen area.turn_margin_m"
         )
-    whole = Flown(lines=(), dives=(), sweep=None)
+    whole = PlannedDives(lines=(), dives=(), sweep=None)
     for number, (part, home) in enumerate(parts):
         more = _plan_part(part, wanted, pattern, costs, home, usable_wh, depth_m)
         dives = (_from_line(dive, len(whole.lines)) for dive in more.dives)
-        whole = Flown(
+        whole = PlannedDives(
             lines=(*whole.lines, *more.lines),
             dives=(*whole.dives, *dives),
             sweep=more.sweep if number == 0 else whole.sweep,
@@ -135,7 +135,7 @@ def _plan_part(
     home_ne: Place,
     usable_wh: float,
     depth_m: float,
-) -> Flown:
+) -> PlannedDives:
     """Lines and dives of one part; arguments as of `plan_parts`."""
     ways, sweep = Ways(area.allowed), None
     cross_lines, closing_line = wanted.cross_lines, wanted.closing_line
@@ -169,7 +169,7 @@ def _plan_part(
         depth_m=depth_m,
         split=wanted.split_dives,
     )
-    return Flown(lines=tuple(lines), dives=dives, sweep=sweep)
+    return PlannedDives(lines=tuple(lines), dives=dives, sweep=sweep)
 
 
 def _from_line(dive: Dive, count: int) -> Dive:
