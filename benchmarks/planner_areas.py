@@ -1,17 +1,19 @@
-"""Areas to plan: a quad, two L-shapes, a star, and a coast; each some number of rows wide."""
+"""Areas to plan: a quad, two L-shapes, a star, a coast, and harbours; each some rows wide."""
 
 import math
 
 import numpy as np
 import shapely
 import shapely.affinity
-from shapely.geometry import MultiPolygon, Polygon, box
+from shapely.geometry import MultiPolygon, Point, Polygon, box
 
 from alice_survey.base.frames import Array, Datum
 from missions.values.area import Area, multipolygon
 
 _COAST_SEED = 5
 _COAST_CORNERS = 500
+_PILE = 0.006
+"""Radius of a pile: 0.6 m in a harbour 100 m wide."""
 
 
 def shapes() -> dict[str, Polygon]:
@@ -26,8 +28,27 @@ def shapes() -> dict[str, Polygon]:
         "L, two holes": ell.difference(shapely.union_all(holes)),
         "star": Polygon(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)),
         f"coast, {_COAST_CORNERS} corners": _coast(),
+        "harbour, 28 piles": harbour(4, 7),
+        "harbour, 56 piles": harbour(7, 8),
     }
     return {name: _one_wide(shape) for name, shape in named.items()}
+
+
+def harbour(rows: int, columns: int) -> Polygon:
+    """A basin with a pier, and a field of round piles on one side of it.
+
+    Args:
+        rows: of piles, along the basin.
+        columns: of piles.
+    """
+    basin = Polygon([(0, 0), (1, 0), (1, 0.9), (0, 0.9)])
+    pier = Polygon([(0.5, 0.95), (0.5, 0.5), (0.6, 0.5), (0.62, 0.95)])
+    piles = [
+        Point((column + 0.7) / (columns + 0.3), 0.45 * (row + 0.7) / rows).buffer(_PILE, 6)
+        for row in range(rows)
+        for column in range(columns)
+    ]
+    return Polygon(basin.difference(pier).difference(shapely.union_all(piles)))
 
 
 def planned_area(shape: Polygon, rows: int, spacing_m: float, margin_m: float) -> Area:

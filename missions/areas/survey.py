@@ -196,14 +196,14 @@ def _check_parts(area: Area, *, margin_m: float = 0.0, given: str = "") -> None:
     if len(parts) > 1:
         gap_m = _widest_gap_m(parts)
         advice = (
-            f"join them in {given}"
+            f"join them in {given} for one dive"
             if given
             else f"turn_margin_m = {_joining_m(margin_m, gap_m):g} joins them where no zone to "
             "keep out of lies between, or set an allowed shape"
         )
         warn(
             f"area: the vehicle may be in {len(parts)} parts up to {gap_m:.3g} m apart and cannot "
-            f"pass between them: {advice}"
+            f"pass between them: each has dives of its own; {advice}"
         )
 
 

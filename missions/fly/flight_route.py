@@ -15,6 +15,7 @@ from missions.values.plan_file import Plan
 
 _SAME_RAD = 1e-6
 _TOUCH_M = 1e-6
+_SAME_HOME_M = 0.01
 
 
 def one_dive(plan: Plan, dive: int | None) -> Plan:
@@ -53,7 +54,11 @@ def stations_of_dives(plan: Plan) -> int:
 
 
 def whole_route(plan: Plan) -> Route:
-    """The routes of all dives, one after the other: at home the vehicle turns for the next."""
+    """The routes of all dives, one after the other: at home the vehicle turns for the next.
+
+    Raises:
+        PlanError: a dive begins elsewhere than the one before has ended.
+    """
     return Route(legs=tuple(_joined(plan)))
 
 
@@ -62,6 +67,12 @@ def _joined(plan: Plan) -> Iterator[Leg]:
     for dive in plan.dives:
         first = dive.route.legs[0]
         if last is not None:
+            away_m = math.dist(last.end_ne_m, first.start_ne_m)
+            if away_m > _SAME_HOME_M:
+                raise PlanError(
+                    f"a dive begins {away_m:.1f} m from where the one before ends, in another part "
+                    f"of the area: fly them one by one: vehicle.dive = 1 to {len(plan.dives)}"
+                )
             heading = last.end_heading_rad + last.side_rad
             turn = math.remainder(first.heading_rad + first.side_rad - heading, 2 * math.pi)
             if abs(turn) > _SAME_RAD:

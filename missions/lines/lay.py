@@ -26,7 +26,7 @@ from missions.values.costs import Costs
 from missions.values.line import Line, LineKind
 from missions.values.pattern import Pattern
 
-MOST_STATIONS = 100_000
+MOST_STATIONS = 2_000_000
 """Most stations of a plan. Chosen: days of flight, and terabytes of pictures."""
 KINDS: tuple[LineKind, ...] = ("survey", "cross", "closing", "fill")
 SURVEY, CROSS, CLOSING, FILL = range(len(KINDS))
@@ -95,7 +95,7 @@ def lay_lines(
         Site.of(area),
         heading_rad,
         pattern,
-        ways,
+        ways.coarse,
         hops.comparable(costs),
         home_ne,
         cross_lines=cross_lines,
@@ -358,8 +358,10 @@ def _tour(
     inner = inner.ravel()
     at_home = np.array([[*home, np.nan]])
     places = enter[:, :2]
-    home_m = ways.distances_m(home[None], places)
-    between_m = ways.distances_m(places, places)
+    all_m = ways.between_m(np.concatenate([home[None], places]))
+    home_m, between_m = np.ascontiguousarray(all_m[:1, 1:]), np.ascontiguousarray(all_m[1:, 1:])
+    useless = np.isinf(inner)  # the second line of a cell of one
+    between_m[useless] = between_m[:, useless] = np.inf
     start = hops.hops_j(costs, at_home, enter, home_m)[0]
     over = hops.hops_j(costs, leave, enter, between_m)
     plain = np.ascontiguousarray(hops.hops_j(costs, leave, at_home, home_m.T)[:, 0])
@@ -386,7 +388,7 @@ def _tour(
         able = np.flatnonzero(np.isfinite(start) & np.isfinite(inner))
         finish[able] = finishes(able)
         return np.asarray(tour.exact_tour(problem, finish, True)[1])
-    order = improved(tour.nearest_tour(problem), problem, 0)
+    order = tour.improved_tour(tour.nearest_tour(problem), problem, 0)
     # Now that it is known where the flight begins, so is where it ends.
     return improved(order, problem._replace(finish=finishes(order[:1])[0]), 1)
 

@@ -28,7 +28,7 @@ from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array
 from alice_survey.base.run.progress import step
 from missions.lines import cells, hops, rows
-from missions.lines.lay import check_size, laid, note_planner
+from missions.lines.lay import check_size, laid, note_planner, survey_pieces
 from missions.lines.rows import Site
 from missions.route.ways import Ways
 from missions.values.area import Area
@@ -47,11 +47,19 @@ _REFINED = 4
 """Best close costs near which they are taken again."""
 _TENTHS = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
 """Tenths of a degree on either side at which they are."""
+_FEW_TENTHS = (-1.0, 1.0)
+"""The same, where cells are many."""
 _FULL = 16
 """Best close costs at which the full cost is taken."""
 _MOST = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_TENTHS)) + _FULL
 _TIMED = 10
 """Costs after which is known how long all will take."""
+_PROMISING = 1.15
+"""A spread heading is taken if its estimate is at most this times the least."""
+_FEW_CELLS = 20
+"""With more cells, which take longer to order, proportionally fewer headings are tried."""
+_FEW_EDGES = 300
+"""With more edges of the area, fewer headings are estimated."""
 _WORTH_SHOWING_S = 2.0
 _NEAR_RAD = math.radians(2.0)
 _OFF_JUMP_RAD = 1e-9
@@ -105,7 +113,7 @@ def best_heading(
                     site,
                     heading,
                     pattern,
-                    ways,
+                    ways.sketch if costs_j is close else ways.coarse,
                     costs,
                     home_ne,
                     cross_lines=cross_lines,
@@ -117,17 +125,24 @@ def best_heading(
             yield heading
 
     def search() -> Iterator[float]:
-        headings = _headings(area, site, pattern)
+        headings = _worthwhile(_headings(area, site, pattern), width_heading, site, pattern, costs)
         estimates = estimate_j(site, headings, pattern, costs, cross_lines)
-        yield from take(close, np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading))
-        yield from take(close, _best(headings, estimates, _BEST, math.radians(0.3)))
-        for heading in _least(close, _REFINED):
+        spread = np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading)
+        spread = _worthwhile(spread, width_heading, site, pattern, costs)
+        promising = estimate_j(site, spread, pattern, costs, cross_lines)
+        spread = spread[promising <= _PROMISING * estimates.min()]
+        best = headings[np.argmin(estimates)]
+        share = min(1.0, _FEW_CELLS / _count_cells(site, float(best), pattern))
+        yield from take(close, spread[:: math.ceil(1 / share)])
+        yield from take(close, _best(headings, estimates, _some(_BEST, share), math.radians(0.3)))
+        for heading in _least(close, _some(_REFINED, share)):
             apart = np.abs((headings - heading + math.pi / 2) % math.pi - math.pi / 2)
             near = apart < _NEAR_RAD
             best = _best(headings[near], estimates[near], _REFINED, math.radians(0.05))
             yield from take(close, best)
-            yield from take(close, heading + math.radians(0.1) * np.array(_TENTHS))
-        yield from take(found, np.array(_least(close, _FULL)))
+            tenths = _TENTHS if share == 1.0 else _FEW_TENTHS
+            yield from take(close, heading + math.radians(0.1) * np.array(tenths))
+        yield from take(found, np.array(_least(close, _some(_FULL, share))))
 
     _run(search())
     if not found:
@@ -139,6 +154,37 @@ def best_heading(
         width_heading_rad=width_heading,
         width_m=width,
     )
+
+
+def _worthwhile(
+    headings: Array, narrow: float, site: Site, pattern: Pattern, costs: Costs
+) -> Array:
+    """Headings at which lines and a turn to each may cost little more than at a narrow heading.
+
+    That spares thousands of short lines across a long strip.
+    """
+    known_j = float(estimate_j(site, np.array([narrow]), pattern, costs, 0)[0])
+    least_j = float(costs.line_w.min()) / costs.speed_mps * site.area_m2 / pattern.spacing_m
+    turns = widths_m(site.survey, headings) / pattern.spacing_m
+    kept = headings[least_j + turns * _turn_j(pattern, costs) <= _PROMISING * known_j]
+    return kept if len(kept) else np.array([narrow])
+
+
+def _turn_j(pattern: Pattern, costs: Costs) -> float:
+    """Energy from the end of a line to the start of the next."""
+    start, goal = np.zeros(3), np.array([0.0, pattern.spacing_m, math.pi])
+    return float(hops.hop_j(costs, start, goal, pattern.spacing_m))
+
+
+def _some(count: int, share: float) -> int:
+    """A share of a count, at least 2."""
+    return max(2, round(share * count))
+
+
+def _count_cells(site: Site, heading_rad: float, pattern: Pattern) -> int:
+    """How many cells the survey lines of a heading have, at least 1."""
+    pieces, _, _ = survey_pieces(site, heading_rad, pattern)
+    return max(1, len(cells.chains(cells.followers(pieces))[0]) - 1)
 
 
 def _least(costs_j: dict[float, float], count: int) -> list[float]:
@@ -184,8 +230,6 @@ def estimate_j(
     site: Site, headings: Array, pattern: Pattern, costs: Costs, cross_lines: int
 ) -> Array:
     """Energy, (H,), of all pieces of lines and of a turn to each, at headings (H,)."""
-    start, goal = np.zeros(3), np.array([0.0, pattern.spacing_m, math.pi])
-    turn_j = hops.hop_j(costs, start, goal, pattern.spacing_m)
     estimates: Array = _estimates(
         site.survey,
         site.allowed,
@@ -197,7 +241,7 @@ def estimate_j(
         pattern.step_m,
         max(1, pattern.pictures - 1),
         costs,
-        turn_j,
+        _turn_j(pattern, costs),
         cross_lines,
     )
     return estimates
@@ -245,10 +289,13 @@ def _headings(area: Area, site: Site, pattern: Pattern) -> Array:
     hull = shapely.get_coordinates(area.survey.convex_hull)
     north_0, east_0, north_1, east_1 = area.survey.bounds
     rows_most = math.hypot(north_1 - north_0, east_1 - east_0) / pattern.spacing_m
-    count = int(np.clip(_ESTIMATES * _FEW_ROWS / rows_most, _LEAST_ESTIMATES, _ESTIMATES))
+    effort = max(rows_most / _FEW_ROWS, len(site.survey) / _FEW_EDGES)
+    count = int(np.clip(_ESTIMATES / effort, _LEAST_ESTIMATES, _ESTIMATES))
     even = np.arange(count) * math.pi / count
     spans = site.survey[:, 2:] - site.survey[:, :2]
-    longest = np.argsort(-np.hypot(*spans.T), kind="stable")[:count]
+    lengths_m = np.hypot(*spans.T)
+    longest = np.argsort(-lengths_m, kind="stable")[:count]
+    longest = longest[lengths_m[longest] >= pattern.spacing_m]  # no line follows a shorter one
     edges = np.arctan2(spans[longest, 1], spans[longest, 0]) % math.pi
     jumps = _jumps(hull, pattern)
     if len(jumps) > count:

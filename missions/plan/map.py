@@ -180,7 +180,7 @@ def _draw_route(axes: Axes, plan: Plan, ways: list[Array]) -> None:
     for index, way in enumerate(ways):
         label = "" if index else "way between lines"
         axes.plot(way[:, 1], way[:, 0], color=COLOURS["way"], lw=0.9, zorder=3, label=label or None)
-    north, east = plan.home_ne_m
+    north, east = zip(*plan.homes_ne_m, strict=True)
     axes.plot(
         east, north, "D", ms=9, mfc=COLOURS["home"], mec="white", zorder=8, ls="", label="home"
     )

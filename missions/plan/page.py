@@ -145,10 +145,11 @@ def _dives(plan: Plan) -> Table:
             f"{dive.route.length_m:.0f} m",
             f"{dive.duration_s / 60:.0f} min",
             f"{dive.energy_wh:.0f} Wh",
+            f"{dive.home_ne_m[0]:.1f} m north, {dive.home_ne_m[1]:.1f} m east",
         )
         for number, dive in enumerate(plan.dives, start=1)
     ]
-    header = ("", "lines", "stations", "way", "time", "energy")
+    header = ("", "lines", "stations", "way", "time", "energy", "launched and recovered at")
     return Table(title="In the order of flight", header=header, rows=rows)
 
 

@@ -83,8 +83,8 @@ def plan_map(
     layers.append(
         ShapeLayer(
             name="home", title="Home", about="Launch and recovery.", kind="point", group="Lines",
-            colour=COLOURS["home"], shapes=[_places(np.array(plan.home_ne_m))],
-            texts=[_north_east(plan.home_ne_m)],
+            colour=COLOURS["home"], shapes=[_places(np.array(home)) for home in plan.homes_ne_m],
+            texts=[_north_east(home) for home in plan.homes_ne_m],
         )
     )  # fmt: skip
     if sea.current_mps > 0 and sea.current_file is None:

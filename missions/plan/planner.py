@@ -34,12 +34,11 @@ from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_se
 from missions.exposure.settings_table import Setting
 from missions.exposure.storage import raw_bytes
 from missions.exposure.ways_out import ConflictError
-from missions.lines.lay import lay_lines
-from missions.lines.sweep import Sweep, best_heading
+from missions.lines.sweep import Sweep
+from missions.plan.parts import plan_parts
 from missions.plan.ready import check_depth, check_turns, gap_m, with_tried_ways
 from missions.plan.rows import plan_rows
 from missions.plan.strength import survey_costs, turn_rate_deg_s, warn_of_swell
-from missions.route.dives import split_dives
 from missions.route.energy import sound_craft_of, usable_wh
 from missions.route.terrain import (
     Reach,
@@ -48,7 +47,6 @@ from missions.route.terrain import (
     reach_of,
     terrain_report,
 )
-from missions.route.ways import Ways
 from missions.values.area import Area
 from missions.values.costs import Costs
 from missions.values.footprint import Swath, common_swath, footprint_size_m, joint_swath
@@ -115,46 +113,19 @@ def _planned(config: SurveyConfig, rig: Rig) -> Planned:
         _warn_of_zones(area, config.area.no_go_clearance_m, hull, glass_body_m)
         depth_m = _depth_m(config.area, area, bathymetry)
         check_depth(wanted.altitude_m, depth_m)
-        ways, home = Ways(area.allowed), _home(wanted.home_ne_m, area)
+        home = _home(wanted.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
         warn_of_swell(config, depth_m)
-        sweep = None
-        if wanted.line_heading_deg is None:
-            sweep = best_heading(
-                area,
-                pattern,
-                ways,
-                costs,
-                home,
-                cross_lines=wanted.cross_lines,
-                closing_line=wanted.closing_line,
-            )
-            heading = sweep.heading_rad
-        else:
-            heading = math.radians(wanted.line_heading_deg)
-        lines = lay_lines(
+        flown = plan_parts(
             area,
-            heading,
+            wanted,
             pattern,
-            ways,
             costs,
             home,
-            cross_lines=wanted.cross_lines,
-            closing_line=wanted.closing_line,
-        )
-        dives = split_dives(
-            lines,
-            ways=ways,
-            costs=costs,
-            home_ne=home,
-            turn_radius_m=wanted.arc_radius_m,
-            run_in_m=wanted.run_in_m,
-            turns=wanted.turns,
             usable_wh=usable_wh(config.vehicle),
-            longest_s=math.inf if wanted.dive_s is None else wanted.dive_s,
             depth_m=depth_m - wanted.altitude_m,
-            split=wanted.split_dives,
         )
+        lines, dives, sweep = flown.lines, flown.dives, flown.sweep
         reach = reach_of(
             hull,
             glass_body_m,
@@ -180,7 +151,7 @@ def _planned(config: SurveyConfig, rig: Rig) -> Planned:
             station_spacing_m=step_m,
             reached_forward_overlap=imaging.forward_overlap,
             reached_side_overlap=imaging.spacing.mean_overlap,
-            lines=tuple(lines),
+            lines=lines,
             dives=dives,
             turn_radius_m=wanted.arc_radius_m,
             run_in_m=wanted.run_in_m,

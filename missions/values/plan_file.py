@@ -28,6 +28,9 @@ _NUMBERS = (
 )  # fmt: skip
 
 
+_SAME_HOME_M = 0.01
+
+
 @dataclass(frozen=True, kw_only=True)
 class Dive:
     """What is flown on one charge: from home along some lines and home again."""
@@ -40,6 +43,11 @@ class Dive:
     """Route from home to home; lines count as in the plan."""
     duration_s: float
     energy_wh: float
+
+    @property
+    def home_ne_m(self) -> tuple[float, float]:
+        """Place where the vehicle is launched and recovered."""
+        return self.route.legs[0].start_ne_m
 
     def to_json(self) -> dict[str, Any]:
         """The dive as `plan.json` holds it."""
@@ -78,7 +86,8 @@ class Plan:
     name: str
     area: Area
     home_ne_m: tuple[float, float]
-    """Place where the vehicle is launched and recovered."""
+    """Place where the vehicle is launched and recovered; the first, where parts of the area that it
+    cannot pass between have dives with homes of their own (`homes_ne_m`)."""
     seafloor_depth_m: float
     altitude_m: float
     speed_mps: float
@@ -125,6 +134,16 @@ class Plan:
     def datum(self) -> Datum:
         """Origin of the local frame."""
         return self.area.datum
+
+    @property
+    def homes_ne_m(self) -> list[tuple[float, float]]:
+        """Home, and the homes of dives in other parts of the area."""
+        own = (dive.home_ne_m for dive in self.dives if dive.route.legs)
+        places = [self.home_ne_m]
+        for place in own:
+            if all(math.dist(place, other) > _SAME_HOME_M for other in places):
+                places.append(place)
+        return places
 
     @property
     def stations(self) -> int:

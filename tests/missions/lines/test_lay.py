@@ -195,8 +195,15 @@ def test_parts_without_a_way_between_are_refused() -> None:
 
 
 def test_too_many_stations_are_refused() -> None:
-    with pytest.raises(PlanError, match="100000"):
-        lay(box(0, 0, 1000, 1000))
+    with pytest.raises(PlanError, match="2000000"):
+        lay(box(0, 0, 2000, 2000))
+
+
+def test_half_a_million_stations_are_laid() -> None:
+    lines = lay(box(0, 0, 470, 480), heading=0.3)
+    assert 470 * 480 / 0.47 < sum(line.stations for line in lines) < 1.05 * 470 * 480 / 0.47
+    metres = sum(line.length_m for line in lines if line.kind == "survey")
+    assert metres == pytest.approx(470 * 480, rel=0.02)
 
 
 def test_an_area_away_from_the_allowed_water_is_refused() -> None:

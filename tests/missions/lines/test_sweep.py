@@ -1,14 +1,17 @@
 import itertools
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import MultiPolygon, Polygon, box
+from shapely.geometry import MultiPolygon, Point, Polygon, box
 
 from alice_survey.base.errors import PlanError
+from missions.lines import sweep as sweep_module
+from missions.lines.lay import Laid, laid
 from missions.lines.sweep import best_heading, least_width, widths_m
 from missions.route.fence import edges_of
 from missions.route.ways import Ways
@@ -109,3 +112,48 @@ def test_a_search_that_takes_long_shows_how_far_it_is(
 
 def _ticks(step_s: float) -> Iterator[float]:
     return itertools.count(0.0, step_s)
+
+
+def _counted(monkeypatch: pytest.MonkeyPatch) -> list[Laid]:
+    """What the search lays, as it goes on."""
+    done: list[Laid] = []
+
+    def counted(*args: Any, **options: Any) -> Laid:
+        done.append(laid(*args, **options))
+        return done[-1]
+
+    monkeypatch.setattr(sweep_module, "laid", counted)
+    return done
+
+
+def test_a_harbour_with_piles_is_searched_at_few_headings(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows = itertools.product((6, 14, 22, 30, 38), (5, 11, 17, 23))
+    piles = [Point(north, east).buffer(0.6, 6) for north, east in rows]
+    area = area_of(box(0, 0, 44, 30).difference(MultiPolygon(piles)))
+    ways, costs, home = Ways(area.allowed), time_costs(0.2), (0.0, 0.0)
+    kinds: dict[str, Any] = {"cross_lines": 1, "closing_line": True}
+    done = _counted(monkeypatch)
+
+    found = best_heading(area, STEREO, ways, costs, home, **kinds)
+
+    assert 10 <= len(done) <= 60
+    sampled = [
+        full_cost_j(area, h, STEREO, ways, costs, home, **kinds)
+        for h in (np.arange(60) + 0.123) * math.pi / 60
+    ]
+    assert found.cost_j <= 1.005 * min(sampled)
+
+
+def test_no_lines_are_laid_across_a_long_strip(monkeypatch: pytest.MonkeyPatch) -> None:
+    area = area_of(box(0, 0, 1000, 3))
+    done = _counted(monkeypatch)
+
+    found = best_heading(
+        area, STEREO, Ways(area.allowed), time_costs(0.2), (0.0, 0.0),
+        cross_lines=1, closing_line=True,
+    )  # fmt: skip
+
+    assert abs(math.sin(found.heading_rad)) < 1e-6
+    assert max(len(one.table) for one in done) <= 100

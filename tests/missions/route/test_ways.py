@@ -51,6 +51,8 @@ def test_ways_are_as_short_as_by_trying_all_corners(area: MultiPolygon, seed: in
     distances = ways.distances_m(places, places)
 
     np.testing.assert_allclose(distances, distances.T, atol=1e-9)
+    twice = np.concatenate([places, places])
+    np.testing.assert_allclose(ways.between_m(twice), np.tile(distances, (2, 2)), atol=1e-9)
     np.testing.assert_allclose(
         ways.lengths_m(places, places[::-1]), np.diag(distances[:, ::-1]), rtol=1e-12
     )
@@ -195,3 +197,24 @@ def test_a_convex_area_needs_no_graph() -> None:
     ways = Ways(multipolygon(Point(0, 0).buffer(20)))
     assert way_m(ways, (-10.0, 0.0), (10.0, 3.0)) == pytest.approx(math.hypot(20, 3))
     assert "_graph" not in vars(ways)
+
+
+def test_ways_that_order_lines_are_hardly_shorter_than_those_flown() -> None:
+    piles = shapely.union_all([Point(n, e).buffer(0.6) for n in (8, 16, 24) for e in (5, 10, 15)])
+    pier = box(12, 18, 14, 30)
+    ways = Ways(multipolygon(box(0, 0, 32, 30).difference(piles).difference(pier)))
+    places = places_in(ways.allowed, np.random.default_rng(3), 40)
+    exact = ways.between_m(places)
+
+    coarse, sketch = ways.coarse, ways.sketch
+
+    assert len(coarse.fence.edges) < len(ways.fence.edges) / 3
+    assert len(sketch.fence.edges) < len(coarse.fence.edges) / 3
+    for fewer, per_zone_m in ((coarse, 0.15), (sketch, 2.0)):
+        lacking = exact - fewer.between_m(places)
+        assert np.all(lacking >= -1e-9)
+        assert np.all(lacking <= 9 * per_zone_m)
+        assert lacking.max() > 1e-3
+    # The pier is no small zone: a way round it stays one.
+    across = np.array([[11.0, 29.0], [15.0, 29.0]])
+    assert sketch.between_m(across)[0, 1] == pytest.approx(ways.between_m(across)[0, 1], abs=0.1)
