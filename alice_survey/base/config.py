@@ -291,6 +291,10 @@ class VehicleConfig(Config):
         path = Path(self.name)
         return path if path.suffix.lower() in VEHICLE_FILES else None
 
+    def __hash__(self) -> int:
+        """As of other sections, which hold nothing that cannot be hashed."""
+        return hash(self.model_dump_json())
+
     @property
     def impaired(self) -> dict[str, float]:
         """Thrusters that are not intact."""

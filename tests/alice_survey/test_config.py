@@ -185,6 +185,13 @@ def test_thrusters_have_their_health_by_name() -> None:
             parse_config({"vehicle": {"thruster_health": {"bow": wrong}}}, "test")
 
 
+def test_surveys_are_keys() -> None:
+    """Results are kept by the survey that they are of."""
+    weak = {"vehicle": {"thruster_health": {"bow": 0.5}}}
+    same, again, other = (parse_config(given, "test") for given in (weak, weak, {}))
+    assert len({same: 1, again: 2, other: 3}) == 2
+
+
 def test_a_vehicle_is_a_name_or_a_file_relative_to_the_settings(tmp_path: Path) -> None:
     path = tmp_path / "survey.toml"
     for name, file in (
