@@ -173,7 +173,7 @@ def fly(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
     vehicle: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="What flies: alice, sparus2, or a file.")
+        str | None, typer.Option(metavar="NAME|FILE", help="A known vehicle, or its TOML file.")
     ] = None,
     controller: Annotated[
         Literal["sway", "los"] | None,

@@ -98,7 +98,9 @@ def compare(
 )
 def identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
-    vehicle: Annotated[str, typer.Option(help="alice, sparus2, or a TOML or JSON file.")] = "alice",
+    vehicle: Annotated[
+        str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
+    ] = "alice",
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
     ] = None,

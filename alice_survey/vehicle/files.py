@@ -77,13 +77,19 @@ def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
         coefficients: the set of a vehicle known by name; a file has one of its own.
 
     Raises:
-        VehicleError: neither is known, or the file does not describe a vehicle.
+        VehicleError: neither is known, the file does not describe a vehicle, or another set than
+            its own is named.
     """
     path = Path(name_or_file)
-    if path.suffix.lower() in VEHICLE_FILES:
-        return vehicle_from_file(path)
     if name_or_file in GEOMETRIES:
         return vehicle(name_or_file, coefficients)
+    if coefficients != OWN_SET:
+        raise VehicleError(
+            f"{name_or_file} has its own coefficients, not {coefficients!r}: leave these out, or "
+            "name a file of others"
+        )
+    if path.suffix.lower() in VEHICLE_FILES:
+        return vehicle_from_file(path)
     if name_or_file in _DESCRIBED:
         return vehicle_from_file(_DESCRIBED[name_or_file])
     known = ", ".join([*GEOMETRIES, *_DESCRIBED])

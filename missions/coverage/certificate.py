@@ -279,7 +279,7 @@ def _cell_m(
 
 
 def _out_of_step(cell_m: float, periods_m: tuple[float, ...], least_m: float) -> float:
-    """A cell of nearly this size whose grid keeps no time with pictures and lines.
+    """A cell size near this one that is incommensurate with steps and line spacing.
 
     Where a step is a whole number of cells, all steps are looked at in the same few places, and
     shares are those of these places (aliasing). Of a few sizes the one is taken at which places

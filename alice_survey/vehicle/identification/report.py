@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
-from alice_survey.vehicle import fleet
 from alice_survey.vehicle.files import (
     coefficients_from_file,
     speeds_missing,
@@ -160,9 +159,7 @@ def _start(options: IdentifyOptions) -> Vehicle:
     path = Path(options.coefficients)
     if path.suffix:
         return known.with_coefficients(coefficients_from_file(path))
-    if Path(options.vehicle).suffix:
-        raise VehicleError(f"{options.vehicle} has its own coefficients: name a file of others")
-    return fleet.vehicle(options.vehicle, options.coefficients)
+    return vehicle_from(options.vehicle, options.coefficients)
 
 
 def _held(pairs: Sequence[str]) -> dict[str, float]:

@@ -74,6 +74,8 @@ LEAST_HEADING_DAMPING = 0.5
 """Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
 PASSING_DAMPING = 0.2
 """Reduction of the heading loop's damping below the survey's speed (inferred)."""
+_NO_FORCE = 1e-6
+"""A force or moment of less is none, N or N m."""
 _AT_REST_PER_S = 1e-9
 """Poles nearer to 0 do not move."""
 _RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
@@ -137,7 +139,7 @@ def gains_for(
         least, most = authority(configuration, lower, upper, axis)
         axes[axis, [MASS, LEAST, MOST]] = inertia, least, most
         weakest = min(-least, most)
-        if weakest < 1e-6:
+        if weakest < _NO_FORCE:
             if axis == SWAY:
                 continue
             name = ("surge", "sway", "heave", "yaw")[axis]
@@ -192,7 +194,7 @@ def _holds(configuration: Array, lower: Array, upper: Array) -> bool:
     if np.linalg.matrix_rank(configuration[[0, 2, 3, 4, 5]]) < 5:
         return False
     ends = [authority(configuration, lower, upper, axis) for axis in (ROLL, PITCH)]
-    return all(min(-least, most) > 1e-6 for least, most in ends)
+    return all(min(-least, most) > _NO_FORCE for least, most in ends)
 
 
 def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[float, float, float]:

@@ -297,7 +297,7 @@ def test_cells_grow_where_there_would_be_too_many(
     assert capsys.readouterr().err
 
 
-def test_a_grid_keeps_no_time_with_pictures_and_lines() -> None:
+def test_shares_do_not_alias_with_steps_and_lines() -> None:
     """Steps of eight twentieths of a footprint: by closed form 2.8 pictures on 1.39 lines."""
     rig = pinhole_rig(1.0, 1.12)
     asked = sure_pattern(rig, 1.0, 0.72, 0.4)
