@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.figures import Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 
-_PARTS = ("start", "dynamics", "accuracy", "allocation", "loop")
+_PARTS = ("start", "dynamics", "accuracy", "allocation", "loop", "seas")
 _QUOTED = (
     "PythonVehicleSimulator (T. I. Fossen), quoted, measured earlier on another machine: 187 us a "
     "step\nof forward Euler, one derivative, of a vehicle of its own."
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _measure(options: argparse.Namespace, cache: Path) -> int:
-    from benchmarks import vehicle_allocation, vehicle_dynamics, vehicle_loop
+    from benchmarks import vehicle_allocation, vehicle_dynamics, vehicle_loop, vehicle_seas
 
     quick = options.quick
     about, report, findings = machine(("numpy", "numba", "scipy")), dict[str, Any](), Findings()
@@ -71,6 +71,11 @@ def _measure(options: argparse.Namespace, cache: Path) -> int:
             figures=tuple(flight.figure() for flight in flights),
             failed=tuple(f"{f.mission}: was broken off" for f in flights if not f.complete),
         )
+    if "seas" in options.only:
+        seas = vehicle_seas.measure(1 if quick else 5)
+        print(f"The paper's mission in other seas:\n{vehicle_seas.table(seas)}\n", flush=True)
+        report["seas"] = [asdict(row) for row in seas]
+        findings += Findings(figures=tuple(vehicle_seas.figures(seas)))
     return hand_over(options, about, findings, report)
 
 
