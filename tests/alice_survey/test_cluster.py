@@ -124,6 +124,32 @@ def test_a_cluster_gives_what_this_process_gives(executor: ClusterExecutor, tmp_
     assert [path.name for path in tmp_path.iterdir()] == [engine.STORE]
 
 
+def test_what_a_killed_run_left_goes_and_what_another_uses_stays(tmp_path: Path) -> None:
+    hold = (
+        "import sys, time; from pathlib import Path; from alice_survey.base.cluster import engine; "
+        "store = engine._store(Path(sys.argv[1])); print(store.__enter__(), flush=True)"
+    )
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", f"{hold}; time.sleep(60)", str(tmp_path)],
+            stdout=subprocess.PIPE, text=True,
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    try:
+        killed, alive = (Path(run.stdout.readline().strip()) for run in runs if run.stdout)
+        runs[0].kill()
+        runs[0].wait()
+        with engine._store(tmp_path) as own:
+            assert own.is_dir() and alive.is_dir()
+            assert not killed.exists()
+        assert {path.name for path in own.parent.iterdir()} == {alive.name, f"{alive.name}.lock"}
+    finally:
+        for run in runs:
+            run.kill()
+            run.communicate()
+
+
 @pytest.mark.slow
 def test_computing_of_workers_below_this_process_counts_once(tmp_path: Path) -> None:
     file = tmp_path / "local.toml"

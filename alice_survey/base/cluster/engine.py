@@ -21,6 +21,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from filelock import FileLock, Timeout
+
 from alice_survey.base.cluster.connection import Connection, connected
 from alice_survey.base.cluster.worker import (
     Answer,
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
 
 STORE = ".cluster"
 """Folder of a workspace for values that tasks share, while a run lasts."""
+_LOCK = ".lock"
+"""Ending of the file next to these that a run locks."""
 _WAIT_S = 30.0
 """For the first worker of a scheduler, and before a missing worker is reported."""
 _LOOK_EVERY_S = 2.0
@@ -92,10 +96,20 @@ def cluster_executor(
 
 @contextlib.contextmanager
 def _store(workspace: Path) -> Iterator[Path]:
-    """A new folder for shared values, with a mark in it; it goes at the end."""
+    """A new folder for shared values, with a mark in it; it goes at the end.
+
+    Those of runs that were killed go now: what holds their locks has ended.
+    """
     folder = (workspace / STORE).resolve() / os.urandom(6).hex()
+    lock = FileLock(folder.with_suffix(_LOCK), timeout=0)
     try:
-        folder.mkdir(parents=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for left in folder.parent.glob(f"*{_LOCK}"):
+            with contextlib.suppress(Timeout), FileLock(left, timeout=0):
+                shutil.rmtree(left.with_suffix(""), ignore_errors=True)
+                left.unlink()
+        lock.acquire()
+        folder.mkdir()
         (folder / "mark").write_text(folder.name)
     except OSError as error:
         raise WorkspaceError(f"{workspace} cannot be written: {why(error)}") from None
@@ -104,6 +118,8 @@ def _store(workspace: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):  # another run has its own in it
+            folder.with_suffix(_LOCK).unlink()
+            lock.release()
             folder.parent.rmdir()
 
 
