@@ -36,8 +36,9 @@ def report(
     print_result(*run(["report"], workspace, survey, None, executor_of(threads)), as_json)
 
 
-@app.command(epilog=examples("view -w reef", "view -w reef --port 8000 --no-browser"))
-def view(
+@app.command("view", hidden=True)
+@app.command(epilog=examples("studio -w reef", "studio -w reef --port 8000 --no-browser"))
+def studio(
     workspace: Workspace = WORK,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="To listen on; 0 for any that is free.")
@@ -51,6 +52,6 @@ def view(
     Serves map, mesh and files of a workspace to this machine alone, at full resolution, until
     Ctrl-C. A GIS can open its rasters by their addresses.
     """
-    from alice_survey.view.server import run_view
+    from alice_survey.studio.server import run_studio
 
-    run_view(workspace, port, browser=browser, show=typer.echo)
+    run_studio(workspace, port, browser=browser, show=typer.echo)

@@ -24,7 +24,8 @@ from camera_calib.rig import design_rig, write_rig
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-control",
-    "import-log", "measure", "control", "quality", "mosaic-tiles", "report", "view", "join",
+    "import-log", "measure", "control", "quality", "mosaic-tiles", "report", "studio", "view",
+    "join",
 )  # fmt: skip
 
 
@@ -62,7 +63,8 @@ def leaves(command: Any, *path: str) -> Iterator[tuple[str, ...]]:
         yield path
         return
     for name, below in command.commands.items():
-        yield from leaves(below, *path, name)
+        if not below.hidden:  # another name of a command
+            yield from leaves(below, *path, name)
 
 
 @pytest.mark.parametrize("path", list(leaves(get_command(app))), ids=" ".join)

@@ -21,8 +21,8 @@ from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_about, mesh_copy, mesh_still
 from alice_survey.report.run import survey_map
 from alice_survey.report.shapes import shape_layers
-from alice_survey.view.layers import FILES, ChangedError, Layers
-from alice_survey.view.paths import Entry, Workspace
+from alice_survey.studio.layers import FILES, ChangedError, Layers
+from alice_survey.studio.paths import Entry, Workspace
 
 _STILL_PX = 900
 _MESH = "mesh/mesh.glb"

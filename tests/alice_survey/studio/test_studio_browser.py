@@ -13,7 +13,7 @@ from alice_survey.base.artefacts import write_json
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import encoded, seafloor, sketch_mesh
 from tests.alice_survey.report.tiny import tiny_workspace
-from tests.alice_survey.view.client import serving
+from tests.alice_survey.studio.client import serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"

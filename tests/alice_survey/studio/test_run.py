@@ -18,7 +18,7 @@ from rasterio.windows import Window
 from typer.testing import CliRunner
 
 from alice_survey.cli.main import app
-from alice_survey.view.server import ADDRESS, Server
+from alice_survey.studio.server import ADDRESS, Server
 from tests.alice_survey.report.tiny import tiny_workspace
 
 SIDE = 20_000
@@ -67,7 +67,7 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     started = subprocess.Popen(
-        [sys.executable, "-m", "alice_survey", "view", "-w", str(workspace), "--no-browser"],
+        [sys.executable, "-m", "alice_survey", "studio", "-w", str(workspace), "--no-browser"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={"TMPDIR": str(temporary), "PATH": ""},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # if we are deaf
@@ -105,13 +105,13 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     with socket.create_server((ADDRESS, 0)) as taken:
         port = taken.getsockname()[1]
-        done = CliRunner().invoke(app, ["view", "-w", str(workspace), "--port", str(port)])
+        done = CliRunner().invoke(app, ["studio", "-w", str(workspace), "--port", str(port)])
     assert done.exit_code == 1
     assert str(port) in str(done.exception) and "--port" in str(done.exception)
 
 
 def test_nothing_to_show(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["view", "-w", str(tmp_path / "none"), "--no-browser"])
+    done = CliRunner().invoke(app, ["studio", "-w", str(tmp_path / "none"), "--no-browser"])
     assert done.exit_code == 1
     assert "'alice-survey plan'" in str(done.exception)
     assert not (tmp_path / "none").exists()
@@ -127,7 +127,7 @@ def test_the_browser_is_opened_unless_it_is_not_wanted(
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr(Server, "serve_forever", lambda self: None)
     option = "--browser" if browser else "--no-browser"
-    done = CliRunner().invoke(app, ["view", "-w", str(tiny_workspace(tmp_path)), option])
+    done = CliRunner().invoke(app, ["studio", "-w", str(tiny_workspace(tmp_path)), option])
     assert done.exit_code == 0
     (address,) = re.findall(r"http://127\.0\.0\.1:\d+/", done.output)
     assert opened == ([address] if browser else [])
@@ -135,8 +135,8 @@ def test_the_browser_is_opened_unless_it_is_not_wanted(
 
 def test_it_cannot_be_reached_from_another_machine(tmp_path: Path) -> None:
     server = Server(tiny_workspace(tmp_path))
-    assert server.server_address[0] == "127.0.0.1"
+    assert server.socket.getsockname()[0] == "127.0.0.1"
     assert server.socket.family == socket.AF_INET
     with pytest.raises(OSError):
-        socket.create_connection(("127.0.0.2", server.server_address[1]), timeout=2)
-    server.server_close()
+        socket.create_connection(("127.0.0.2", server.port), timeout=2)
+    server.close()

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from alice_survey.report.colours import TILE_PX, coloured, limits_of, number_rasters
-from alice_survey.view.layers import ChangedError, Layers, Pyramid
-from alice_survey.view.paths import Workspace
+from alice_survey.studio.layers import ChangedError, Layers, Pyramid
+from alice_survey.studio.paths import Workspace
 from tests.alice_survey.report.tiny import tiny_workspace
 
 ROWS, COLUMNS = 1302, 1110

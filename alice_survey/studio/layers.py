@@ -39,7 +39,7 @@ from alice_survey.report.colours import (
     scale_of,
 )
 from alice_survey.report.held import Held
-from alice_survey.view.paths import Workspace
+from alice_survey.studio.paths import Workspace
 
 _KEPT_TILES = 1000
 _KEPT_PYRAMIDS = 12

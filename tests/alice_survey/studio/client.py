@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from http.client import HTTPResponse
 from pathlib import Path
 
-from alice_survey.view.server import Server
+from alice_survey.studio.server import Server
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +26,14 @@ class Reply:
 def serving(folder: Path) -> Iterator[Server]:
     """A server that runs in a thread within this block."""
     server = Server(folder)
-    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
         yield server
     finally:
         server.shutdown()
-        server.server_close()
         thread.join()
+        server.close()
 
 
 def ask(
@@ -53,7 +53,7 @@ def ask(
         method: any word.
         host: the server's own if empty; None for no such header.
     """
-    port = server.server_address[1]
+    port = server.port
     lines = [f"{method} {path} HTTP/1.1", "Connection: close"]
     if host is not None:
         lines.append(f"Host: {host or f'127.0.0.1:{port}'}")

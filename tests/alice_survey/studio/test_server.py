@@ -1,5 +1,6 @@
 """What the server gives, and above all what it does not."""
 
+import contextlib
 import http.client
 import os
 import shutil
@@ -7,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.base.artefacts import write_json
-from alice_survey.view.server import Server
+from alice_survey.studio.server import Server
 from tests.alice_survey.report.tiny import tiny_workspace
-from tests.alice_survey.view.client import Reply, ask, serving
+from tests.alice_survey.studio.client import Reply, ask, serving
 
 SECRET = b"not of the workspace"
 MOSAIC = "/files/mosaic/mosaic.tif"
@@ -149,7 +151,7 @@ def test_no_path_gives_the_secret(server: Server, path: str) -> None:
     ],
 )  # fmt: skip
 def test_only_for_its_own_name(server: Server, host: str | None, status: int) -> None:
-    port = server.server_address[1]
+    port = server.port
     named = None if host is None else host.format(port=port)
     for path in ("/files/survey.toml", "/tiles/mosaic/0/0/0.webp"):
         assert ask(server, path, host=named).status == status
@@ -178,12 +180,13 @@ def test_no_method_but_get_and_head(server: Server, method: str) -> None:
     ],
 )
 def test_requests_out_of_form_get_nothing(server: Server, request_text: bytes) -> None:
-    port = server.server_address[1]
+    port = server.port
     with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
         connection.sendall(request_text.replace(b"HOST", f"127.0.0.1:{port}".encode()))
         answer = b""
-        while part := connection.recv(65536):
-            answer += part
+        with contextlib.suppress(ConnectionResetError):  # it was closed before all was read
+            while part := connection.recv(65536):
+                answer += part
     assert b" 200 " not in answer.split(b"\r\n")[0]
     assert b"name = " not in answer
     assert answer.count(b"HTTP/1.1 ") <= 1  # what came as a body is not a second request
@@ -323,7 +326,7 @@ def test_many_at_once(server: Server) -> None:
     faults: list[object] = []
 
     def client(number: int) -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=30)
+        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
         for step in range(10):
             path = paths[(number + step) % len(paths)]
             connection.request("GET", path)
@@ -429,3 +432,56 @@ def test_a_workspace_that_goes_away(tmp_path: Path) -> None:
         (tmp_path / "gone").rename(workspace)
         write_json(workspace / "dense" / "stage.json", {"stage": "dense", "digest": "1"})
         assert ask(server, "/").status == 200
+
+
+@pytest.fixture
+def impatient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """A server whose deadlines are short, of a workspace with a large file."""
+    monkeypatch.setattr("alice_survey.studio.server._ASK_S", 1.5)
+    monkeypatch.setattr("alice_survey.studio.server._ANSWER_S", 1.5)
+    workspace = tiny_workspace(tmp_path)
+    with (workspace / "dense" / "large.bin").open("wb") as file:
+        file.truncate(1 << 28)
+    with serving(workspace) as started:
+        yield started
+
+
+def dripping(port: int, stop: threading.Event, ended: list[float]) -> None:
+    """Send a request a byte at a time, until the connection is closed."""
+    began_s = time.monotonic()
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\na: ")
+        while not stop.is_set():
+            connection.sendall(b"a")
+            time.sleep(0.1)
+        return
+    ended.append(time.monotonic() - began_s)
+
+
+def test_requests_that_drip_in_starve_nobody_and_are_closed(impatient: Server) -> None:
+    stop, ended = threading.Event(), list[float]()
+    clients = [
+        threading.Thread(target=dripping, args=(impatient.port, stop, ended)) for _ in range(120)
+    ]
+    for client in clients:
+        client.start()
+    replies = [ask(impatient, "/files/dense/dem.tif").status for _ in range(20)]
+    for client in clients:
+        client.join(20)
+    stop.set()
+    assert replies == 20 * [200]
+    assert len(ended) == len(clients)
+    assert min(ended) > 1.0
+
+
+def test_an_answer_that_is_not_taken_in_is_given_up(impatient: Server) -> None:
+    with socket.create_connection(("127.0.0.1", impatient.port)) as connection:
+        head = f"GET /files/dense/large.bin HTTP/1.1\r\nHost: 127.0.0.1:{impatient.port}\r\n\r\n"
+        connection.sendall(head.encode())
+        time.sleep(2.5)
+        taken = 0
+        with contextlib.suppress(ConnectionResetError):
+            while part := connection.recv(1 << 20):
+                taken += len(part)
+    assert 0 < taken < 1 << 27
+    assert ask(impatient, "/plan/none").status == 404
