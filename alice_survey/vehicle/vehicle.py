@@ -11,6 +11,7 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.dynamics import GRAVITY, Body, Plant
+from alice_survey.vehicle.fins import Fin, pack_fins
 from alice_survey.vehicle.hull import POINT, Hull
 from alice_survey.vehicle.propulsion import Thruster, pack
 
@@ -73,6 +74,8 @@ class Vehicle:
     rigid_body: RigidBody
     coefficients: Coefficients
     thrusters: tuple[Thruster, ...]
+    fins: tuple[Fin, ...] = ()
+    """Drives of fins: one or more surfaces each, that turn together."""
     hull: Hull = POINT
     """Extent of the hull; its origin alone for a vehicle that is not flown."""
     density_kg_m3: float = 1025.0
@@ -114,7 +117,16 @@ class Vehicle:
             buoyancy_n=rigid.buoyancy_kg * GRAVITY,
             cg=np.array(rigid.cg_body_m),
         )
-        return Plant(body, pack(self.thrusters, self.density_kg_m3, displaced_kg))
+        return Plant(
+            body,
+            pack(self.thrusters, self.density_kg_m3, displaced_kg),
+            pack_fins(self.fins, self.density_kg_m3),
+        )
+
+    @property
+    def actuators(self) -> int:
+        """Number of thrusters and drives of fins."""
+        return len(self.thrusters) + len(self.fins)
 
     @cached_property
     def configuration_matrix(self) -> Array:

@@ -24,6 +24,7 @@ from missions.plan.ready import with_tried_ways
 from missions.plan.strength import survey_costs
 from missions.plan.trade import both_ways_w
 from missions.route.energy import usable_wh
+from missions.route.flyable import as_flown
 from missions.values.costs import time_costs
 
 
@@ -106,6 +107,7 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
     Raises:
         PlanError: the dive or the battery is too short for one line of one picture's length.
     """
+    config = as_flown(config)
     setup, plan = ImagingSetup.of(config), config.plan
     try:
         settings = imaging_settings(setup.rig, setup, quiet=True)
@@ -116,7 +118,9 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
     dive_down_s, turn = time_costs(plan.speed_mps).dive_s(depth_m), turn_s(plan, spacing)
     line_w = float(np.min(both_ways_w(flying.line_w)))
     way_w = float(np.max(flying.way_w[np.isfinite(flying.way_w)]))
-    turn_w = max(flying.spot_w, way_w + flying.arc_extra_w)
+    turn_w = way_w + flying.arc_extra_w
+    if plan.turns != "arcs":
+        turn_w = max(turn_w, flying.spot_w)
     usable_j = usable_wh(config.vehicle) * 3600.0
 
     def needs(side_m: float) -> tuple[float, float]:

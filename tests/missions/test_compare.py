@@ -15,7 +15,7 @@ from alice_survey.base.config import SurveyConfig, changed, parse_config
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.executor import SERIAL
 from alice_survey.cli.main import app
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from missions.fly.compare import (
@@ -257,6 +257,6 @@ def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
 def test_variants_are_named_apart_and_fit_their_vehicle() -> None:
     assert len(BY_NAME) == len(VARIANTS)
     for variant in VARIANTS:
-        names = {thruster.name for thruster in vehicle(variant.vehicle).thrusters}
+        names = {thruster.name for thruster in vehicle_from(variant.vehicle).thrusters}
         assert set(variant.failed) <= names
         assert variant.controller == "los" or variant.vehicle == "alice"

@@ -128,7 +128,7 @@ def test_no_vehicle_dives_deeper_than_it_is_built_for() -> None:
 @pytest.mark.parametrize(
     ("vehicle", "named"),
     [
-        ({"name": "nautilus"}, "alice, sparus2, bluerov2_heavy, or a TOML file"),
+        ({"name": "nautilus"}, "alice, bluerov2_heavy, remus100, sparus2, or a TOML file"),
         ({"name": "none.toml"}, "none.toml: cannot be read"),
         ({"name": "bluerov2_heavy", "coefficients": "cfd"}, "has its own coefficients, not 'cfd'"),
         ({"thruster_health": {"warp": 0.5}}, "no thruster 'warp'; it has starboard"),

@@ -18,13 +18,17 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
+from alice_survey.vehicle.fins import add_fins
 from alice_survey.vehicle.pilot import memory as slot
+from alice_survey.vehicle.pilot.diving import circle_course, fly_to_depth
 from alice_survey.vehicle.pilot.gains import (
     BANDWIDTH,
     FASTEST,
     HEAVE,
     INNER,
     INTEGRAL,
+    INTEGRAL_SHARE,
+    KEPT_RAD,
     LEAST,
     MASS,
     MOST,
@@ -146,6 +150,7 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
         motion[axis if axis < 3 else 5] = demand[slot.REF_SURGE + axis]
     add_damping(body, motion, force)
     add_coriolis(body, motion, force)
+    add_fins(gains.fins, gains.straight, motion, force)
     for axis in range(4):
         i = axis if axis < 3 else 5
         asked = -force[i]
@@ -162,7 +167,9 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
 def hold_level(
     estimate: Array, dt_s: float, gains: Gains, pilot: PilotState, wrench: Array
 ) -> None:
-    """Add the moments that hold roll and pitch level, where thrusters can: PID and computed torque.
+    """Add the moments that hold roll level and pitch as wanted, where thrusters or fins can.
+
+    PID and computed torque.
 
     The computed part is what the wanted motion and the centre of gravity do at level attitude,
     which is why `write_wrench` comes first. What gravity rights by itself comes on top.
@@ -175,6 +182,9 @@ def hold_level(
         i = 3 if axis == ROLL else 4
         angle = estimate[vector.ROLL] if axis == ROLL else estimate[vector.PITCH]
         rate = estimate[vector.P] if axis == ROLL else estimate[vector.Q]
+        if axis == PITCH:
+            angle -= pilot.demand[slot.REF_PITCH]
+            rate -= pilot.demand[slot.REF_PITCH_RATE]
         place = slot.ROLL_SUM if axis == ROLL else slot.PITCH_SUM
         total = pilot.memory[place]
         asked = -row[MASS] * (row[PLACE] * angle + row[RATE] * rate + total) - pilot.force[i]
@@ -189,7 +199,7 @@ def hold_level(
 
 
 DEPTH_KEPT_M = 0.2
-HEADING_KEPT_RAD = math.radians(10.0)
+HEADING_KEPT_RAD = KEPT_RAD
 """Tolerances within which a depth or heading counts as kept."""
 _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
@@ -203,6 +213,8 @@ _RISE_ON_S = 5.0
 the vehicle goes on until it is at rest (inferred)."""
 _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
+_MOST_LEAN_RAD = math.radians(30.0)
+"""Greatest angle into a current that is learned (inferred: half of a vehicle's speed across)."""
 _HOVER_SHARE = 0.25
 """Bandwidth of keeping place by surge, over that of the surge loop."""
 
@@ -255,9 +267,19 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
 
 @kernel
 def sink_to(
-    depth_m: float, feed_mps: float, estimate: Array, dt_s: float, gains: Gains, pilot: PilotState
+    depth_m: float,
+    feed_mps: float,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
 ) -> None:
-    """Command the heave that takes the origin to a depth, which itself moves at a speed."""
+    """Command the heave, or the pitch, that takes the origin to a depth, which moves at a speed."""
+    if guidance.under_way.circle_m > 0.0:
+        fly_to_depth(depth_m, feed_mps, path.speed_mps, estimate, dt_s, guidance.under_way, pilot)
+        return
     memory, demand = pilot.memory, pilot.demand
     error, most = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
     demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
@@ -383,7 +405,8 @@ def go_to(
 ) -> tuple[float, float]:
     """Go to a place and stay there, with a heading if the vehicle can sway.
 
-    A vehicle without sway faces its goal and waits until the current has carried it off again.
+    A vehicle without sway faces its goal and waits until the current has carried it off again. One
+    that cannot hover circles, and comes through the place with the heading.
 
     Returns:
         Distance from the goal, and the error of the wanted heading.
@@ -391,6 +414,14 @@ def go_to(
     now = estimate[vector.HEADING]
     dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
     distance = math.hypot(dn, de)
+    if guidance.under_way.circle_m > 0.0:
+        course, bend = circle_course(
+            goal_n, goal_e, heading, guidance.look_ahead_m, guidance.under_way, pilot.point
+        )
+        head_for(course, bend * path.speed_mps, 0.0, estimate, dt_s, gains, pilot)
+        surge_at(path.speed_mps, dt_s, guidance, gains, pilot)
+        pilot.report[slot.BY_SWAY] = 0.0
+        return distance, wrapped(heading - now)
     ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
     speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
     hover = guidance.sway > 0.0 and distance < _HOVER_M
@@ -456,11 +487,17 @@ def follow(
         ahead = guidance.look_ahead_m
         aim_n, aim_e = n + ahead * math.cos(beta), e + ahead * math.sin(beta)
         heading = math.atan2(aim_e - east, aim_n - north)
+        flies = guidance.under_way.circle_m > 0.0
+        if flies:
+            straight = curvature == 0.0
+            heading += _lean(cross, beta, straight, dt_s, path, guidance, pilot)
         # The aim turns as the offset changes: what its heading does is known, not awaited.
         drift = surge * sine + sway * cosine
         feed -= ahead * drift / (ahead * ahead + cross * cross)
         error = head_for(heading + (smooth - beta), feed, quicken, estimate, dt_s, gains, pilot)
-        surge_at(speed * max(math.cos(error), 0.0), dt_s, guidance, gains, pilot)
+        surge_at(
+            speed * (1.0 if flies else max(math.cos(error), 0.0)), dt_s, guidance, gains, pilot
+        )
         if guidance.sway > 0.0:
             # Lateral thrusters keep the vehicle from slipping sideways, so that it goes where it
             # heads: else a current could hold it off the path indefinitely.
@@ -468,6 +505,31 @@ def follow(
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
     report[slot.CROSS], report[slot.PATH_HEADING] = cross, beta
     report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, along, path.line[leg]
+
+
+@kernel
+def _lean(
+    cross: float,
+    beta: float,
+    straight: bool,
+    dt_s: float,
+    path: Path,
+    guidance: Guidance,
+    pilot: PilotState,
+) -> float:
+    """Angle into a current from the side: an integral of the cross-track error (Fossen, 10.3).
+
+    It is kept as a vector in NED, as that of sway is, and learns on straights, near the path, at a
+    tenth of the bandwidth of the path's loop.
+    """
+    memory, ahead = pilot.memory, guidance.look_ahead_m
+    s, c = math.sin(beta), math.cos(beta)
+    if straight and abs(cross) < 0.5 * ahead:
+        step = -INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * cross * dt_s
+        north, east = memory[slot.LEAN_N] - s * step, memory[slot.LEAN_E] + c * step
+        cut = min(1.0, _MOST_LEAN_RAD / max(math.hypot(north, east), 1e-9))
+        memory[slot.LEAN_N], memory[slot.LEAN_E] = cut * north, cut * east
+    return float(c * memory[slot.LEAN_E] - s * memory[slot.LEAN_N])
 
 
 @kernel

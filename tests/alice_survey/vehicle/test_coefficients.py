@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.files import SETS
 from tests.alice_survey.vehicle.motions import alice
 
 
@@ -63,7 +63,7 @@ def test_replacing_an_added_mass_drops_its_mirror() -> None:
     assert before.added_mass[1, 5] == 8.5  # the old set is as it was
 
 
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_signs_of_the_papers_sets(coefficients: str) -> None:
     """Diagonals resist; the nose and the stern are alike in sway and heave but for the mast."""
     kinds = alice(coefficients).coefficients

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import propulsion as kernels
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import Thruster, pack, weakened
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
 DENSITY, DISPLACED = 1025.0, 75.0
-ALICE = vehicle("alice")
+ALICE = vehicle_from("alice")
 STARBOARD, PORT, VERTICAL, BOW, STERN = ALICE.thrusters
 EVERY = tuple(
     # Arms that no source gives, so that their law is still tested.

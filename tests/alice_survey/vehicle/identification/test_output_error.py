@@ -7,7 +7,7 @@ import pytest
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.output_error import (
     OutputErrorFit,
     Simulation,
@@ -19,7 +19,7 @@ from alice_survey.vehicle.log import VehicleLog, vehicle_log
 from alice_survey.vehicle.propulsion import add_thrust
 from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured
 
-KNOWN = vehicle("alice")
+KNOWN = vehicle_from("alice")
 DAMPING = ("X_uu", "Y_vv", "Z_ww", "N_rr")
 QUICK = Simulation(longest_step_s=0.05)
 
