@@ -123,8 +123,11 @@ def _wanted_of_fins(vehicle: Vehicle, nu: Array, share: float) -> Array:
     wanted = np.zeros((len(nu), 6))
     known: dict[tuple[float, float], float] = {}
     for row, (u, v, w, _, _, r) in zip(wanted, np.round(nu, 3).tolist(), strict=True):
+        if u <= 0.0 or v != 0.0 or w != 0.0:
+            row[0] = np.nan
+            continue
         if (u, abs(r)) not in known:
-            flight = held(vehicle, u, abs(r), share) if u > 0.0 and v == w == 0.0 else None
+            flight = held(vehicle, u, abs(r), share)
             known[u, abs(r)] = np.nan if flight is None else flight.force_x_n
         row[0] = known[u, abs(r)]
     return wanted

@@ -138,7 +138,7 @@ class Vehicle:
             kept = thruster.kt_forward * (1.0 - thruster.thrust_deduction)
             reaction = thruster.diameter_m * thruster.kq_forward / kept
             columns.append([*direction, *(moment - thruster.handedness * reaction * direction)])
-        return np.array(columns).T
+        return np.array(columns, np.float64).reshape(-1, 6).T
 
     def with_coefficients(self, coefficients: Coefficients) -> "Vehicle":
         """The same vehicle with another set."""

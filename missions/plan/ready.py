@@ -108,8 +108,8 @@ def check_no_stops(craft: Vehicle, plan: PlanConfig, dives: Sequence[Dive]) -> N
     stops = sum(leg.turn_rad != 0.0 or leg.side_rad != 0.0 for leg in legs)
     if stops:
         raise PlanError(
-            f"{stops} turns of {plan.turn_radius_m:g} m radius have no room inside the allowed "
-            f"area, and {craft.name}, which fins steer, cannot turn in less: widen "
+            f"turns of {plan.turn_radius_m:g} m radius have no room inside the allowed area (the "
+            f"way has {stops} stops), and {craft.name}, which fins steer, cannot stop: widen "
             "area.turn_margin_m or the allowed area, set plan.home_ne_m farther from its edges, or "
             "survey it with a vehicle that can stop"
         )

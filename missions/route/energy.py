@@ -48,8 +48,8 @@ _HEADINGS = 24
 """Number of headings over which a turn on the spot in a current is averaged."""
 _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
-_DEAR_W = 1e9
-"""Power that no vehicle has."""
+_DEAR = 10.0
+"""Price of what cannot be flown, over that of an arc."""
 _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
 """Rates of descent that are tried."""
 
@@ -407,10 +407,11 @@ def _turning_power(conditions: FlightConditions, speeds_mps: Array, rates_rad_s:
 def _spot(conditions: FlightConditions) -> tuple[float, float]:
     """Power on the spot, of turning through a quarter and settling; and the rate of turning.
 
-    A vehicle that fins steer cannot: it costs so much that no plan has it but for want of room.
+    A vehicle that fins steer cannot: it costs so much that a plan has it for want of room alone,
+    and is refused for it.
     """
     if conditions.craft.fins:
-        return _DEAR_W, conditions.most_spot_rad_s
+        return _DEAR * _arc(conditions)[0], conditions.most_spot_rad_s
     rates = conditions.most_spot_rad_s * np.append(_RATES, 0.0)
     power = _turning_power(conditions, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))

@@ -50,6 +50,8 @@ def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
             f"{craft.name} hold at {plan.speed_mps:g} m/s: raise it, or leave it out"
         )
     run_in_m = plan.run_in_m if "run_in_m" in plan.model_fields_set else radius_m
-    return plan.model_copy(
+    flown = plan.model_copy(
         update={"turns": "arcs", "turn_radius_m": radius_m, "run_in_m": run_in_m}
     )
+    flown.model_fields_set.intersection_update(plan.model_fields_set)  # still not of the survey's
+    return flown
