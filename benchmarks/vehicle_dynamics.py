@@ -137,13 +137,10 @@ class NumpyTwin:
         strength = np.maximum(np.abs(whole), 1e-300)
         u = nu[0]
         thrust = whole * np.exp(-t[:, column.JET_LOSS] * u * u / strength)
-        suction = math.copysign(1.0, u) * t[:, column.JET_CENTRE] * (whole - thrust)
         ratio = abs(u) * np.sqrt(t[:, column.JET_AREA] / strength)
         a, b, c, d = t[:, column.DRAG : column.DRAG + 4].T
         force = self.matrix @ (thrust * t[:, column.KEPT])
         force[3:] += self.axes @ torque
-        force[4] -= suction @ self.axes[2]
-        force[5] += suction @ self.axes[1]
         force[0] -= np.sum(a * np.exp(-b * ratio) + c * np.exp(-d * ratio)) * u * abs(u)
         return force
 
@@ -168,7 +165,8 @@ class NumpyTwin:
         coriolis[:3] = _cross(nu[3:]) @ momentum[:3]
         coriolis[3:] = _cross(nu[:3]) @ momentum[:3] + _cross(nu[3:]) @ momentum[3:]
         force = load + self.thrust(rps, nu) - coriolis
-        force += (body.linear + body.quadratic * np.abs(nu)) @ nu
+        quadratic = np.where(nu > 0.0, body.quadratic, body.quadratic_back)
+        force += (body.linear + quadratic * np.abs(nu)) @ nu
         u, v, w = nu[:3]
         force[[1, 2, 4, 5]] += body.lift * [abs(u) * v, abs(u) * w, u * w, u * v]
         force[:3] += (body.weight_n - body.buoyancy_n) * rotation[2]

@@ -133,6 +133,14 @@ def damping_force(vehicle: Vehicle, nu: Array) -> Array:
             term = lift[name]
         elif len(name) == len("X_u"):
             term = motion[name[2]]
+        elif name.endswith("_pos"):
+            term = max(motion[name[2]], 0.0) ** 2
+        elif name.endswith("_neg"):
+            term = -(min(motion[name[2]], 0.0) ** 2)
+        elif (
+            f"{name}_pos" if motion[name[2]] > 0 else f"{name}_neg"
+        ) in vehicle.coefficients.values:
+            term = 0.0
         else:
             term = motion[name[2]] * abs(motion[name[3]])
         force[FORCES.index(name[0])] += value * term

@@ -37,7 +37,7 @@ class Body(NamedTuple):
     linear: Array
     """(6, 6) linear damping."""
     quadratic: Array
-    """(6, 6) quadratic damping."""
+    """(6, 6) quadratic damping of motions that are positive."""
     lift: Array
     """(4,) Y_uv, Z_uw, M_uw, N_uv."""
     weight_n: float
@@ -45,6 +45,8 @@ class Body(NamedTuple):
     buoyancy_n: float
     cg: Array
     """(3,) lever of the weight, from the centre of buoyancy."""
+    quadratic_back: Array
+    """(6, 6) quadratic damping of motions that are negative."""
 
 
 class Plant(NamedTuple):
@@ -118,7 +120,8 @@ def add_damping(body: Body, nu: Array, force: Array) -> None:
     for i in range(6):
         total = 0.0
         for j in range(6):
-            total += (body.linear[i, j] + body.quadratic[i, j] * abs(nu[j])) * nu[j]
+            square = body.quadratic[i, j] if nu[j] > 0.0 else body.quadratic_back[i, j]
+            total += (body.linear[i, j] + square * abs(nu[j])) * nu[j]
         force[i] += total
     u, v, w = nu[0], nu[1], nu[2]
     force[1] += body.lift[0] * abs(u) * v

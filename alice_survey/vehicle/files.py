@@ -247,7 +247,8 @@ def coefficients_from_file(path: Path) -> Coefficients:
     if not values:
         raise VehicleError(f"{path}: holds no coefficients")
     found = _coefficients(path, str(table.get("name", path.stem)), values)
-    driving = np.flatnonzero(np.maximum(np.diag(found.linear), np.diag(found.quadratic)) > 0)
+    ways = (found.linear, found.quadratic, found.quadratic_back)
+    driving = np.flatnonzero(np.max([np.diag(way) for way in ways], axis=0) > 0)
     if len(driving):
         axis = FORCES[driving[0]]
         raise VehicleError(

@@ -112,6 +112,7 @@ class Vehicle:
             in_current=np.ascontiguousarray(np.hstack([inertia, inertia - rigid.displaced])),
             linear=kinds.linear,
             quadratic=kinds.quadratic,
+            quadratic_back=kinds.quadratic_back,
             lift=kinds.lift,
             weight_n=rigid.dry_kg * GRAVITY,
             buoyancy_n=rigid.buoyancy_kg * GRAVITY,

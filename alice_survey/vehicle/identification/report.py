@@ -111,6 +111,11 @@ def identify_report(
     if options.method not in ("joint", "two-step"):
         raise VehicleError(f"method {options.method!r} is not known: joint or two-step")
     vehicle = _start(options)
+    if vehicle.fins:
+        raise VehicleError(
+            f"{vehicle.name} is steered by fins, whose angles no log holds yet: give --vehicle of a "
+            "vehicle without [[fins]], and logs of the whole wrench (X_n to N_nm)"
+        )
     thrust: list[ThrustCoefficient] = []
     if options.bollard is not None:
         thrust = fit_pulls(read_pulls(options.bollard), vehicle)

@@ -460,7 +460,8 @@ def _damped_together(
 
 def linear_damping(body: Body, nu: Array) -> Array:
     """(6, 6) slope of damping and body lift by velocity at a velocity (6,)."""
-    slope = -(body.linear + 2.0 * body.quadratic * np.abs(nu))
+    quadratic = np.where(np.asarray(nu) > 0.0, body.quadratic, body.quadratic_back)
+    slope = -(body.linear + 2.0 * quadratic * np.abs(nu))
     u, v, w = nu[0], nu[1], nu[2]
     y_uv, z_uw, m_uw, n_uv = body.lift
     slope[1, [0, 1]] -= y_uv * np.sign(u) * v, y_uv * abs(u)
@@ -537,8 +538,9 @@ def effective_lag_s(
 
 
 def _steady_speed(body: Body, degree: int, force: float) -> float:
-    """Speed at which linear and quadratic drag of one degree of freedom take a force."""
-    linear, quadratic = -body.linear[degree, degree], -body.quadratic[degree, degree]
+    """Speed at which linear and quadratic drag of one degree of freedom take a force, both ways."""
+    linear = -body.linear[degree, degree]
+    quadratic = -min(body.quadratic[degree, degree], body.quadratic_back[degree, degree])
     if quadratic <= 0.0:
         return force / linear if linear > 0.0 else math.inf
     return float((math.sqrt(linear**2 + 4.0 * quadratic * force) - linear) / (2.0 * quadratic))

@@ -74,7 +74,8 @@ def damping_matrix(body: Body, nu: Array) -> Array:
     lift = np.zeros((6, 6))
     lift[1, 1], lift[2, 2] = body.lift[0] * abs(u), body.lift[1] * abs(u)
     lift[4, 2], lift[5, 1] = body.lift[2] * u, body.lift[3] * u
-    matrix: Array = -(body.linear + body.quadratic * np.abs(nu) + lift)
+    quadratic = np.where(nu > 0.0, body.quadratic, body.quadratic_back)
+    matrix: Array = -(body.linear + quadratic * np.abs(nu) + lift)
     return matrix
 
 

@@ -73,6 +73,24 @@ def test_terminal_speed_of_the_whole_vehicle(axis: int, newtons: float, coeffici
         np.testing.assert_allclose(np.delete(end[7:13], axis), 0.0, atol=0.02)
 
 
+def test_it_rises_slower_than_it_sinks_where_drag_differs() -> None:
+    """At 1.277 times the drag upwards the terminal speed is 13 % less, as of the paper's ALICE."""
+    vehicle = block({"Z_ww_pos": -200.0, "Z_ww_neg": -1.277 * 200.0, "Y_vv": -300.0})
+    ends = [
+        advance(vehicle, state_of(vehicle), 60.0, 0.02, newtons * W)[-1, 9]
+        for newtons in (5.0, -5.0)
+    ]
+    assert ends[0] == pytest.approx(math.sqrt(5.0 / 200.0), rel=1e-6)
+    assert ends[0] / -ends[1] == pytest.approx(1.13, abs=1e-3)
+    turning = state_of(vehicle, np.array([0.3, -0.2, -0.4, 0.1, 0.2, -0.3]), (0.1, 0.2, 0.3))
+    eta = np.concatenate([turning[:3], (0.1, 0.2, 0.3)])
+    _, expected, _ = oracle.derivative(
+        0.0, eta, turning[7:13], np.zeros(0), np.zeros(0), np.zeros(6), vehicle,
+        constant_current(0.0, 0.0),
+    )  # fmt: skip
+    np.testing.assert_allclose(rates(vehicle, turning)[7:13], expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("coefficients", "holds"), [("estimated", False), ("cfd", False), ("calibrated", True)]
 )

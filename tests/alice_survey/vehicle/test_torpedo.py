@@ -7,6 +7,7 @@ shape of the hull.
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.files import vehicle_from
+from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot.diving import UnderWay, circle_course, dive_loop
 from alice_survey.vehicle.pilot.gains import damping_ratio, gains_for, heading_loop
@@ -234,3 +236,8 @@ def test_the_circle_leads_through_its_goal_with_its_heading(side: float) -> None
         assert np.hypot(*off) == pytest.approx(8.0, abs=0.05)
         ahead = np.array([math.cos(course), math.sin(course)])
         assert np.sign(off[0] * ahead[1] - off[1] * ahead[0]) == side
+
+
+def test_logs_of_it_are_not_identified_as_if_it_had_no_fins(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match="steered by fins"):
+        identify_report([], tmp_path, IdentifyOptions(vehicle="remus100"))

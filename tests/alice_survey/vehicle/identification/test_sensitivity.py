@@ -20,9 +20,9 @@ from alice_survey.vehicle.identification.sensitivity import (
 from tests.oracles_identification import integrated, numpy_observation
 
 ALL = (
-    "X_u", "K_p", "N_r", "X_uu", "Y_vv", "Z_ww", "M_qq", "N_rr", "N_vv", "Y_uv", "Z_uw", "M_uw",
-    "N_uv", "X_udot", "Y_vdot", "Y_rdot", "M_wdot", "K_pdot", "N_rdot", "current", "buoyancy",
-    "trim", "bias", "gain",
+    "X_u", "K_p", "N_r", "X_uu", "Y_vv", "Z_ww_pos", "Z_ww_neg", "M_qq", "N_rr", "N_vv", "Y_uv",
+    "Z_uw", "M_uw", "N_uv", "X_udot", "Y_vdot", "Y_rdot", "M_wdot", "K_pdot", "N_rdot", "current",
+    "buoyancy", "trim", "bias", "gain",
 )  # fmt: skip
 ROWS, STEP_S = 41, 0.05
 
