@@ -255,7 +255,7 @@ def add_fin_rates(fins: Fins, angles: Array, commands: Array, out: Array) -> Non
 def fin_slope(fins: Fins, nu: Array) -> Array:
     """(6, 6) slope, by velocity, of the force that fins at rest take from the water: of -F.
 
-    As `gains.linear_damping`, which has the hull's; by central differences.
+    As `linear.linear_damping`, which has the hull's; by central differences.
     """
     slope, step = np.zeros((6, 6)), 1e-5
     angles = np.zeros(len(fins.drives))

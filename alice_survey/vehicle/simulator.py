@@ -17,8 +17,6 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.allocation import (
-    AXIS_WEIGHTS,
-    LEVEL_WEIGHTS,
     AllocationScratch,
     allocate_exact,
     allocate_rpi,
@@ -40,14 +38,8 @@ from alice_survey.vehicle.navigation.filter import NavigationState, new_navigati
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.vehicle.pilot.gains import (
-    HEAVE,
     INNER,
-    MASS,
-    PITCH,
-    ROLL,
-    SURGE,
     SWAY,
-    YAW,
     Gains,
 )
 from alice_survey.vehicle.pilot.guidance import steer
@@ -489,20 +481,10 @@ def _allocation(setup: Setup) -> Allocation:
     matrix[:, :thrusters] = believed.configuration_matrix
     upper[thrusters:] = fins.drives[:, MOST_RAD]
     return Allocation(
-        setup.exact_allocation, believed.plant.propulsion, fins, matrix, _axis_weights(setup.gains),
+        setup.exact_allocation, believed.plant.propulsion, fins, matrix, setup.gains.axis_weights,
         health, lower=-upper, upper=upper, weights=np.ones(n), thrust=np.zeros(n),
         command=np.zeros(n), scratch=allocation_scratch(n),
     )  # fmt: skip
-
-
-def _axis_weights(gains: Gains) -> Array:
-    """Priorities of the axes: none of those that a vehicle with fins has no means to push along."""
-    weights = LEVEL_WEIGHTS if gains.holds_level or gains.dives_by_pitch else AXIS_WEIGHTS
-    weights = weights.copy()
-    if gains.dives_by_pitch:
-        axes = gains.axes[[SURGE, SWAY, HEAVE, ROLL, PITCH, YAW], MASS]
-        weights[axes == 0.0] = 0.0
-    return weights
 
 
 def _new_rows(count: int, thrusters: int, actuators: int) -> TickRows:

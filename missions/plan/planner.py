@@ -95,8 +95,14 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
 
 def _planned(config: SurveyConfig, rig: Rig) -> Planned:
     with heard() as warnings:
-        config = as_flown(config)
+        config, as_set = as_flown(config), config.plan
         wanted = config.plan
+        if wanted.turn_radius_m > as_set.arc_radius_m:
+            warn(
+                f"{config.vehicle.name} is steered by fins: turns are planned with a radius of "
+                f"{wanted.turn_radius_m:g} m and run-ins of {wanted.run_in_m:g} m; long lines suit "
+                "it better than short ones"
+            )
         imaging = imaging_settings(rig, ImagingSetup.of(config))
         check_turns(wanted)
         step_m = imaging.station_spacing_m

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import PlanConfig, SurveyConfig
+from alice_survey.base.config import PlanConfig, SurveyConfig, changed
 from alice_survey.base.errors import ConfigError, PlanError
 from alice_survey.vehicle.limits import spot_rate_rad_s
 from missions.exposure.settings import ImagingSetup, imaging_settings
@@ -23,7 +23,7 @@ from missions.exposure.ways_out import ConflictError
 from missions.plan.ready import with_tried_ways
 from missions.plan.strength import survey_costs
 from missions.plan.trade import both_ways_w
-from missions.route.energy import usable_wh
+from missions.route.energy import craft_of, usable_wh
 from missions.route.flyable import as_flown
 from missions.values.costs import time_costs
 
@@ -108,6 +108,8 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
         PlanError: the dive or the battery is too short for one line of one picture's length.
     """
     config = as_flown(config)
+    if craft_of(config.vehicle).fins:
+        config = changed(config, "plan", turns="arcs")
     setup, plan = ImagingSetup.of(config), config.plan
     try:
         settings = imaging_settings(setup.rig, setup, quiet=True)

@@ -48,7 +48,7 @@ _HEADINGS = 24
 """Number of headings over which a turn on the spot in a current is averaged."""
 _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
-_DEAR = 10.0
+_DEAR = 100.0
 """Price of what cannot be flown, over that of an arc."""
 _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
 """Rates of descent that are tried."""

@@ -24,9 +24,10 @@ def as_flown(config: SurveyConfig) -> SurveyConfig:
 
 
 def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
-    """Settings with arcs that fins hold, and run-ins as long as their radius, where none are set.
+    """Settings with arcs that fins hold and run-ins as long as their radius.
 
-    At a speed at which it does not fly at all the radius is left: the speed is refused elsewhere.
+    They are widened where `turns = "auto"`. At a speed at which it does not fly at all they are
+    left: the speed is refused elsewhere.
 
     Raises:
         PlanError: turns are set that it cannot fly.
@@ -38,20 +39,16 @@ def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
             f"{craft.name} is steered by fins and cannot stop: plan.turns = {plan.turns!r} cannot "
             "be flown; set 'arcs', or leave it out"
         )
-    least_m, radius_m = 0.0, plan.turn_radius_m
-    if held(craft, plan.speed_mps, 0.0, STEADY_SHARE) is not None:
-        least_m = least_radius_m(craft, plan.speed_mps, STEADY_SHARE)
-    if "turn_radius_m" not in plan.model_fields_set:
-        by_rate_m = plan.speed_mps / math.radians(plan.turn_rate_limit_deg_s)
-        radius_m = max(radius_m, math.ceil(10.0 * max(_ROOM * least_m, by_rate_m)) / 10.0)
-    elif radius_m < least_m:
+    if held(craft, plan.speed_mps, 0.0, STEADY_SHARE) is None:
+        return plan
+    least_m = least_radius_m(craft, plan.speed_mps, STEADY_SHARE)
+    if plan.turns == "auto":
+        radius_m = max(plan.arc_radius_m, math.ceil(10.0 * _ROOM * least_m) / 10.0)
+        run_in_m = max(plan.run_in_m, radius_m)
+        return plan.model_copy(update={"turn_radius_m": radius_m, "run_in_m": run_in_m})
+    if plan.turn_radius_m < least_m:
         raise PlanError(
-            f"turn_radius_m {radius_m:g} is tighter than the {least_m:.2f} m that the fins of "
-            f"{craft.name} hold at {plan.speed_mps:g} m/s: raise it, or leave it out"
+            f"turn_radius_m {plan.turn_radius_m:g} is tighter than the {least_m:.2f} m that the "
+            f"fins of {craft.name} hold at {plan.speed_mps:g} m/s: raise it, or set turns = 'auto'"
         )
-    run_in_m = plan.run_in_m if "run_in_m" in plan.model_fields_set else radius_m
-    flown = plan.model_copy(
-        update={"turns": "arcs", "turn_radius_m": radius_m, "run_in_m": run_in_m}
-    )
-    flown.model_fields_set.intersection_update(plan.model_fields_set)  # still not of the survey's
-    return flown
+    return plan

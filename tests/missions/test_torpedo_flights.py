@@ -9,6 +9,7 @@ from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.pilot.memory import ABORT, PHASE
 from alice_survey.vehicle.under_way import least_radius_m, least_speed_mps
 from missions.exposure.ways_out import ConflictError
+from missions.plan.solve import area_for_dive
 from missions.route.energy import craft_of
 from missions.route.flyable import as_flown
 from missions.values.flight import rms
@@ -95,7 +96,8 @@ def test_turns_that_need_a_stop_are_refused(turns: str) -> None:
 
 def test_turns_that_are_too_tight_are_refused() -> None:
     with pytest.raises(PlanError, match=r"turn_radius_m 3 is tighter than the 6\.\d+ m"):
-        planned(survey({"turn_radius_m": 3.0}))
+        planned(survey({"turn_radius_m": 3.0, "turns": "arcs"}))
+    assert planned(survey({"turn_radius_m": 3.0})).turn_radius_m > 6.0
 
 
 def test_an_area_without_room_for_its_turns_is_refused() -> None:
@@ -125,6 +127,15 @@ def test_it_is_not_flown_by_sway() -> None:
     config = survey(vehicle={"name": "remus100", "controller": "sway"})
     with pytest.raises(VehicleError, match="no lateral thrusters"):
         flown(planned(config), config)
+
+
+def test_a_dive_holds_less_area_where_turns_are_wide() -> None:
+    """Each turn back to a line 1 m beside takes some 7 radii."""
+    wide = area_for_dive(survey(), 3600.0)
+    assert 40.0 < wide.turn_s < 90.0
+    assert wide.side_m > 20.0
+    with pytest.raises(ConflictError):
+        area_for_dive(survey({"speed_mps": 0.2}), 3600.0)
 
 
 def test_other_vehicles_are_planned_as_before() -> None:

@@ -21,9 +21,11 @@ from alice_survey.vehicle.pilot.gains import (
     PITCH,
     PLACE,
     RATE,
-    VERTICAL,
     Gains,
     heading_loop,
+)
+from alice_survey.vehicle.pilot.linear import (
+    VERTICAL,
 )
 from alice_survey.vehicle.pilot.memory import PilotState
 

@@ -40,15 +40,23 @@ their drives are fast: omega is so low that an error of KEPT_RAD takes no more t
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.dynamics import Body, coriolis_matrix
-from alice_survey.vehicle.fins import MOST_RAD, Fins, fin_slope, pack_fins, write_fin_matrix
+from alice_survey.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
+from alice_survey.vehicle.dynamics import Body
+from alice_survey.vehicle.fins import MOST_RAD, Fins, fin_slope, write_fin_matrix
+from alice_survey.vehicle.pilot.linear import (
+    LATERAL,
+    NO_FINS,
+    VERTICAL,
+    coupled_pair,
+    linear_damping,
+    mode_damping,
+)
 from alice_survey.vehicle.propulsion import thrust_limits
 from alice_survey.vehicle.under_way import keeps, least_radius_m
 from alice_survey.vehicle.vehicle import Vehicle
@@ -62,8 +70,6 @@ LEVEL = (3, 4)
 """The same of the rows after them, which are held level: by thrusters that can, else by gravity."""
 _DEGREE = (*DEGREES, *LEVEL)
 _BY_FINS = (SURGE, YAW, PITCH, ROLL)
-LATERAL, VERTICAL = (1, 5), (2, 4)
-"""Degrees of freedom that a turn couples: sway and yaw, heave and pitch."""
 
 MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
@@ -86,11 +92,8 @@ PASSING_DAMPING = 0.2
 """Reduction of the heading loop's damping below the survey's speed (inferred)."""
 KEPT_RAD = math.radians(10.0)
 """Tolerance within which a heading counts as kept."""
-_NO_FINS = pack_fins((), 0.0)
 _NO_FORCE = 1e-6
 """A force or moment of less is none, N or N m."""
-_AT_REST_PER_S = 1e-9
-"""Poles nearer to 0 do not move."""
 _RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
 _PLACE_FACTORS = np.geomspace(0.5, 16.0, 61)
 _SLOWER, _SLOWER_BY_FINS = (0.0, 0.5), (0.5,)
@@ -118,6 +121,16 @@ class Gains(NamedTuple):
     def holds_level(self) -> bool:
         """Whether thrusters hold roll and pitch, or fins."""
         return bool(np.all(self.axes[[ROLL, PITCH], MASS] > 0.0))
+
+    @property
+    def axis_weights(self) -> Array:
+        """(6,) priorities of the axes in the allocation; 0 of those that nothing pushes along."""
+        weights = LEVEL_WEIGHTS if self.holds_level or self.dives_by_pitch else AXIS_WEIGHTS
+        weights = weights.copy()
+        if self.dives_by_pitch:
+            rows = [SURGE, SWAY, HEAVE, ROLL, PITCH, YAW]
+            weights[self.axes[rows, MASS] == 0.0] = 0.0
+        return weights
 
     @property
     def dives_by_pitch(self) -> bool:
@@ -327,35 +340,11 @@ def _integral(rate: float, place: float, omega: float, most_decay: float) -> flo
     return place * min(INTEGRAL_SHARE * omega, place / (rate + most_decay))
 
 
-def coupled_pair(
-    body: Body, speed_mps: float, fins: Fins = _NO_FINS, plane: tuple[int, int] = LATERAL
-) -> tuple[Array, Array]:
-    """Sway and yaw rate under way: (v, r)' = A (v, r) + b moment; or heave and pitch rate.
-
-    Args:
-        body: body of the vehicle.
-        speed_mps: surge; without drift or turning.
-        fins: of the vehicle, not turned.
-        plane: `LATERAL` or `VERTICAL`.
-
-    Returns:
-        (2, 2) and (2,)
-    """
-    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    both = np.ix_(plane, plane)
-    inverse = np.linalg.inv(body.mass[both])
-    slope = linear_damping(body, nu) + linear_coriolis(body, nu)
-    if len(fins.surfaces):
-        slope = slope + fin_slope(fins, nu)
-    pair: Array = -inverse @ slope[both]
-    return pair, np.array(inverse[:, 1], np.float64)
-
-
 def heading_loop(
     body: Body,
     speed_mps: float,
     row: Array,
-    fins: Fins = _NO_FINS,
+    fins: Fins = NO_FINS,
     plane: tuple[int, int] = LATERAL,
 ) -> Array:
     """State matrix of the heading loop with the sway that it brings about; or of pitch and heave.
@@ -385,21 +374,6 @@ def heading_loop(
     return loop
 
 
-def damping_ratio(loop: Array) -> float:
-    """Least damping ratio of a state matrix's modes; negative if one grows."""
-    return float(_mode_damping(np.linalg.eigvals(loop)).min())
-
-
-def _mode_damping(poles: NDArray[Any]) -> Array:
-    """Damping ratio of each pole; 1 of one at rest: a sway that no water damps is its own loop's.
-
-    Args:
-        poles: complex.
-    """
-    size = np.abs(poles)
-    return np.where(size > _AT_REST_PER_S, -poles.real / np.maximum(size, _AT_REST_PER_S), 1.0)
-
-
 def _damped_together(
     body: Body,
     speed_mps: float,
@@ -409,7 +383,7 @@ def _damped_together(
     most_decay: float,
     sampled_rad_s: float,
     *,
-    fins: Fins = _NO_FINS,
+    fins: Fins = NO_FINS,
     plane: tuple[int, int] = LATERAL,
     slower: tuple[float, ...] = _SLOWER,
 ) -> tuple[float, float, float]:
@@ -448,7 +422,7 @@ def _damped_together(
             loops = loops[:, [[0], [1], [3], [4]], [0, 1, 3, 4]]
         poles = np.linalg.eigvals(loops)
         size = np.abs(poles)
-        ratio = _mode_damping(poles).min(axis=1)
+        ratio = mode_damping(poles).min(axis=1)
         fast = np.any((np.abs(poles.imag) > 0.0) & (size > sampled_rad_s), axis=1)
         if share < 1.0:
             ratio += PASSING_DAMPING
@@ -456,31 +430,6 @@ def _damped_together(
     enough = np.flatnonzero(damped >= HEADING_DAMPING)
     best = int(enough[0]) if len(enough) else int(np.argmax(damped))
     return float(gains[best, 0]), float(gains[best, 1]), float(damped[best])
-
-
-def linear_damping(body: Body, nu: Array) -> Array:
-    """(6, 6) slope of damping and body lift by velocity at a velocity (6,)."""
-    quadratic = np.where(np.asarray(nu) > 0.0, body.quadratic, body.quadratic_back)
-    slope = -(body.linear + 2.0 * quadratic * np.abs(nu))
-    u, v, w = nu[0], nu[1], nu[2]
-    y_uv, z_uw, m_uw, n_uv = body.lift
-    slope[1, [0, 1]] -= y_uv * np.sign(u) * v, y_uv * abs(u)
-    slope[2, [0, 2]] -= z_uw * np.sign(u) * w, z_uw * abs(u)
-    slope[4, [0, 2]] -= m_uw * w, m_uw * u
-    slope[5, [0, 1]] -= n_uv * v, n_uv * u
-    result: Array = slope
-    return result
-
-
-def linear_coriolis(body: Body, nu: Array) -> Array:
-    """(6, 6) slope of C(nu) nu by velocity at a velocity (6,).
-
-    C(a) b is bilinear, so that the slope's column j is C(e_j) nu + C(nu) e_j.
-    """
-    slope = coriolis_matrix(body.mass, nu)
-    columns = [coriolis_matrix(body.mass, unit) @ nu for unit in np.eye(6)]
-    result: Array = slope + np.array(columns).T
-    return result
 
 
 def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tuple[float, float]:

@@ -21,6 +21,10 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as slot
+from alice_survey.vehicle.pilot.following import (
+    follow,
+    go_to,
+)
 from alice_survey.vehicle.pilot.gains import HEAVE, LEAST, STEADY_SHARE, Gains
 from alice_survey.vehicle.pilot.memory import (
     ABORT,
@@ -54,8 +58,6 @@ from alice_survey.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
     clamped,
-    follow,
-    go_to,
     head_for,
     hear_floor,
     hold_level,

@@ -26,6 +26,8 @@ from alice_survey.vehicle.pilot.gains import (
     SWAY,
     YAW,
     Gains,
+)
+from alice_survey.vehicle.pilot.linear import (
     coupled_pair,
     damping_ratio,
 )

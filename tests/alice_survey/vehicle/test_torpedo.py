@@ -18,7 +18,11 @@ from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot.diving import UnderWay, circle_course, dive_loop
-from alice_survey.vehicle.pilot.gains import damping_ratio, gains_for, heading_loop
+from alice_survey.vehicle.pilot.gains import (
+    gains_for,
+    heading_loop,
+)
+from alice_survey.vehicle.pilot.linear import LATERAL, VERTICAL, damping_ratio
 from alice_survey.vehicle.steady import steady_flight
 from alice_survey.vehicle.under_way import (
     MOST_DRIFT_RAD,
@@ -166,7 +170,7 @@ def test_loops_are_damped_and_within_the_strength_of_the_fins(speed: float) -> N
     gains = gains_for(REMUS, speed)
     assert gains.dives_by_pitch and not gains.holds_level
     assert not gains.axes[[g.SWAY, g.HEAVE, g.ROLL]].any()
-    for axis, plane in ((g.YAW, g.LATERAL), (g.PITCH, g.VERTICAL)):
+    for axis, plane in ((g.YAW, LATERAL), (g.PITCH, VERTICAL)):
         row = gains.axes[axis]
         loop = heading_loop(gains.body, speed, row, gains.fins, plane)
         assert g.LEAST_HEADING_DAMPING < damping_ratio(loop) < 1.0

@@ -16,8 +16,10 @@ from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot.gains import (
     DEGREES,
     Gains,
-    damping_ratio,
     gains_for,
+)
+from alice_survey.vehicle.pilot.linear import (
+    damping_ratio,
     linear_coriolis,
     linear_damping,
 )

@@ -14,8 +14,13 @@ from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.files import SETS, vehicle_from
 from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.gains import damping_ratio, gains_for
+from alice_survey.vehicle.pilot.gains import (
+    gains_for,
+)
 from alice_survey.vehicle.pilot.guidance import steer
+from alice_survey.vehicle.pilot.linear import (
+    damping_ratio,
+)
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.vehicle.pilot.path import Path, place_at
 from alice_survey.vehicle.pilot.settings import (
