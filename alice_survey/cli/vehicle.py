@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.cli.options import (
     CONTEXT,
     WORK,
@@ -106,7 +107,7 @@ def identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
     vehicle: Annotated[
         str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
-    ] = "alice",
+    ] = DEFAULT_VEHICLE,
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
     ] = None,

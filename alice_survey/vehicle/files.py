@@ -86,7 +86,7 @@ class _VehicleFile(Config):
     """Contents of a vehicle file."""
 
     name: str | None = None
-    geometry: Literal["alice", "sparus2"] | None = None
+    geometry: str | None = None
     rigid_body: RigidBody
     coefficients: dict[str, float] = Field(default_factory=dict)
     coefficient_sets: tuple[Literal["estimated", "cfd", "calibrated", "computed"], ...] = ()
@@ -157,12 +157,18 @@ def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
 
 def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
     """The contents of a file with the hull and the water inside that follow from its geometry."""
-    shape, body = GEOMETRIES.get(str(table.get("geometry"))), table.get("rigid_body")
-    if shape is None or not isinstance(body, dict):
+    named, body = table.get("geometry"), table.get("rigid_body")
+    if named is None:
         return table
-    drained = body.get("buoyancy_kg")
-    if not isinstance(drained, int | float):
-        return table
+    shape = GEOMETRIES.get(str(named))
+    if shape is None:
+        raise VehicleError(
+            f"geometry {shown(str(named))!r} is not known; known: {', '.join(GEOMETRIES)}: leave "
+            "it out, and give [hull] and [coefficients]"
+        )
+    drained = body.get("buoyancy_kg") if isinstance(body, dict) else None
+    if not isinstance(body, dict) or not isinstance(drained, int | float):
+        return table  # whose faults are named elsewhere
     inside = entrained_water(shape, drained, float(table.get("density_kg_m3", _DENSITY)))
     water = {
         "entrained_kg": inside.mass_kg,

@@ -90,18 +90,18 @@ def variants_of(vehicles: Sequence[str]) -> tuple[Variant, ...]:
     """Vehicles by name or file, each steered by sway if it can sway; `VARIANTS` if there are none.
 
     Raises:
-        VehicleError: one is not known, or two are the same.
+        VehicleError: one is not known, or two have one name.
     """
-    if len(set(vehicles)) < len(vehicles):
-        raise VehicleError(f"vehicles {', '.join(vehicles)}: name each once")
+    crafts = [vehicle_to_fly(vehicle) for vehicle in vehicles]
+    names = [craft.name for craft in crafts]
+    if len(set(names)) < len(names):
+        raise VehicleError(f"vehicles {', '.join(names)}: two have one name")
     return (
         tuple(
             Variant(
-                name=vehicle,
-                vehicle=vehicle,
-                controller="sway" if has_sway(vehicle_to_fly(vehicle)) else "los",
+                name=craft.name, vehicle=vehicle, controller="sway" if has_sway(craft) else "los"
             )
-            for vehicle in vehicles
+            for vehicle, craft in zip(vehicles, crafts, strict=True)
         )
         or VARIANTS
     )

@@ -1,7 +1,10 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from alice_survey.base.errors import VehicleError
+from alice_survey.vehicle import files
 from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.files import GEOMETRIES, SETS, vehicle_from
 
@@ -82,3 +85,20 @@ def test_unknown_names_are_refused() -> None:
         vehicle_from("bluerov")
     with pytest.raises(VehicleError, match=r"'best'.* estimated"):
         vehicle_from("alice", "best")
+
+
+def test_a_geometry_gives_hull_water_and_coefficients_to_any_file(tmp_path: Path) -> None:
+    """A file that names a shape, with one number of its own; and one that names none there is."""
+    own = tmp_path / "own.toml"
+    alice = (Path(files.__file__).parent / "fleet_files" / "alice.toml").read_text()
+    own.write_text(alice.replace('name = "alice"', 'name = "own"').replace("= 60.0", "= 20.0"))
+    craft, known = vehicle_from(str(own), "computed"), vehicle_from("alice", "computed")
+    assert (craft.name, craft.hotel_w) == ("own", 20.0)
+    assert craft.hull == known.hull and craft.rigid_body == known.rigid_body
+    assert craft.coefficients is known.coefficients
+    own.write_text(alice.replace('geometry = "alice"', 'geometry = "nautilus"'))
+    with pytest.raises(VehicleError, match=r"'nautilus' is not known; known: alice, sparus2"):
+        vehicle_from(str(own))
+    own.write_text(alice.replace('"estimated", "cfd", ', ""))
+    with pytest.raises(VehicleError, match="'cfd' are not known; known: calibrated, computed"):
+        vehicle_from(str(own), "cfd")
