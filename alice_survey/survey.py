@@ -91,7 +91,7 @@ def run(
         )
     if flight is not None and flight != FlightChanges():
         config = flight.applied(config)
-        warn("these options hold for this flight alone: to keep them, put them into survey.toml")
+        warn("these options hold for this run alone: to keep them, put them into survey.toml")
     if planes:
         config = changed(config, "reconstruct", planes=list(planes))
         if config.reconstruct.planes != planned.reconstruct.planes:
@@ -129,16 +129,22 @@ def run(
 
 
 def plan_report(
-    workspace: Path, survey: Path | None, *, every_setting: bool = False
+    workspace: Path,
+    survey: Path | None,
+    *,
+    every_setting: bool = False,
+    vehicle: str | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Plan a survey, and show its main settings; or every one with its equation and source.
+
+    A vehicle by name or file counts for this plan instead of the survey's.
 
     What imaging and reconstruction will take on this machine follows.
     """
     from alice_survey.computing import GROUPS
     from missions.plan.rows import main_settings
 
-    text, found = run(["plan"], workspace, survey)
+    text, found = run(["plan"], workspace, survey, flight=FlightChanges(vehicle=vehicle))
     cost, found["cost"] = _predicted(workspace, survey, GROUPS)
     folder = workspace / "plan"
     if every_setting:

@@ -27,7 +27,7 @@ from alice_survey.vehicle.allocation import (
     allocation_scratch,
 )
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import thrust_limits
 from benchmarks.figures import Figure, Goal
 from tests.oracles_propulsion import redistributed
@@ -111,7 +111,7 @@ _SOLVERS: dict[str, Callable[[Case, Array], None]] = {
 
 def measure(runs: int) -> list[Row]:
     """All rows; each solver does all wrenches repeatedly, in turns, and its best run counts."""
-    alice = vehicle("alice")
+    alice = vehicle_from("alice")
     matrix, count = alice.configuration_matrix, len(alice.thrusters)
     lower, upper = np.zeros(count), np.zeros(count)
     thrust_limits(alice.plant.propulsion, np.ones(count), np.zeros(6), lower, upper)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import fleet, propulsion
+from alice_survey.vehicle import propulsion
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import (
     STATE,
@@ -27,6 +27,7 @@ from alice_survey.vehicle.dynamics import (
     rk4_step,
     scratch_for,
 )
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.sea import (
     Current,
     constant_current,
@@ -136,13 +137,10 @@ class NumpyTwin:
         strength = np.maximum(np.abs(whole), 1e-300)
         u = nu[0]
         thrust = whole * np.exp(-t[:, column.JET_LOSS] * u * u / strength)
-        suction = math.copysign(1.0, u) * t[:, column.JET_CENTRE] * (whole - thrust)
         ratio = abs(u) * np.sqrt(t[:, column.JET_AREA] / strength)
         a, b, c, d = t[:, column.DRAG : column.DRAG + 4].T
         force = self.matrix @ (thrust * t[:, column.KEPT])
         force[3:] += self.axes @ torque
-        force[4] -= suction @ self.axes[2]
-        force[5] += suction @ self.axes[1]
         force[0] -= np.sum(a * np.exp(-b * ratio) + c * np.exp(-d * ratio)) * u * abs(u)
         return force
 
@@ -167,7 +165,8 @@ class NumpyTwin:
         coriolis[:3] = _cross(nu[3:]) @ momentum[:3]
         coriolis[3:] = _cross(nu[:3]) @ momentum[:3] + _cross(nu[3:]) @ momentum[3:]
         force = load + self.thrust(rps, nu) - coriolis
-        force += (body.linear + body.quadratic * np.abs(nu)) @ nu
+        quadratic = np.where(nu > 0.0, body.quadratic, body.quadratic_back)
+        force += (body.linear + quadratic * np.abs(nu)) @ nu
         u, v, w = nu[:3]
         force[[1, 2, 4, 5]] += body.lift * [abs(u) * v, abs(u) * w, u * w, u * v]
         force[:3] += (body.weight_n - body.buoyancy_n) * rotation[2]
@@ -205,9 +204,9 @@ def measure(count: int, runs: int) -> list[Row]:
     """
     mixed = varying_current(_SHEAR, 0.03, 60.0, 3600.0, np.random.default_rng(1))
     cases = {
-        "ALICE, steady current": (fleet.vehicle("alice"), constant_current(0.1, 90.0)),
-        "ALICE, current by depth and time": (fleet.vehicle("alice"), mixed),
-        "SPARUS II, steady current": (fleet.vehicle("sparus2"), constant_current(0.1, 90.0)),
+        "ALICE, steady current": (vehicle_from("alice"), constant_current(0.1, 90.0)),
+        "ALICE, current by depth and time": (vehicle_from("alice"), mixed),
+        "SPARUS II, steady current": (vehicle_from("sparus2"), constant_current(0.1, 90.0)),
     }
     rows: list[Row] = []
     for case, (vehicle, current) in cases.items():
@@ -294,7 +293,7 @@ def _measure_case(
 
 def first_step() -> None:
     """Compile, or load, the equations of motion."""
-    vehicle = fleet.vehicle("alice")
+    vehicle = vehicle_from("alice")
     state = initial_state(np.zeros(3), np.zeros(3), 5)
     still = constant_current(0.0, 0.0)
     rk4_step(0.0, 0.01, state, np.zeros(5), np.zeros(6), vehicle.plant, still, scratch_for(5))
@@ -320,7 +319,7 @@ def accuracy(seconds: int) -> list[Accuracy]:
         seconds: a motion with thrusters changed at will every 4 s, pushes besides, in a current
             that changes with depth and time.
     """
-    vehicle = fleet.vehicle("alice")
+    vehicle = vehicle_from("alice")
     current = Current(
         np.array([-10.0, 100.0]),
         np.array([-50.0, 100.0]),

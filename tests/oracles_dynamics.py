@@ -13,7 +13,9 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
+from alice_survey.vehicle.fins import Fin
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.sea import Current
 from alice_survey.vehicle.vehicle import Vehicle
@@ -131,6 +133,14 @@ def damping_force(vehicle: Vehicle, nu: Array) -> Array:
             term = lift[name]
         elif len(name) == len("X_u"):
             term = motion[name[2]]
+        elif name.endswith("_pos"):
+            term = max(motion[name[2]], 0.0) ** 2
+        elif name.endswith("_neg"):
+            term = -(min(motion[name[2]], 0.0) ** 2)
+        elif (
+            f"{name}_pos" if motion[name[2]] > 0 else f"{name}_neg"
+        ) in vehicle.coefficients.values:
+            term = 0.0
         else:
             term = motion[name[2]] * abs(motion[name[3]])
         force[FORCES.index(name[0])] += value * term
@@ -168,6 +178,47 @@ def plain_thrust(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
         wrench[3:] += cross_matrix(np.array(thruster.position_body_m)) @ push
         wrench[3:] -= thruster.handedness * torque
     return wrench
+
+
+def fin_wrench(vehicle: Vehicle, angles: Array, nu: Array) -> Array:
+    """The wrench of all fins, surface by surface, with vectors in three dimensions.
+
+    The chord is turned about the shaft by a rotation matrix; lift is along shaft x velocity, drag
+    against the velocity, both of the part of the velocity square to the shaft.
+    """
+    wrench = np.zeros(6)
+    for fin, angle in zip(vehicle.fins, angles, strict=True):
+        shaft = np.array(fin.shaft_body)
+        chord = Rotation.from_rotvec(angle * shaft).apply([1.0, 0.0, 0.0])
+        for place in np.array(fin.positions_body_m):
+            velocity = nu[:3] + np.cross(nu[3:], place)
+            flow = velocity - (velocity @ shaft) * shaft
+            speed = np.linalg.norm(flow)
+            if speed == 0.0:
+                continue
+            # The angle by which the chord is turned out of the flow, about the shaft.
+            alpha = np.arctan2(np.cross(flow, chord) @ shaft, flow @ chord)
+            c_lift = alpha * fin.slope
+            c_drag = c_lift**2 / (np.pi * 0.9 * fin.aspect_ratio)
+            share = np.clip((abs(alpha) - np.radians(fin.stall_deg)) / np.radians(10.0), 0.0, 1.0)
+            share = 3 * share**2 - 2 * share**3
+            c_lift = (1 - share) * c_lift + share * fin.plate_drag * np.sin(2 * alpha) / 2
+            c_drag = (1 - share) * c_drag + share * fin.plate_drag * (1 - np.cos(2 * alpha)) / 2
+            c_drag += fin.profile_drag
+            force = c_lift * np.cross(shaft, flow / speed) - c_drag * flow / speed
+            force *= 0.5 * vehicle.density_kg_m3 * fin.area_m2 * speed**2
+            wrench += np.concatenate([force, np.cross(place, force)])
+    return wrench
+
+
+def fin_lag(fins: Sequence[Fin], angles: Array, commands: Array) -> Array:
+    """Rates of the angles of fins."""
+    rates = []
+    for fin, angle, asked in zip(fins, angles, commands, strict=True):
+        most, fastest = np.radians(fin.most_angle_deg), np.radians(fin.most_rate_deg_s)
+        rate = (np.clip(asked, -most, most) - angle) / fin.time_constant_s
+        rates.append(np.clip(rate, -fastest, fastest))
+    return np.array(rates)
 
 
 def lag(thrusters: Sequence[Thruster], rps: Array, command_rps: Array) -> Array:
@@ -212,7 +263,9 @@ def derivative(
     current: Current,
     thrust: Thrust = plain_thrust,
 ) -> tuple[Array, Array, Array]:
-    """Rates of eta (N, E, D, roll, pitch, heading), of the velocity over ground, and of thrusters.
+    """Rates of eta (N, E, D, roll, pitch, heading), of the velocity over ground, and of actuators.
+
+    `rps` and `command_rps` hold the angles of fins after the speeds of thrusters.
 
     Newton for the bodies, with the velocity over ground:
         M_RB nu_g' + C_RB(nu_g) nu_g = tau - g + F.
@@ -235,7 +288,9 @@ def derivative(
 
     rigid = parts(vehicle)
     mass_rigid, mass_added = sum(p.matrix for p in rigid), added_mass(vehicle)
-    force = load + thrust(vehicle, rps, nu_relative) - restoring(vehicle, eta[3:])
+    count = len(vehicle.thrusters)
+    force = load + thrust(vehicle, rps[:count], nu_relative) - restoring(vehicle, eta[3:])
+    force = force + fin_wrench(vehicle, rps[count:], nu_relative)
     force = force + damping_force(vehicle, nu_relative)
     force = force - added_coriolis(mass_added, nu_relative) @ nu_relative
     force = force - sum(p.coriolis(nu_ground) for p in rigid) @ nu_ground
@@ -250,7 +305,9 @@ def derivative(
         force[3:] += cross_matrix(centre) @ push
     nu_rate = np.linalg.solve(mass_rigid + mass_added, force)
     eta_rate = np.concatenate([ground_ned, attitude_rates_from_body_rates(eta[3:]) @ nu_ground[3:]])
-    return eta_rate, nu_rate, lag(vehicle.thrusters, rps, command_rps)
+    turns = lag(vehicle.thrusters, rps[:count], command_rps[:count])
+    fins = fin_lag(vehicle.fins, rps[count:], command_rps[count:])
+    return eta_rate, nu_rate, np.concatenate([turns, fins])
 
 
 def energy(vehicle: Vehicle, eta: Array, nu: Array) -> float:

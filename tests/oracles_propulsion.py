@@ -69,9 +69,6 @@ def wrench(
         total[3:] -= t.handedness * torque_nm(t, density, n, nu) * direction
         if whole == 0 or nu[0] == 0:
             continue
-        suction = (net / (1 - t.thrust_deduction) - whole) * direction
-        downstream = np.array([-math.copysign(t.jet_centre_m, nu[0]), 0.0, 0.0])
-        total[3:] += np.cross(downstream, suction)
         a, b, c, d = t.jet_drag
         ratio = abs(nu[0]) / jet_speed_mps(t, density, whole)
         coefficient = a * math.exp(-b * ratio) + c * math.exp(-d * ratio)

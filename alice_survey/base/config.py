@@ -261,13 +261,16 @@ VEHICLE_FILES = (".toml", ".json")
 """Endings of the files that describe a vehicle."""
 
 
+DEFAULT_VEHICLE = "alice"
+
+
 class VehicleConfig(Config):
     """The vehicle and how it is controlled.
 
     Battery and hotel load are ALICE's; of another vehicle its own, where they are not set.
     """
 
-    name: str = Field("alice", min_length=1)
+    name: str = Field(DEFAULT_VEHICLE, min_length=1)
     """Of a known vehicle, or a file that describes one."""
     coefficients: Literal["estimated", "cfd", "calibrated", "computed"] = "calibrated"
     coefficients_file: Path | None = None

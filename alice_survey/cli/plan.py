@@ -26,6 +26,7 @@ app = typer.Typer(
         "plan -w reef",
         "plan -w reef --all",
         "plan -w reef -s other.toml --json",
+        "plan -w reef --vehicle bluerov2_heavy",
         "plan solve -w reef --resolution 0.5",
         "plan precision -w reef",
         "plan gain 'control/*.jpg'",
@@ -45,6 +46,9 @@ def plan(
         bool,
         typer.Option("--all", help="Print every setting with its equation, source and limit."),
     ] = False,
+    vehicle: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="A known vehicle, or its TOML file.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Plan lines and camera settings.
@@ -56,7 +60,9 @@ def plan(
     if context.invoked_subcommand is None:
         from alice_survey.survey import plan_report
 
-        print_result(*plan_report(workspace, survey, every_setting=every_setting), as_json)
+        print_result(
+            *plan_report(workspace, survey, every_setting=every_setting, vehicle=vehicle), as_json
+        )
 
 
 @app.command(

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.cli.options import (
     CONTEXT,
     WORK,
@@ -52,6 +53,7 @@ def coefficients(
         "vehicle compare -w reef --current 0.1@90 --current 0.05@0 -o compared",
         "vehicle compare -s survey.toml --seed 7 --flights 3 --json",
         "vehicle compare --current 0@0 --swell 0.5@6",
+        "vehicle compare -w reef --vehicle bluerov2_heavy --vehicle own.toml",
     )
 )
 def compare(
@@ -64,6 +66,10 @@ def compare(
     swell: Annotated[
         str | None, typer.Option(help="HEIGHT@PERIOD of waves across the lines: m, s.")
     ] = None,
+    vehicle: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME|FILE", help="One to compare; the paper's two if not given."),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the first flight.")] = None,
     flights: Annotated[int, typer.Option(min=1, max=1000, help="Of each, in each current.")] = 5,
     out: Annotated[
@@ -72,10 +78,11 @@ def compare(
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fly a survey by both configurations in the same sea.
+    """Fly a survey by both configurations in the same sea, or by any vehicles.
 
     SPARUS II steering by line of sight, and ALICE holding its lines by sway: cross-track error,
-    roll, speed and energy next to the paper's section VIII.
+    roll, speed and energy next to the paper's section VIII. Other vehicles are steered by sway if
+    they can sway.
     """
     from alice_survey.survey import settings
     from missions.fly.compare_report import compare_report
@@ -83,7 +90,7 @@ def compare(
     config = settings(workspace, survey, needed=workspace != WORK)
     text, data = compare_report(
         config, out or workspace / "compare", currents=current or (), swell=swell, seed=seed,
-        flights=flights, executor=executor_of(threads),
+        flights=flights, executor=executor_of(threads), vehicles=vehicle or (),
     )  # fmt: skip
     print_result(text, data, as_json)
 
@@ -100,7 +107,7 @@ def identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
     vehicle: Annotated[
         str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
-    ] = "alice",
+    ] = DEFAULT_VEHICLE,
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
     ] = None,

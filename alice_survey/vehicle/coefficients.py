@@ -3,6 +3,9 @@
 A name is the force or moment, an underscore, and what it is the derivative by: `Y_vdot` (added
 mass), `Y_v` (linear damping), `Y_vv` (of v |v|), `Y_uv` (body lift). Values are as in SNAME:
 derivatives of the force that the water exerts, so that damping and added mass are negative.
+
+A hull that is not the same both ways has two values of a quadratic damping: `Z_ww_pos` while w is
+positive (sinking) and `Z_ww_neg` while it is negative (rising); each counts instead of `Z_ww`.
 """
 
 from collections.abc import Mapping
@@ -66,8 +69,18 @@ class Coefficients:
 
     @cached_property
     def quadratic(self) -> Array:
-        """(6, 6) coefficients of nu |nu|: force i is sum over j of [i, j] nu_j |nu_j|."""
-        return np.nan_to_num(self._matrix("quadratic"))
+        """(6, 6) coefficients of nu |nu|: force i is sum over j of [i, j] nu_j |nu_j|, nu_j > 0."""
+        return self._one_way("quadratic_pos")
+
+    @cached_property
+    def quadratic_back(self) -> Array:
+        """(6, 6) the same where nu_j < 0."""
+        return self._one_way("quadratic_neg")
+
+    def value(self, name: str) -> float:
+        """A coefficient by its name; of one way what is given for both, if it is not given."""
+        own = self.values.get(name)
+        return self.values.get(both_ways(name), 0.0) if own is None else own
 
     @cached_property
     def lift(self) -> Array:
@@ -77,10 +90,20 @@ class Coefficients:
     def replaced(self, name: str, values: Mapping[str, float]) -> "Coefficients":
         """Another set with some values replaced or added.
 
-        An added mass replaces its mirror too: a new N_vdot drops the old Y_rdot.
+        An added mass replaces its mirror too: a new N_vdot drops the old Y_rdot; and a damping of
+        both ways those of one: a new Z_ww drops Z_ww_pos and Z_ww_neg.
         """
-        kept = {key: value for key, value in self.values.items() if _mirror(key) not in values}
+        kept = {
+            key: value
+            for key, value in self.values.items()
+            if _mirror(key) not in values
+            and (both_ways(key) == key or both_ways(key) not in values)
+        }
         return Coefficients(name=name, values={**kept, **values})
+
+    def _one_way(self, kind: str) -> Array:
+        both, own = self._matrix("quadratic"), self._matrix(kind)
+        return np.nan_to_num(np.where(np.isnan(own), both, own))
 
     def _matrix(self, kind: str) -> Array:
         matrix = np.full((6, 6), np.nan)
@@ -90,13 +113,20 @@ class Coefficients:
         return matrix
 
 
+def both_ways(name: str) -> str:
+    """Name of the damping of both ways that a damping of one way stands for; others unchanged."""
+    return name[:-4] if name.endswith(("_pos", "_neg")) else name
+
+
 def _kind(name: str) -> str | None:
-    """`dot`, `linear`, `quadratic`, `lift`, or None if it is not a name."""
+    """`dot`, `linear`, `quadratic` (`_pos`, `_neg`), `lift`, or None if it is not a name."""
     if name in LIFTS:
         return "lift"
     if len(name) < 3 or name[0] not in FORCES or name[1] != "_" or name[2] not in MOTIONS:
         return None
-    return {"dot": "dot", "": "linear", name[2]: "quadratic"}.get(name[3:])
+    kinds = {"dot": "dot", "": "linear", name[2]: "quadratic"}
+    kinds |= {f"{name[2]}{way}": f"quadratic{way}" for way in ("_pos", "_neg")}
+    return kinds.get(name[3:])
 
 
 def _mirror(name: str) -> str:

@@ -2,8 +2,8 @@
 
 M nu' + C(nu) nu + D(nu) nu + g(eta) = tau (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and
 Motion Control, 2011), where nu is the velocity relative to the water, in the body frame.
-The state is a vector: position in NED (3), attitude quaternion ned_from_body, xyzw (4), nu (6), and
-the speed of each thruster in revolutions per second.
+The state is a vector: position in NED (3), attitude quaternion ned_from_body, xyzw (4), nu (6), the
+speed of each thruster in revolutions per second, and the angle of each drive of fins, rad.
 """
 
 from typing import NamedTuple
@@ -12,13 +12,14 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.fins import Fins, add_fin_rates, add_fins
 from alice_survey.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
 from alice_survey.vehicle.rotations import matrix_rows
 from alice_survey.vehicle.sea import Current, current_at
 
 GRAVITY = 9.80665
 STATE = 13
-"""Length of the state without the thrusters."""
+"""Length of the state without thrusters and fins."""
 
 
 class Body(NamedTuple):
@@ -36,7 +37,7 @@ class Body(NamedTuple):
     linear: Array
     """(6, 6) linear damping."""
     quadratic: Array
-    """(6, 6) quadratic damping."""
+    """(6, 6) quadratic damping of motions that are positive."""
     lift: Array
     """(4,) Y_uv, Z_uw, M_uw, N_uv."""
     weight_n: float
@@ -44,13 +45,16 @@ class Body(NamedTuple):
     buoyancy_n: float
     cg: Array
     """(3,) lever of the weight, from the centre of buoyancy."""
+    quadratic_back: Array
+    """(6, 6) quadratic damping of motions that are negative."""
 
 
 class Plant(NamedTuple):
-    """All moving parts: body and thrusters."""
+    """All moving parts: body, n thrusters, and fins of m drives."""
 
     body: Body
     propulsion: Propulsion
+    fins: Fins
 
 
 class Scratch(NamedTuple):
@@ -64,25 +68,25 @@ class Scratch(NamedTuple):
     """(6,) current and its slopes."""
 
 
-def scratch_for(thrusters: int) -> Scratch:
-    """Work arrays for a vehicle with a number of thrusters."""
-    return Scratch(np.zeros((5, STATE + thrusters)), np.zeros(6), np.zeros(6))
+def scratch_for(actuators: int) -> Scratch:
+    """Work arrays for a vehicle with a number of thrusters and drives of fins."""
+    return Scratch(np.zeros((5, STATE + actuators)), np.zeros(6), np.zeros(6))
 
 
 def initial_state(
-    position_ned: Array, attitude_rad: Array, thrusters: int, nu: Array | None = None
+    position_ned: Array, attitude_rad: Array, actuators: int, nu: Array | None = None
 ) -> Array:
-    """A state, thrusters at rest.
+    """A state, thrusters at rest and fins not turned.
 
     Args:
         position_ned: (3,) metres.
         attitude_rad: (3,) roll, pitch, heading.
-        thrusters: number of thrusters.
+        actuators: number of thrusters and drives of fins.
         nu: (6,) velocity relative to the water; at rest if not given.
     """
     from alice_survey.base.frames import rotation_from_attitude
 
-    state = np.zeros(STATE + thrusters)
+    state = np.zeros(STATE + actuators)
     state[:3] = position_ned
     state[3:7] = rotation_from_attitude(*attitude_rad).as_quat()
     if nu is not None:
@@ -116,7 +120,8 @@ def add_damping(body: Body, nu: Array, force: Array) -> None:
     for i in range(6):
         total = 0.0
         for j in range(6):
-            total += (body.linear[i, j] + body.quadratic[i, j] * abs(nu[j])) * nu[j]
+            square = body.quadratic[i, j] if nu[j] > 0.0 else body.quadratic_back[i, j]
+            total += (body.linear[i, j] + square * abs(nu[j])) * nu[j]
         force[i] += total
     u, v, w = nu[0], nu[1], nu[2]
     force[1] += body.lift[0] * abs(u) * v
@@ -166,7 +171,7 @@ def add_weight(body: Body, r20: float, r21: float, r22: float, force: Array) -> 
 def derivative(
     time_s: float,
     state: Array,
-    command_rps: Array,
+    command: Array,
     load: Array,
     plant: Plant,
     current: Current,
@@ -177,13 +182,13 @@ def derivative(
 
     Args:
         time_s: for the current.
-        state: (13 + n,)
-        command_rps: (n,) commanded speeds of the thrusters.
+        state: (13 + n + m,)
+        command: (n + m,) commanded speeds of the thrusters, rev/s, and angles of the fins, rad.
         load: (6,) other forces and moments on the body, in its frame.
         plant: the vehicle.
         current: the water.
         scratch: work arrays.
-        out: (13 + n,) is written.
+        out: (13 + n + m,) is written.
     """
     body = plant.body
     nu, force, water = state[7:13], scratch.force, scratch.water
@@ -202,7 +207,9 @@ def derivative(
 
     for i in range(6):
         force[i] = load[i]
+    fins_from = plant.propulsion.table.shape[0]
     add_thrust(plant.propulsion, state[13:], nu, force)
+    add_fins(plant.fins, state[13 + fins_from :], nu, force)
     add_damping(body, nu, force)
     add_coriolis(body, nu, force)
     add_weight(body, r20, r21, r22, force)
@@ -230,7 +237,8 @@ def derivative(
         for j in range(6):
             total += body.mass_inverse[i, j] * force[j]
         out[7 + i] = total
-    add_speed_rates(plant.propulsion, state[13:], command_rps, out[13:])
+    add_speed_rates(plant.propulsion, state[13:], command, out[13:])
+    add_fin_rates(plant.fins, state[13 + fins_from :], command[fins_from:], out[13 + fins_from :])
 
 
 @kernel
@@ -238,25 +246,25 @@ def rk4_step(
     time_s: float,
     step_s: float,
     state: Array,
-    command_rps: Array,
+    command: Array,
     load: Array,
     plant: Plant,
     current: Current,
     scratch: Scratch,
 ) -> None:
-    """Advance a state (13 + n,), which is overwritten, by the classical Runge-Kutta method."""
+    """Advance a state (13 + n + m,), which is overwritten, by the classical Runge-Kutta method."""
     k, count = scratch.stages, state.shape[0]
     trial = k[4]
-    derivative(time_s, state, command_rps, load, plant, current, scratch, k[0])
+    derivative(time_s, state, command, load, plant, current, scratch, k[0])
     for i in range(count):
         trial[i] = state[i] + 0.5 * step_s * k[0, i]
-    derivative(time_s + 0.5 * step_s, trial, command_rps, load, plant, current, scratch, k[1])
+    derivative(time_s + 0.5 * step_s, trial, command, load, plant, current, scratch, k[1])
     for i in range(count):
         trial[i] = state[i] + 0.5 * step_s * k[1, i]
-    derivative(time_s + 0.5 * step_s, trial, command_rps, load, plant, current, scratch, k[2])
+    derivative(time_s + 0.5 * step_s, trial, command, load, plant, current, scratch, k[2])
     for i in range(count):
         trial[i] = state[i] + step_s * k[2, i]
-    derivative(time_s + step_s, trial, command_rps, load, plant, current, scratch, k[3])
+    derivative(time_s + step_s, trial, command, load, plant, current, scratch, k[3])
     for i in range(count):
         state[i] += step_s / 6.0 * (k[0, i] + 2.0 * (k[1, i] + k[2, i]) + k[3, i])
     norm = 0.0

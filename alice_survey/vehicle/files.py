@@ -1,16 +1,21 @@
 """Files that describe a vehicle, and files of identified coefficients.
 
 A vehicle file is TOML or JSON with the fields of `Vehicle`: `name`, `rigid_body` as `RigidBody`,
-`coefficients` by SNAME name, `thrusters` as a list of `Thruster`, `hull` as `Hull`,
-`density_kg_m3`, `depth_rating_m`, `battery_wh`, `hotel_w`. Of a thruster only name, place and
-direction are needed where logs give thrusts; speeds need its diameter and k_t too.
+`coefficients` by SNAME name, `thrusters` as a list of `Thruster`, `fins` as a list of `Fin`, `hull`
+as `Hull`, `density_kg_m3`, `depth_rating_m`, `battery_wh`, `hotel_w`. Of a thruster only name,
+place and direction are needed where logs give thrusts; speeds need its diameter and k_t too.
+
+Instead of a hull, `geometry` names a shape of `hydrodynamics.geometry`, from which the hull and the
+water inside follow; and `coefficient_sets`, instead of coefficients, those of such a vehicle: the
+paper's tables, and `computed` from the shape.
 """
 
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
@@ -20,13 +25,19 @@ from alice_survey.base.config import VEHICLE_FILES, Config
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import VehicleError, why
 from alice_survey.vehicle.coefficients import FORCES, Coefficients
-from alice_survey.vehicle.fleet import GEOMETRIES, OWN_SET, usual_kq, vehicle
+from alice_survey.vehicle.fins import Fin
 from alice_survey.vehicle.hull import POINT, Hull
+from alice_survey.vehicle.hydrodynamics.entrained import entrained_water
+from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2
+from alice_survey.vehicle.hydrodynamics.paper_tables import CALIBRATED, CFD, ESTIMATED
+from alice_survey.vehicle.hydrodynamics.parts import estimate
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
 _Kind = TypeVar("_Kind")
 COEFFICIENTS_FORMAT = "alice-survey coefficients 1"
+_DENSITY = 1025.0
+"""Of sea water, kg/m^3."""
 _THRUSTER_DEFAULTS: Mapping[str, Any] = {
     "kind": "open", "diameter_m": 1.0, "kt_forward": 1.0, "kt_reverse": 1.0, "kq_forward": 0.0,
     "kq_reverse": 0.0, "handedness": 1, "most_rps": 1e3, "dead_band_rps": 0.0,
@@ -36,11 +47,27 @@ _THRUSTER_DEFAULTS: Mapping[str, Any] = {
 _DESCRIBED = {
     path.stem: path for path in sorted((Path(__file__).parent / "fleet_files").glob("*.toml"))
 }
-"""Files of the vehicles that are known by name, but for those that are computed (`fleet`)."""
+"""Files of the vehicles that are known by name."""
+GEOMETRIES = {shape.name: shape for shape in (ALICE, SPARUS2)}
+PAPER_SETS = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
+OWN_SET = "calibrated"
+"""Stands for a vehicle's own coefficients where none are named."""
+SETS = (*PAPER_SETS, "computed")
+"""Names of the sets of coefficients of vehicles of a geometry."""
+_MERIT = 0.07 / 0.4566**1.5
+"""k_q over k_t^1.5 of a Wageningen B propeller with three blades, blade area ratio 0.718, pitch 1,
+in water at rest (k_t 0.4566, k_q 0.0700; T. I. Fossen's MSS toolbox, remus100): 0.227. Where no
+torque of a propeller is known: inferred to be as good as that one, both ways. Momentum theory asks
+for 0.090 at least; Stonefish's k_q of 0.01 for a k_t of 0.698 is 0.017."""
 _MOST_FAULTS = 3
 """Faults of a file that one message names."""
 _NEEDED_FOR_SPEEDS = ("diameter_m", "kt_forward", "kt_reverse", "time_constant_s")
 _NEEDED_TO_FLY = (*_NEEDED_FOR_SPEEDS, "most_rps")
+
+
+def usual_kq(kt: float) -> float:
+    """k_q of a propeller of this k_t that is as good as the one above."""
+    return float(_MERIT * kt**1.5)
 
 
 def _with_defaults(table: object) -> object:
@@ -59,11 +86,14 @@ class _VehicleFile(Config):
     """Contents of a vehicle file."""
 
     name: str | None = None
+    geometry: str | None = None
     rigid_body: RigidBody
     coefficients: dict[str, float] = Field(default_factory=dict)
+    coefficient_sets: tuple[Literal["estimated", "cfd", "calibrated", "computed"], ...] = ()
     thrusters: tuple[Annotated[Thruster, BeforeValidator(_with_defaults)], ...] = ()
+    fins: tuple[Fin, ...] = ()
     hull: Hull = POINT
-    density_kg_m3: float = 1025.0
+    density_kg_m3: float = _DENSITY
     depth_rating_m: float | None = Field(None, gt=0, le=12_000)
     battery_wh: float | None = Field(None, gt=0)
     hotel_w: float | None = Field(None, ge=0)
@@ -81,43 +111,96 @@ def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
             its own is named.
     """
     path = Path(name_or_file)
-    if name_or_file in GEOMETRIES:
-        return vehicle(name_or_file, coefficients)
-    if coefficients != OWN_SET:
-        raise VehicleError(
-            f"{name_or_file} has its own coefficients, not {coefficients!r}: leave these out, or "
-            "name a file of others"
-        )
     if path.suffix.lower() in VEHICLE_FILES:
-        return vehicle_from_file(path)
+        return vehicle_from_file(path, coefficients)
     if name_or_file in _DESCRIBED:
-        return vehicle_from_file(_DESCRIBED[name_or_file])
-    known = ", ".join([*GEOMETRIES, *_DESCRIBED])
+        return vehicle_from_file(_DESCRIBED[name_or_file], coefficients)
+    known = ", ".join(_DESCRIBED)
     raise VehicleError(f"vehicle {name_or_file!r} is not known; known: {known}, or a TOML file")
 
 
-def vehicle_from_file(path: Path) -> Vehicle:
+def vehicles_of_a_geometry() -> list[str]:
+    """Names of the known vehicles whose shape is known: they carry the same payload."""
+    return [name for name in _DESCRIBED if name in GEOMETRIES]
+
+
+def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
     """Read a vehicle file.
+
+    Args:
+        path: TOML or JSON.
+        coefficients: one of the file's sets.
 
     Raises:
         VehicleError: the file cannot be read, or lacks a field, has one that is not known or makes
-            no sense.
+            no sense, or has no such set.
     """
-    found = validated(path, _VehicleFile, read_table(path))
-    names = [thruster.name for thruster in found.thrusters]
-    if len(set(names)) < len(names):
-        raise VehicleError(f"{path}: two thrusters have one name")
+    table = read_table(path)
+    found = validated(path, _VehicleFile, _with_shape(table))
+    for what, parts in (("thrusters", found.thrusters), ("fins", found.fins)):
+        names = [part.name for part in parts]
+        if len(set(names)) < len(names):
+            raise VehicleError(f"{path}: two {what} have one name")
     return Vehicle(
         name=found.name or path.stem,
         rigid_body=found.rigid_body,
-        coefficients=_coefficients(path, path.stem, found.coefficients),
+        coefficients=_chosen(path, found, coefficients),
         thrusters=found.thrusters,
+        fins=found.fins,
         hull=found.hull,
         density_kg_m3=found.density_kg_m3,
         depth_rating_m=found.depth_rating_m,
         battery_wh=found.battery_wh,
         hotel_w=found.hotel_w,
     )
+
+
+def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
+    """The contents of a file with the hull and the water inside that follow from its geometry."""
+    named, body = table.get("geometry"), table.get("rigid_body")
+    if named is None:
+        return table
+    shape = GEOMETRIES.get(str(named))
+    if shape is None:
+        raise VehicleError(
+            f"geometry {shown(str(named))!r} is not known; known: {', '.join(GEOMETRIES)}: leave "
+            "it out, and give [hull] and [coefficients]"
+        )
+    drained = body.get("buoyancy_kg") if isinstance(body, dict) else None
+    if not isinstance(body, dict) or not isinstance(drained, int | float):
+        return table  # whose faults are named elsewhere
+    inside = entrained_water(shape, drained, float(table.get("density_kg_m3", _DENSITY)))
+    water = {
+        "entrained_kg": inside.mass_kg,
+        "entrained_cg_body_m": (inside.x_m, 0.0, 0.0),
+        "entrained_inertia_kg_m2": inside.inertia_kg_m2,
+    }
+    return {"hull": shape.hull, **table, "rigid_body": {**water, **body}}
+
+
+def _chosen(path: Path, found: _VehicleFile, name: str) -> Coefficients:
+    """Coefficients of a file: its own, or one of its sets."""
+    if not found.coefficient_sets:
+        if name != OWN_SET:
+            raise VehicleError(
+                f"{found.name or path.stem} has its own coefficients, not {name!r}: leave these "
+                "out, or name a file of others"
+            )
+        return _coefficients(path, path.stem, found.coefficients)
+    sets: tuple[str, ...] = found.coefficient_sets
+    chosen = name if name in sets else (sets[0] if name == OWN_SET else None)
+    if chosen is None:
+        raise VehicleError(f"coefficients {name!r} are not known; known: {', '.join(sets)}")
+    if chosen in PAPER_SETS:
+        return PAPER_SETS[chosen]
+    if found.geometry is None:
+        raise VehicleError(f"{path}: coefficients are {chosen} from a shape: name its geometry")
+    return _computed(found.geometry)
+
+
+@cache
+def _computed(geometry: str) -> Coefficients:
+    return estimate(GEOMETRIES[geometry])
 
 
 def vehicle_to_fly(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
@@ -170,7 +253,8 @@ def coefficients_from_file(path: Path) -> Coefficients:
     if not values:
         raise VehicleError(f"{path}: holds no coefficients")
     found = _coefficients(path, str(table.get("name", path.stem)), values)
-    driving = np.flatnonzero(np.maximum(np.diag(found.linear), np.diag(found.quadratic)) > 0)
+    ways = (found.linear, found.quadratic, found.quadratic_back)
+    driving = np.flatnonzero(np.max([np.diag(way) for way in ways], axis=0) > 0)
     if len(driving):
         axis = FORCES[driving[0]]
         raise VehicleError(

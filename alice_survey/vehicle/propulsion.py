@@ -12,8 +12,9 @@ bilinear form of T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion
 u_a = (1 - w) times the speed of the water along the thruster's axis where it sits
 (going astern or turning included). The second holds the paper's thrust deduction t and its
 deflection of tunnel jets by the surge u (A. R. Palmer, PhD thesis, University of Southampton,
-2009; the paper prints sqrt(T_0 / (rho A)), which has no root astern). A propeller at rest makes
-neither thrust nor torque: its drag is the hull's.
+2009; the paper prints sqrt(T_0 / (rho A)), which has no root astern). The moment of the deflected
+jet, whose arm no source gives, is left out. A propeller at rest makes neither thrust nor torque:
+its drag is the hull's.
 
 A jet that leaves the hull also drags on it,
 
@@ -75,9 +76,6 @@ class Thruster:
     """Share of the thrust that suction on the hull takes away (paper, t)."""
     jet_loss: float = 0.0
     """C of the tunnel's jet deflection, T = T_0 exp(-C (u / u_j)^2)."""
-    jet_centre_m: float = 0.0
-    """How far downstream of the tunnel the lost thrust acts, the suction of the bent jet on the
-    hull: the moment that Palmer (2009) describes."""
     jet_drag: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """(a, b, c, d) of the jet's drag by displaced volume to the power 2/3,
     C_d = a exp(-b |u| / u_j) + c exp(-d |u| / u_j)."""
@@ -152,16 +150,15 @@ JET_LOSS = 14
 """C rho A, N per (m/s)^2; 0 of a thruster without a jet."""
 JET_AREA = 15
 """rho A, kg/m."""
-JET_CENTRE = 16
-DRAG = 17
+DRAG = 16
 """Four columns: 1/2 rho V^(2/3) times a, then b; and times c, then d."""
-MOST, DEAD_BAND, RATE = 21, 22, 23
+MOST, DEAD_BAND, RATE = 20, 21, 22
 """rev/s, rev/s, 1/s."""
-WATTS, IDLE = 24, 25
+WATTS, IDLE = 23, 24
 """Electrical watts per watt on the shaft; W."""
-DISTRUST = 26
+DISTRUST = 25
 """(m/s)^-2: see `allocation.preference_weights`."""
-COLUMNS = 27
+COLUMNS = 26
 
 _STILL_RPS = 1e-9
 """A propeller slower than this stands; its lag would lead it through the smallest numbers."""
@@ -197,7 +194,7 @@ def pack(thrusters: Sequence[Thruster], density: float, displaced_kg: float) -> 
         )
         row[TORQUE_ADVANCE] = inflow * density * d**4 * t.torque_slope
         row[HAND] = t.handedness
-        row[JET_LOSS], row[JET_AREA], row[JET_CENTRE] = t.jet_loss * area, area, t.jet_centre_m
+        row[JET_LOSS], row[JET_AREA] = t.jet_loss * area, area
         row[DRAG : DRAG + 4] = np.array(t.jet_drag) * [
             0.5 * density * volume, 1.0, 0.5 * density * volume, 1.0,
         ]  # fmt: skip
@@ -266,12 +263,7 @@ def add_thrust(propulsion: Propulsion, rps: Array, nu: Array, force: Array) -> N
         x, y, z = t[i, AXIS], t[i, AXIS + 1], t[i, AXIS + 2]
         strength = abs(thrust)
         if u != 0.0 and t[i, JET_LOSS] > 0.0 and strength > 0.0:
-            whole = thrust
             thrust *= math.exp(-t[i, JET_LOSS] * u * u / strength)
-            # The suction acts downstream of the tunnel, against the thrust that makes it.
-            moment = math.copysign(t[i, JET_CENTRE], u) * (whole - thrust)
-            force[4] -= moment * z
-            force[5] += moment * y
         thrust *= t[i, KEPT]
         if u != 0.0 and t[i, DRAG] + t[i, DRAG + 2] > 0.0 and strength > 0.0:
             ratio = abs(u) * math.sqrt(t[i, JET_AREA] / strength)

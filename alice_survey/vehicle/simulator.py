@@ -17,8 +17,6 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.allocation import (
-    AXIS_WEIGHTS,
-    LEVEL_WEIGHTS,
     AllocationScratch,
     allocate_exact,
     allocate_rpi,
@@ -34,11 +32,16 @@ from alice_survey.vehicle.dynamics import (
     rk4_step,
     scratch_for,
 )
+from alice_survey.vehicle.fins import MOST_RAD, Fins, write_fin_matrix
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.navigation.filter import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
-from alice_survey.vehicle.pilot.gains import INNER, SWAY, Gains
+from alice_survey.vehicle.pilot.gains import (
+    INNER,
+    SWAY,
+    Gains,
+)
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import (
     ABORT,
@@ -91,17 +94,21 @@ class Allocation(NamedTuple):
     exact: bool
     propulsion: Propulsion
     """Propulsion as the allocation assumes it."""
+    fins: Fins
     matrix: Array
-    """B, (6, n)."""
+    """B, (6, n + m): of the thrusters; and of the fins, per angle, at the speed of the tick."""
     axes: Array
     """(6,) weight of each axis; 0 of one that is not requested."""
     health: Array
     """(n,) 1 of an intact thruster, 0 of a failed one, see `weakened`."""
     lower: Array
     upper: Array
+    """(n + m,) N, and rad."""
     weights: Array
     thrust: Array
-    command_rps: Array
+    """(n + m,) thrusts, and angles of fins."""
+    command: Array
+    """(n + m,) speeds, and angles of fins."""
     scratch: AllocationScratch
 
 
@@ -109,7 +116,7 @@ class World(NamedTuple):
     """State that changes from tick to tick, apart from pilot and navigation."""
 
     state: Array
-    """(13 + n,) state of the dynamics."""
+    """(13 + n + m,) state of the dynamics."""
     before: Array
     """(13,) truth at the tick before: position, quaternion, velocity over ground in NED, rates."""
     now: Array
@@ -188,7 +195,8 @@ def _fly_ticks(
     rows: TickRows,
 ) -> int:
     """Fly ticks until the rows are full or the mission is over; return their number."""
-    count, thrusters, flown = rows.state.shape[0], allocation.thrust.shape[0], 0
+    count, flown = rows.state.shape[0], 0
+    thrusters, actuators = rows.command_rps.shape[1], allocation.thrust.shape[0]
     for k in range(count):
         tick = first + k
         time_s = tick * TICK_S
@@ -206,6 +214,7 @@ def _fly_ticks(
         lower, upper = allocation.lower, allocation.upper
         thrust_limits(allocation.propulsion, allocation.health, known, lower, upper)
         preference_weights(allocation.propulsion, known[0], allocation.weights)
+        write_fin_matrix(allocation.fins, known, allocation.matrix, thrusters)
         if allocation.exact:
             allocate_exact(
                 allocation.matrix, world.wrench, lower, upper,
@@ -216,16 +225,18 @@ def _fly_ticks(
                 allocation.matrix, world.wrench, lower, upper,
                 allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
             )  # fmt: skip
-        speeds_for(allocation.propulsion, allocation.thrust, known, allocation.command_rps)
+        speeds_for(allocation.propulsion, allocation.thrust, known, allocation.command)
+        for i in range(thrusters, actuators):
+            allocation.command[i] = allocation.thrust[i]
 
-        for i in range(STATE + thrusters):
+        for i in range(STATE + actuators):
             rows.state[k, i] = world.state[i]
         for i in range(STATE):
             rows.truth[k, i] = world.now[i]
         for i in range(6):
             rows.wrench[k, i] = world.wrench[i]
         for i in range(thrusters):
-            rows.command_rps[k, i] = allocation.command_rps[i]
+            rows.command_rps[k, i] = allocation.command[i]
         for i in range(REPORT):
             rows.report[k, i] = pilot.report[i]
         electrical_power(
@@ -245,7 +256,7 @@ def _fly_ticks(
         step = TICK_S / STEPS
         for i in range(STEPS):
             rk4_step(
-                time_s + i * step, step, world.state, allocation.command_rps, world.load, plant,
+                time_s + i * step, step, world.state, allocation.command, world.load, plant,
                 sea.current, scratch,
             )  # fmt: skip
     return flown
@@ -296,7 +307,7 @@ class Flown:
 
     time_s: Array
     state: Array
-    """(T, 13 + n) states of the dynamics."""
+    """(T, 13 + n + m) states of the dynamics."""
     truth: Array
     """(T, 13) position, quaternion, velocity over ground in NED, body rates."""
     navigation: Array
@@ -323,7 +334,12 @@ class Flown:
     @property
     def rps(self) -> Array:
         """(T, n) speeds of the thrusters, rev/s."""
-        return self.state[:, STATE:]
+        return self.state[:, STATE : STATE + len(self.thrusters)]
+
+    @property
+    def fin_rad(self) -> Array:
+        """(T, m) angles of the fins."""
+        return self.state[:, STATE + len(self.thrusters) :]
 
     @property
     def energy_j(self) -> Array:
@@ -384,10 +400,10 @@ def _chunks(
     vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
     sound = vehicle.plant
     left = dict(setup.health)
-    plant = Plant(sound.body, weakened(sound.propulsion, vehicle.health_of(left)))
-    world = _new_world(setup, n)
+    plant = sound._replace(propulsion=weakened(sound.propulsion, vehicle.health_of(left)))
+    world = _new_world(setup)
     navigation = new_navigation(setup.sensors, world.now, rng)
-    pilot, allocation, scratch = new_pilot(), _allocation(setup), scratch_for(n)
+    pilot, allocation, scratch = new_pilot(), _allocation(setup), scratch_for(vehicle.actuators)
     gusts = setup.disturbance
     sea = Sea(
         setup.current, np.array(gusts.sigma), math.exp(-TICK_S / max(gusts.correlation_s, 1e-9))
@@ -401,12 +417,12 @@ def _chunks(
     while first < last:
         while waiting and round(waiting[0].time_s / TICK_S) <= first:
             left[waiting[0].thruster] = waiting[0].left
-            plant = Plant(sound.body, weakened(sound.propulsion, vehicle.health_of(left)))
+            plant = sound._replace(propulsion=weakened(sound.propulsion, vehicle.health_of(left)))
             del waiting[0]
         end = min(first + most, last)
         if waiting:
             end = min(end, round(waiting[0].time_s / TICK_S))
-        rows = _new_rows(end - first, n)
+        rows = _new_rows(end - first, n, vehicle.actuators)
         flown = _fly_ticks(
             first, plant, sea, setup.floor, setup.sensors, navigation, setup.path,
             guidance, gains, pilot, allocation, world, scratch, rng, sea_rng, rows,
@@ -417,7 +433,7 @@ def _chunks(
         first = end
         if setup.without is None:
             continue
-        new = sees.judge(first * TICK_S, rows.command_rps, rows.state[:, STATE:])
+        new = sees.judge(first * TICK_S, rows.command_rps, rows.state[:, STATE : STATE + n])
         for failure in new:
             found.append(failure)
             known[failure.thruster] = min(failure.left, known.get(failure.thruster, 1.0))
@@ -443,11 +459,11 @@ def _carry_over(pilot: PilotState, before: Gains, after: Gains) -> None:
     pilot.memory[[SWAY_SUM_N, SWAY_SUM_E]] *= factor
 
 
-def _new_world(setup: Setup, thrusters: int) -> World:
+def _new_world(setup: Setup) -> World:
     start = np.array([*setup.start_ne_m, 0.0])
     attitude = np.array([0.0, 0.0, setup.start_heading_rad])
     world = World(
-        initial_state(start, attitude, thrusters),
+        initial_state(start, attitude, setup.vehicle.actuators),
         *(np.zeros(size) for size in (13, 13, 6, 6, 6, vector.ESTIMATE, 6)),
     )
     _write_truth(world, setup.current, 0.0)
@@ -456,19 +472,21 @@ def _new_world(setup: Setup, thrusters: int) -> World:
 
 
 def _allocation(setup: Setup) -> Allocation:
-    n = len(setup.vehicle.thrusters)
+    n = setup.vehicle.actuators
     left = setup.health if setup.known_health is None else setup.known_health
     health = setup.vehicle.health_of(left)
     believed = setup.believed or setup.vehicle
-    matrix = np.ascontiguousarray(believed.configuration_matrix)
-    weights = LEVEL_WEIGHTS if setup.gains.holds_level else AXIS_WEIGHTS
+    thrusters, fins = len(believed.thrusters), believed.plant.fins
+    matrix, upper = np.zeros((6, n)), np.zeros(n)
+    matrix[:, :thrusters] = believed.configuration_matrix
+    upper[thrusters:] = fins.drives[:, MOST_RAD]
     return Allocation(
-        setup.exact_allocation, believed.plant.propulsion, matrix, weights.copy(), health,
-        lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
-        command_rps=np.zeros(n), scratch=allocation_scratch(n),
+        setup.exact_allocation, believed.plant.propulsion, fins, matrix, setup.gains.axis_weights,
+        health, lower=-upper, upper=upper, weights=np.ones(n), thrust=np.zeros(n),
+        command=np.zeros(n), scratch=allocation_scratch(n),
     )  # fmt: skip
 
 
-def _new_rows(count: int, thrusters: int) -> TickRows:
-    widths = (STATE + thrusters, STATE, LOG_ROW, REPORT, 6, thrusters, thrusters)
+def _new_rows(count: int, thrusters: int, actuators: int) -> TickRows:
+    widths = (STATE + actuators, STATE, LOG_ROW, REPORT, 6, thrusters, thrusters)
     return TickRows(*(np.zeros((count, width)) for width in widths))

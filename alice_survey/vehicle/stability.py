@@ -5,7 +5,10 @@ import math
 import numpy as np
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.pilot.gains import linear_coriolis, linear_damping
+from alice_survey.vehicle.pilot.linear import (
+    linear_coriolis,
+    linear_damping,
+)
 from alice_survey.vehicle.vehicle import Vehicle
 
 _VERTICAL = [2, 4]

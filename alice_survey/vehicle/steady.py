@@ -3,7 +3,8 @@
 The laws are those of `dynamics`, `propulsion` and `allocation`, called at many velocities: what a
 planner counts on is what the simulator flies. The vehicle is level; what rolls and pitches it is
 left to its weight, as in allocation. Surge, sway, heave and yaw are balanced exactly, the torque of
-propellers and the drag of jets included.
+propellers and the drag of jets included. A vehicle that fins steer is not level: its pitch and
+drift are those of `under_way`, and its thrusters give what that takes ahead.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from alice_survey.vehicle.propulsion import (
     speeds_for,
     thrust_limits,
 )
+from alice_survey.vehicle.under_way import held
 from alice_survey.vehicle.vehicle import Vehicle
 
 BALANCED = (0, 1, 2, 5)
@@ -82,16 +84,19 @@ def steady_flight(
         slips: leave out what no thruster can balance, instead of giving NaN: a vehicle without sway
             that turns is pushed sideways, and goes.
     """
-    body, propulsion = vehicle.plant
+    body, propulsion, _ = vehicle.plant
     nu = np.ascontiguousarray(nu, dtype=np.float64)
-    water = np.zeros((len(nu), 6))
-    _add_water(body, nu, water)
-    wanted = -water
-    wanted[:, 2] -= body.weight_n - body.buoyancy_n
-    if nu_rate is not None:
-        wanted += nu_rate @ body.mass
     matrix = np.ascontiguousarray(vehicle.configuration_matrix)
-    axes = AXIS_WEIGHTS * np.any(np.abs(matrix) > 1e-12, axis=1)
+    if vehicle.fins:
+        wanted, axes = _wanted_of_fins(vehicle, nu, share), np.eye(6)[0]
+    else:
+        water = np.zeros((len(nu), 6))
+        _add_water(body, nu, water)
+        wanted = -water
+        wanted[:, 2] -= body.weight_n - body.buoyancy_n
+        if nu_rate is not None:
+            wanted += nu_rate @ body.mass
+        axes = AXIS_WEIGHTS * np.any(np.abs(matrix) > 1e-12, axis=1)
     n = len(vehicle.thrusters)
     room = _Room(
         lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
@@ -99,7 +104,7 @@ def steady_flight(
     )  # fmt: skip
     rps, power_w, made = np.zeros((len(nu), n)), np.zeros((len(nu), n)), np.zeros((len(nu), 6))
     _keep(propulsion, matrix, axes, np.full(n, share), wanted, nu, room, made, rps, power_w)
-    balanced = np.flatnonzero(axes) if slips else list(BALANCED)
+    balanced = np.flatnonzero(axes) if slips or vehicle.fins else list(BALANCED)
     off = np.abs(wanted - made)[:, balanced].max(axis=1)
     lost = ~(off <= 1e3 * _MISS_N)
     load = (rps / propulsion.table[:, MOST]) ** 2
@@ -108,6 +113,24 @@ def steady_flight(
         power_w=np.where(lost, np.nan, power_w.sum(axis=1)),
         load=np.where(lost, np.nan, load.max(axis=1)),
     )
+
+
+def _wanted_of_fins(vehicle: Vehicle, nu: Array, share: float) -> Array:
+    """Force ahead, (N, 6), that keeps a vehicle with fins at surges and rates of turn.
+
+    NaN where they do not fly level, or more is asked than surge and turn.
+    """
+    wanted = np.zeros((len(nu), 6))
+    known: dict[tuple[float, float], float] = {}
+    for row, (u, v, w, _, _, r) in zip(wanted, np.round(nu, 3).tolist(), strict=True):
+        if u <= 0.0 or v != 0.0 or w != 0.0:
+            row[0] = np.nan
+            continue
+        if (u, abs(r)) not in known:
+            flight = held(vehicle, u, abs(r), share)
+            known[u, abs(r)] = np.nan if flight is None else flight.force_x_n
+        row[0] = known[u, abs(r)]
+    return wanted
 
 
 def drag_power(body: Body, nu: Array) -> Array:

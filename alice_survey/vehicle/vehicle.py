@@ -11,6 +11,7 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.dynamics import GRAVITY, Body, Plant
+from alice_survey.vehicle.fins import Fin, pack_fins
 from alice_survey.vehicle.hull import POINT, Hull
 from alice_survey.vehicle.propulsion import Thruster, pack
 
@@ -73,6 +74,8 @@ class Vehicle:
     rigid_body: RigidBody
     coefficients: Coefficients
     thrusters: tuple[Thruster, ...]
+    fins: tuple[Fin, ...] = ()
+    """Drives of fins: one or more surfaces each, that turn together."""
     hull: Hull = POINT
     """Extent of the hull; its origin alone for a vehicle that is not flown."""
     density_kg_m3: float = 1025.0
@@ -109,12 +112,22 @@ class Vehicle:
             in_current=np.ascontiguousarray(np.hstack([inertia, inertia - rigid.displaced])),
             linear=kinds.linear,
             quadratic=kinds.quadratic,
+            quadratic_back=kinds.quadratic_back,
             lift=kinds.lift,
             weight_n=rigid.dry_kg * GRAVITY,
             buoyancy_n=rigid.buoyancy_kg * GRAVITY,
             cg=np.array(rigid.cg_body_m),
         )
-        return Plant(body, pack(self.thrusters, self.density_kg_m3, displaced_kg))
+        return Plant(
+            body,
+            pack(self.thrusters, self.density_kg_m3, displaced_kg),
+            pack_fins(self.fins, self.density_kg_m3),
+        )
+
+    @property
+    def actuators(self) -> int:
+        """Number of thrusters and drives of fins."""
+        return len(self.thrusters) + len(self.fins)
 
     @cached_property
     def configuration_matrix(self) -> Array:
@@ -126,7 +139,7 @@ class Vehicle:
             kept = thruster.kt_forward * (1.0 - thruster.thrust_deduction)
             reaction = thruster.diameter_m * thruster.kq_forward / kept
             columns.append([*direction, *(moment - thruster.handedness * reaction * direction)])
-        return np.array(columns).T
+        return np.array(columns, np.float64).reshape(-1, 6).T
 
     def with_coefficients(self, coefficients: Coefficients) -> "Vehicle":
         """The same vehicle with another set."""

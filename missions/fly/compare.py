@@ -17,9 +17,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.errors import VehicleError
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import STATE
+from alice_survey.vehicle.files import vehicle_to_fly
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.gains import gains_for
 from alice_survey.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
@@ -35,6 +37,7 @@ from missions.fly.simulation import (
     mission_setup,
     with_values,
 )
+from missions.route.energy import has_sway
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
 
@@ -81,6 +84,27 @@ VARIANTS = (
     Variant(name=IMPROVED, vehicle="alice", controller="sway"),
 )  # fmt: skip
 """What is compared: the two configurations, and what separates them."""
+
+
+def variants_of(vehicles: Sequence[str]) -> tuple[Variant, ...]:
+    """Vehicles by name or file, each steered by sway if it can sway; `VARIANTS` if there are none.
+
+    Raises:
+        VehicleError: one is not known, or two have one name.
+    """
+    crafts = [vehicle_to_fly(vehicle) for vehicle in vehicles]
+    names = [craft.name for craft in crafts]
+    if len(set(names)) < len(names):
+        raise VehicleError(f"vehicles {', '.join(names)}: two have one name")
+    return (
+        tuple(
+            Variant(
+                name=craft.name, vehicle=vehicle, controller="sway" if has_sway(craft) else "los"
+            )
+            for vehicle, craft in zip(vehicles, crafts, strict=True)
+        )
+        or VARIANTS
+    )
 
 
 PAPER = {
@@ -232,6 +256,7 @@ def fly_all(
     cases: Sequence[Case],
     seeds: Sequence[int],
     executor: Executor,
+    variants: Sequence[Variant] = VARIANTS,
 ) -> Iterator[Outcome]:
     """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
 
@@ -242,9 +267,10 @@ def fly_all(
         cases: mean currents.
         seeds: of the water and of the instruments.
         executor: where tasks run.
+        variants: what flies.
     """
     fly = partial(fly_one, settings, plan, seeds[0])
-    yield from executor.map(fly, list(itertools.product(cases, VARIANTS, seeds)), label="flights")
+    yield from executor.map(fly, list(itertools.product(cases, variants, seeds)), label="flights")
 
 
 def fly_one(

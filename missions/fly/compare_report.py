@@ -21,15 +21,16 @@ from missions.fly.compare import (
     IMPROVED,
     ORIGINAL,
     PAPER,
-    VARIANTS,
     Case,
     CaseResult,
     Outcome,
     Summary,
     Trace,
+    Variant,
     default_cases,
     fly_all,
     summarised,
+    variants_of,
 )
 from missions.fly.flight_plots import BAND, draw_lines
 from missions.fly.flight_route import whole_route
@@ -45,7 +46,9 @@ _HEADER = (
 _UNITS = ("", "m", "m", "m", "m", "deg", "deg", "deg", "m/s", "m/s", "deg/s", "Wh", "s", "")
 _AROUND_M = 3.2
 """Margin around the lines that a map shows: the turns, not the way in."""
-_COLOURS = {ORIGINAL: "#c0392b", EQUAL: "#ca6f1e", IMPROVED: "#1b4f72"}
+_COLUMNS = 3
+"""Most variants that a figure shows."""
+_COLOURS = ("#c0392b", "#ca6f1e", "#1b4f72")
 _PAPER, _WAY = "#5d6d7e", "#aab7b8"
 
 
@@ -58,6 +61,7 @@ def compare_report(
     seed: int | None = None,
     flights: int = 5,
     executor: Executor | None = None,
+    vehicles: Sequence[str] = (),
 ) -> tuple[str, dict[str, Any]]:
     """Fly a survey by both configurations, and write table, figures and pictures.
 
@@ -69,6 +73,8 @@ def compare_report(
         seed: of the first flight; the survey's when left out.
         flights: of each variant in each current.
         executor: where tasks run; all cores of this machine when left out.
+        vehicles: names or files of the vehicles to compare; the paper's two configurations when
+            left out.
 
     Returns:
         Text, and the same as values for JSON.
@@ -76,7 +82,8 @@ def compare_report(
     Raises:
         ConfigError: a current or swell is not of that form, or the folder cannot be written.
     """
-    # Turns that both forms of the vehicle can fly.
+    variants = variants_of(vehicles)
+    # Turns that all can fly.
     config = changed(config, "plan", turns="arcs")
     if config.plan.line_spacing_m is None:
         config = changed(config, "plan", line_spacing_m=_PAPER_SPACING_M)
@@ -87,13 +94,13 @@ def compare_report(
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
     settings = flight_settings(config)
-    outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor()))
-    results = [_result(plan, case, outcomes) for case in cases]
+    outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor(), variants))
+    results = [_result(plan, case, outcomes, variants) for case in cases]
     text = "\n\n".join([
         _heading(plan, config.sea, seeds), *(_table(result) for result in results),
-        "Why they differ from the paper: docs/vehicle-comparison.md",
+        *(["Why they differ from the paper: docs/vehicle-comparison.md"] if not vehicles else []),
     ])  # fmt: skip
-    data = _data(plan, seeds, results)
+    data = _data(plan, seeds, results, variants)
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / "compare.json", data)
@@ -120,7 +127,7 @@ def _heading(plan: Plan, sea: SeaConfig, seeds: Sequence[int]) -> str:
 
 def _table(result: CaseResult) -> str:
     rows: list[tuple[str, ...]] = [_UNITS]
-    rows += [_paper_row(name) for name in (ORIGINAL, IMPROVED)]
+    rows += [_paper_row(name) for name in (ORIGINAL, IMPROVED) if name in result.summaries]
     rows += [_row(name, summary) for name, summary in result.summaries.items()]
     return f"{result.title}\n{text_table(_HEADER, rows)}"
 
@@ -170,7 +177,12 @@ def _row(name: str, summary: Summary) -> tuple[str, ...]:
     )
 
 
-def _data(plan: Plan, seeds: Sequence[int], results: Sequence[CaseResult]) -> dict[str, Any]:
+def _data(
+    plan: Plan,
+    seeds: Sequence[int],
+    results: Sequence[CaseResult],
+    variants: Sequence[Variant],
+) -> dict[str, Any]:
     return {
         "paper": PAPER,
         "followed_point": "body origin",
@@ -183,7 +195,7 @@ def _data(plan: Plan, seeds: Sequence[int], results: Sequence[CaseResult]) -> di
         "seeds": list(seeds),
         "variants": {
             variant.name: {**asdict(variant), "failed": list(variant.failed)}
-            for variant in VARIANTS
+            for variant in variants
         },
         "cases": [
             {
@@ -204,7 +216,9 @@ def _data(plan: Plan, seeds: Sequence[int], results: Sequence[CaseResult]) -> di
     }
 
 
-def _result(plan: Plan, case: Case, outcomes: Sequence[Outcome]) -> CaseResult:
+def _result(
+    plan: Plan, case: Case, outcomes: Sequence[Outcome], variants: Sequence[Variant]
+) -> CaseResult:
     mine = tuple(outcome for outcome in outcomes if outcome.case == case)
     turned = math.radians(case.towards_deg) - plan.lines[0].heading_rad
     return CaseResult(
@@ -214,7 +228,7 @@ def _result(plan: Plan, case: Case, outcomes: Sequence[Outcome]) -> CaseResult:
         outcomes=mine,
         summaries={
             variant.name: summarised([o for o in mine if o.variant == variant.name])
-            for variant in VARIANTS
+            for variant in variants
             if any(o.variant == variant.name for o in mine)
         },
     )
@@ -279,18 +293,20 @@ def draw_case(path: Path, plan: Plan, result: CaseResult) -> None:
     figure = new_figure(11, 15)
     grid = figure.add_gridspec(3, 3, height_ratios=(1.6, 1, 1))
     shown = [name for name in (ORIGINAL, EQUAL, IMPROVED) if name in result.summaries]
+    shown = shown or list(result.summaries)[:_COLUMNS]
+    colours = dict(zip(shown, _COLOURS, strict=False))
     traced = {o.variant: o for o in result.outcomes if o.trace is not None}
     first = None
     for column, name in enumerate(shown):
         chart = figure.add_subplot(grid[0, column], sharex=first, sharey=first)
         first = first or chart
-        _draw_track(chart, plan, traced[name], column == 0)
+        _draw_track(chart, plan, traced[name], colours[name], column == 0)
     cross, roll = (figure.add_subplot(grid[row, :2]) for row in (1, 2))
-    _draw_strip(cross, traced, shown, "cross_m")
+    _draw_strip(cross, traced, colours, "cross_m")
     cross.set_ylabel("true cross-track, m")
     cross.axhspan(-0.12, 0.12, color=BAND, zorder=0, label="paper's rms, improved (shaded)")
     _legend(cross)
-    _draw_strip(roll, traced, shown, "roll_deg")
+    _draw_strip(roll, traced, colours, "roll_deg")
     roll.set_ylabel("roll, °")
     _legend(roll)
     cross.sharex(roll)
@@ -303,18 +319,18 @@ def draw_case(path: Path, plan: Plan, result: CaseResult) -> None:
             ("peak surge in turns, mean, m/s", "surge_in_turns_mps", ("turn_surge_peak_mps",)),
         )
     ):
-        _draw_bars(figure.add_subplot(bars[row]), result, shown, title, paper, figures)
+        _draw_bars(figure.add_subplot(bars[row]), result, colours, title, paper, figures)
     figure.suptitle(f"{plan.name}, {result.title}", x=0.01, ha="left", fontsize=12, weight="bold")
     save_figure(figure, path, dpi=110)
 
 
-def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, labelled: bool) -> None:
+def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, colour: str, labelled: bool) -> None:
     draw_lines(axes, plan)
     route = whole_route(plan)
     way = route.places(np.linspace(0.0, route.length_m, 4000))
     axes.plot(way[:, 1], way[:, 0], color=_WAY, lw=0.8, zorder=1, label="planned route")
     track = _traced(outcome).true_ne
-    axes.plot(track[:, 1], track[:, 0], color=_COLOURS[outcome.variant], lw=1.1, label="true track")
+    axes.plot(track[:, 1], track[:, 0], color=colour, lw=1.1, label="true track")
     figures = outcome.figures
     axes.set_title(
         f"{outcome.variant}: {figures.lines_true_m:.2f} m rms on lines, "
@@ -329,14 +345,16 @@ def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, labelled: bool) -> Non
         axes.legend(loc="upper left", fontsize=7.5, frameon=True, framealpha=0.85)
 
 
-def _draw_strip(axes: Axes, traced: dict[str, Outcome], names: list[str], field: str) -> None:
-    for name in names:
+def _draw_strip(
+    axes: Axes, traced: dict[str, Outcome], colours: dict[str, str], field: str
+) -> None:
+    for name, colour in colours.items():
         trace = _traced(traced[name])
         if not len(trace.time_s):  # it never came to the route
             continue
         share = trace.time_s / trace.time_s[-1]
         values: Array = getattr(trace, field)
-        axes.plot(share, values, color=_COLOURS[name], lw=0.8, label=name)
+        axes.plot(share, values, color=colour, lw=0.8, label=name)
     axes.axhline(0, color="#7f8c8d", lw=0.6)
     axes.grid(visible=False, axis="x")
     axes.margins(x=0.005)
@@ -345,7 +363,7 @@ def _draw_strip(axes: Axes, traced: dict[str, Outcome], names: list[str], field:
 def _draw_bars(
     axes: Axes,
     result: CaseResult,
-    names: list[str],
+    colours: dict[str, str],
     title: str,
     paper: str,
     figures: tuple[str, ...],
@@ -353,7 +371,7 @@ def _draw_bars(
     """Bars of some figures of each variant, with their spread, next to the paper's span."""
     width = 0.8 / (1 + len(figures))
     top = 0.0
-    for i, name in enumerate(names):
+    for i, (name, colour) in enumerate(colours.items()):
         printed = PAPER.get(name, PAPER[ORIGINAL] if name == EQUAL else {}).get(paper)
         if printed is not None:
             least, most = printed
@@ -371,7 +389,7 @@ def _draw_bars(
             found = result.summaries[name][figure]
             x = i - 0.4 + (j + 1.5) * width
             axes.bar(
-                x, found["mean"], width * 0.9, yerr=found.get("sd"), color=_COLOURS[name],
+                x, found["mean"], width * 0.9, yerr=found.get("sd"), color=colour,
                 alpha=1.0 if j == 0 else 0.5, error_kw={"lw": 0.9, "capsize": 2},
             )  # fmt: skip
             reach = found["mean"] + found.get("sd", 0.0)
@@ -381,7 +399,7 @@ def _draw_bars(
             )  # fmt: skip
             top = max(top, reach)
     axes.set_ylim(0, 1.2 * top)
-    axes.set_xticks(range(len(names)), names, fontsize=8)
+    axes.set_xticks(range(len(colours)), list(colours), fontsize=8)
     said = " (full: lines, pale: whole route; hatched: paper)" if len(figures) > 1 else ""
     axes.set_title(title + said, loc="left", fontsize=8.5)
     axes.tick_params(axis="y", labelsize=7.5)

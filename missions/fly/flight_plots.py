@@ -37,11 +37,22 @@ from missions.values.plan_file import Plan
 
 PLAN, TRUE, NAV, AREA, BAND = "#95a5a6", "#1b4f72", "#ca6f1e", "#c8553d", "#eaf2f8"
 _ROLL, _PITCH = "#884ea0", "#229954"
-_THRUSTERS = ("#1b4f72", "#ca6f1e", "#229954", "#884ea0", "#c0392b", "#7f8c8d")
+_THRUSTERS = (
+    "#1b4f72", "#ca6f1e", "#229954", "#884ea0", "#c0392b", "#7f8c8d", "#5dade2", "#b7950b",
+)  # fmt: skip
 _ALLOWED, _HOME = "#566573", "#27ae60"
 _WAY_POINTS = 4000
 _DRAWN = 20_000
 """Most points of a curve."""
+_ROOM = 140
+"""Characters that have room above a strip ..."""
+_MARK = 6
+"""... of which the mark of a curve takes so many."""
+_BOLD = 1.25
+"""Width of a character of a title."""
+_LINE_PT = 11.0
+_NAMED = 5
+"""Most curves named in a row."""
 _SPREAD_SIGMAS = 2.0
 """The band of the navigation error: 95 % of the time within it."""
 _PHASES = {
@@ -92,7 +103,7 @@ def draw_vehicle(path: Path, flight: Flight) -> None:
     ]
     other = [t.name for t in craft.thrusters if t.name not in (*main, *lateral)]
     groups = [group for group in (main, lateral, other) if group]
-    figure, chart, strips = _sheet(4 + len(groups))
+    figure, chart, strips = _sheet(4 + len(groups) + bool(craft.fins))
     velocity = true_velocity(flight.flown)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     _draw_plan(chart, flight.plan)
@@ -103,6 +114,8 @@ def draw_vehicle(path: Path, flight: Flight) -> None:
     _draw_roll(strips[1], flight)
     for axes, group in zip(strips[2:], groups, strict=False):
         _draw_thrusters(axes, flight, group)
+    if craft.fins:
+        _draw_fins(strips[-3], flight)
     _draw_power(strips[-2], flight)
     _draw_current(strips[-1], flight)
     _end_strips(figure, strips, flight)
@@ -213,13 +226,20 @@ def _end_strips(figure: Sheet, strips: list[Axes], flight: Flight) -> None:
 
 
 def _legend(axes: Axes, title: str = "") -> None:
-    """Names of the curves above a strip, to the right, and a title to the left."""
-    axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=5, fontsize=7.5,
-        borderaxespad=0.0, columnspacing=1.2, handlelength=1.6,
-    )  # fmt: skip
+    """Names of the curves above a strip, to the right, and a title to the left, or above both."""
+    names = axes.get_legend_handles_labels()[1]
+    longest = max((len(name) for name in names), default=0) + _MARK
+    columns = max(1, min(len(names), _NAMED, _ROOM // longest))
+    width = _BOLD * len(title) + sum(len(name) + _MARK for name in names)
+    beside = width <= _ROOM and len(names) <= _NAMED
+    lines = 0 if beside else math.ceil(len(names) / columns)
+    if names:
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=_NAMED if beside else columns,
+            fontsize=7.5, borderaxespad=0.0, columnspacing=1.2, handlelength=1.6,
+        )  # fmt: skip
     if title:
-        axes.set_title(title, loc="left", fontsize=8.5, pad=3)
+        axes.set_title(title, loc="left", fontsize=8.5, pad=3 + _LINE_PT * lines)
 
 
 def _only(track: Array, rows: Array) -> tuple[Array, Array]:
@@ -345,14 +365,26 @@ def _draw_thrusters(axes: Axes, flight: Flight, names: list[str]) -> None:
     _legend(axes, f"speed of thrusters, limits ±{limit:.0f}")
 
 
+def _draw_fins(axes: Axes, flight: Flight) -> None:
+    """Angles of the fins, and their limits."""
+    fins, angles = flight.vehicle.fins, np.rad2deg(flight.flown.fin_rad)
+    for fin, angle, colour in zip(fins, angles.T, itertools.cycle(_THRUSTERS), strict=False):
+        _plot(axes, flight, angle, colour, fin.name, lw=0.7, alpha=0.85)
+    limit = min(fin.most_angle_deg for fin in fins)
+    _zero(axes, "fins, °")
+    for end in (-limit, limit):
+        axes.axhline(end, color="#c0392b", lw=0.8, ls="--")
+    _legend(axes, f"angles of the fins, limits ±{limit:g}°")
+
+
 def _draw_power(axes: Axes, flight: Flight) -> None:
     flown = flight.flown
     some = thin(len(flight.line))
     t = flight.truth.time_s[some]
     colours = [_THRUSTERS[i % len(_THRUSTERS)] for i in range(len(flown.thrusters))]
-    axes.stackplot(
-        t, flown.power_w[some].T, labels=flown.thrusters, colors=colours, alpha=0.75, lw=0
-    )
+    # The strips above name the colours of many.
+    names = flown.thrusters if len(flown.thrusters) <= _NAMED else ()
+    axes.stackplot(t, flown.power_w[some].T, labels=names, colors=colours, alpha=0.75, lw=0)
     total = flown.power_w.sum(axis=1)
     # The jerk of the first seconds would flatten the rest.
     axes.set_ylim(0, max(1.0, 1.3 * float(np.percentile(total, 99.0))))

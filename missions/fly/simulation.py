@@ -44,7 +44,7 @@ from alice_survey.vehicle.simulator import Failure, Flown, Setup, simulate
 from alice_survey.vehicle.stability import pitch_divergence_speed_mps
 from alice_survey.vehicle.swell import with_swell
 from alice_survey.vehicle.vehicle import Vehicle
-from missions.fly.flight_route import path_of, room_behind_m, turns_on_the_spot
+from missions.fly.flight_route import path_of, room_behind_m, roomier_side, turns_on_the_spot
 from missions.route.energy import sound_craft_of
 from missions.values.flight import Flight, trigger_times
 from missions.values.navigation import BelievedNavigation
@@ -158,7 +158,7 @@ def mission_setup(
         rng: for what is drawn once a mission.
     """
     craft = sound_craft_of(settings.vehicle)
-    diverging_mps = pitch_divergence_speed_mps(craft)
+    diverging_mps = math.inf if craft.fins else pitch_divergence_speed_mps(craft)
     if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
         warn(
             f"the pitch of {craft.name} with {craft.coefficients.name!r} coefficients diverges "
@@ -196,7 +196,9 @@ def mission_setup(
             ),
         )
         way_in_m = min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
-        return gains, guidance._replace(way_in_m=way_in_m)
+        side = roomier_side(plan, path, way_in_m, guidance.under_way.circle_m)
+        under_way = guidance.under_way._replace(side=side)
+        return gains, guidance._replace(way_in_m=way_in_m, under_way=under_way)
 
     gains, guidance = piloted(known)
     gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])

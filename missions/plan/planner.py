@@ -36,10 +36,11 @@ from missions.exposure.storage import raw_bytes
 from missions.exposure.ways_out import ConflictError
 from missions.lines.sweep import Sweep
 from missions.plan.parts import plan_parts
-from missions.plan.ready import check_depth, check_turns, gap_m, with_tried_ways
+from missions.plan.ready import check_depth, check_no_stops, check_turns, gap_m, with_tried_ways
 from missions.plan.rows import plan_rows
 from missions.plan.strength import survey_costs, turn_rate_deg_s, warn_of_swell
 from missions.route.energy import sound_craft_of, usable_wh
+from missions.route.flyable import as_flown
 from missions.route.terrain import (
     Reach,
     TerrainLimits,
@@ -94,7 +95,14 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
 
 def _planned(config: SurveyConfig, rig: Rig) -> Planned:
     with heard() as warnings:
+        config, as_set = as_flown(config), config.plan
         wanted = config.plan
+        if wanted.turn_radius_m > as_set.arc_radius_m:
+            warn(
+                f"{config.vehicle.name} is steered by fins: turns are planned with a radius of "
+                f"{wanted.turn_radius_m:g} m and run-ins of {wanted.run_in_m:g} m; long lines suit "
+                "it better than short ones"
+            )
         imaging = imaging_settings(rig, ImagingSetup.of(config))
         check_turns(wanted)
         step_m = imaging.station_spacing_m
@@ -126,6 +134,8 @@ def _planned(config: SurveyConfig, rig: Rig) -> Planned:
             depth_m=depth_m - wanted.altitude_m,
         )
         lines, dives, sweep = flown.lines, flown.dives, flown.sweep
+        if craft.fins:
+            check_no_stops(craft, wanted, dives)
         reach = reach_of(
             hull,
             glass_body_m,

@@ -1,10 +1,12 @@
 """Whether a survey can be planned up to where its lines lie, as set or with a way out taken."""
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 from alice_survey.base.config import PlanConfig, SurveyConfig, with_settings
 from alice_survey.base.errors import PlanError, collected_by, warn
+from alice_survey.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig, design_rig
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.ways_out import (
@@ -16,7 +18,9 @@ from missions.exposure.ways_out import (
 )
 from missions.plan.strength import arcs_fit, turn_rate_deg_s
 from missions.route.energy import flight_conditions, vehicle_costs
+from missions.route.flyable import as_flown
 from missions.values.footprint import Swath, common_swath
+from missions.values.plan_file import Dive
 
 
 def with_tried_ways(found: ConflictError, config: SurveyConfig, rig: Rig) -> ConflictError:
@@ -41,7 +45,7 @@ def check_ready(config: SurveyConfig, rig: Rig, settings: Settings) -> None:
     Raises:
         AliceError: it cannot, or its lines would leave gaps in stereo.
     """
-    changed = with_settings(config, settings, "way out")
+    changed = as_flown(with_settings(config, settings, "way out"))
     wanted = changed.plan
     if changed.camera != config.camera:
         rig = design_rig(changed.camera, changed.water)
@@ -91,6 +95,23 @@ def check_turns(plan: PlanConfig) -> None:
             f"turn_radius_m {plan.turn_radius_m:g} at {plan.speed_mps:g} m/s is beyond "
             f"turn_rate_limit_deg_s {plan.turn_rate_limit_deg_s:g}: arcs are planned with "
             f"{plan.arc_radius_m:g} m"
+        )
+
+
+def check_no_stops(craft: Vehicle, plan: PlanConfig, dives: Sequence[Dive]) -> None:
+    """Refuse a route with stops, which a vehicle that fins steer cannot make.
+
+    Raises:
+        PlanError: there is no room for its arcs.
+    """
+    legs = [leg for dive in dives for leg in dive.route.legs]
+    stops = sum(leg.turn_rad != 0.0 or leg.side_rad != 0.0 for leg in legs)
+    if stops:
+        raise PlanError(
+            f"turns of {plan.turn_radius_m:g} m radius have no room inside the allowed area (the "
+            f"way has {stops} stops), and {craft.name}, which fins steer, cannot stop: widen "
+            "area.turn_margin_m or the allowed area, set plan.home_ne_m farther from its edges, or "
+            "survey it with a vehicle that can stop"
         )
 
 

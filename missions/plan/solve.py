@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import PlanConfig, SurveyConfig
+from alice_survey.base.config import PlanConfig, SurveyConfig, changed
 from alice_survey.base.errors import ConfigError, PlanError
 from alice_survey.vehicle.limits import spot_rate_rad_s
 from missions.exposure.settings import ImagingSetup, imaging_settings
@@ -23,7 +23,8 @@ from missions.exposure.ways_out import ConflictError
 from missions.plan.ready import with_tried_ways
 from missions.plan.strength import survey_costs
 from missions.plan.trade import both_ways_w
-from missions.route.energy import usable_wh
+from missions.route.energy import craft_of, usable_wh
+from missions.route.flyable import as_flown
 from missions.values.costs import time_costs
 
 
@@ -106,6 +107,9 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
     Raises:
         PlanError: the dive or the battery is too short for one line of one picture's length.
     """
+    config = as_flown(config)
+    if craft_of(config.vehicle).fins:
+        config = changed(config, "plan", turns="arcs")
     setup, plan = ImagingSetup.of(config), config.plan
     try:
         settings = imaging_settings(setup.rig, setup, quiet=True)
@@ -116,7 +120,9 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
     dive_down_s, turn = time_costs(plan.speed_mps).dive_s(depth_m), turn_s(plan, spacing)
     line_w = float(np.min(both_ways_w(flying.line_w)))
     way_w = float(np.max(flying.way_w[np.isfinite(flying.way_w)]))
-    turn_w = max(flying.spot_w, way_w + flying.arc_extra_w)
+    turn_w = way_w + flying.arc_extra_w
+    if plan.turns != "arcs":
+        turn_w = max(turn_w, flying.spot_w)
     usable_j = usable_wh(config.vehicle) * 3600.0
 
     def needs(side_m: float) -> tuple[float, float]:

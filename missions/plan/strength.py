@@ -10,8 +10,10 @@ import numpy as np
 
 from alice_survey.base.config import PlanConfig, SurveyConfig, VehicleConfig
 from alice_survey.base.errors import AliceError, PlanError, warn
-from alice_survey.vehicle.fleet import GEOMETRIES
+from alice_survey.vehicle.files import vehicles_of_a_geometry
+from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.swell import orbital_speed_mps
+from alice_survey.vehicle.under_way import held, too_slow
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import Settings, Way, conflict
 from missions.route.energy import (
@@ -22,6 +24,7 @@ from missions.route.energy import (
     motion,
     vehicle_costs,
 )
+from missions.route.flyable import as_flown, plan_as_flown
 from missions.values.costs import Costs
 
 _SPEEDS_MPS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.75, 1.0, 1.25, 1.5)
@@ -37,6 +40,7 @@ def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         config: of the survey.
         imaging_w: mean power of strobes while on lines.
     """
+    config = as_flown(config)
     flown = flight_conditions(config)
     refused = partial(too_strong, flown, config.vehicle, ImagingSetup.of(config))
     return vehicle_costs(flown, refused=refused, imaging_w=imaging_w)
@@ -99,6 +103,9 @@ def too_strong(
     against = f"a current of {size:.2f} m/s towards {towards_deg:03.0f} deg"
     ways = [*_waits(flown, held_mps), *_changes(flown, vehicle, setup)]
     said = f"{what} in {against}" if what else f"{against} is above the strength of {name}"
+    if held_mps == 0.0 and flown.craft.fins and held(flown.craft, speed, 0.0, STEADY_SHARE) is None:
+        said = too_slow(flown.craft, speed, STEADY_SHARE)
+        return conflict(said, ("plan.speed_mps", "the lift of its fins and hull"), ways)
     if held_mps == 0.0:
         said = (
             f"{name} cannot fly lines{heading} {manner}, ways between in all directions and turns "
@@ -167,7 +174,7 @@ def _changes(flown: FlightConditions, own: VehicleConfig, setup: ImagingSetup) -
         yield from _tried(changed, setup, named, 0.0, {"vehicle.controller": other})
     if own.file is not None or own.coefficients_file is not None:  # of this vehicle alone
         return
-    for other in (name for name in GEOMETRIES if name != own.name):
+    for other in (name for name in vehicles_of_a_geometry() if name != own.name):
         changed = flown.with_vehicle(own.model_copy(update={"name": other, "thruster_health": {}}))
         named = f"vehicle.name = '{other}'"
         settings: dict[str, Any] = {"vehicle.name": other}
@@ -217,8 +224,11 @@ def _speeds(flown: FlightConditions, setup: ImagingSetup) -> Iterator[Way]:
     """
     own = flown.speed_mps
     for speed in sorted(_SPEEDS_MPS, key=lambda each: abs(math.log(each / own))):
-        plan = setup.plan.model_copy(update={"speed_mps": speed})
         settings, wider = {"plan.speed_mps": speed}, ""
+        try:
+            plan = plan_as_flown(setup.plan.model_copy(update={"speed_mps": speed}), flown.craft)
+        except PlanError:
+            continue
         if not arcs_fit(plan):
             limit_rad_s = math.radians(plan.turn_rate_limit_deg_s)
             radius_m = math.ceil(10.0 * speed / limit_rad_s) / 10.0

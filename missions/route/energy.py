@@ -35,6 +35,7 @@ from alice_survey.base.errors import PlanError, VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import coefficients_from_file, vehicle_to_fly
 from alice_survey.vehicle.limits import STEP_MPS, spot_rate_rad_s
+from alice_survey.vehicle.pilot.diving import MOST_PITCH_RAD
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
 from alice_survey.vehicle.vehicle import Vehicle
@@ -47,6 +48,8 @@ _HEADINGS = 24
 """Number of headings over which a turn on the spot in a current is averaged."""
 _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
+_DEAR = 100.0
+"""Price of what cannot be flown, over that of an arc."""
 _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
 """Rates of descent that are tried."""
 
@@ -104,7 +107,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         most_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=hotel_w(config.vehicle),
-        needs_arcs=plan.turns == "arcs",
+        needs_arcs=plan.turns == "arcs" or bool(craft.fins),
     )
 
 
@@ -162,7 +165,7 @@ def vehicle_costs(
     if conditions.needs_arcs and not math.isfinite(arc_w):
         raise refused(f"arcs of {conditions.turn_radius_m:g} m radius cannot be flown")
     step_mps, step_w = _sway_step(craft, courses, current, conditions.manner)
-    heave_mps, heave_w = _heave(craft, current)
+    heave_mps, heave_w = _heave(conditions)
     return Costs(
         speed_mps=conditions.speed_mps,
         line_w=lines + hotel + imaging_w,
@@ -402,7 +405,13 @@ def _turning_power(conditions: FlightConditions, speeds_mps: Array, rates_rad_s:
 
 
 def _spot(conditions: FlightConditions) -> tuple[float, float]:
-    """Power on the spot, of turning through a quarter and settling; and the rate of turning."""
+    """Power on the spot, of turning through a quarter and settling; and the rate of turning.
+
+    A vehicle that fins steer cannot: it costs so much that a plan has it for want of room alone,
+    and is refused for it.
+    """
+    if conditions.craft.fins:
+        return _DEAR * _arc(conditions)[0], conditions.most_spot_rad_s
     rates = conditions.most_spot_rad_s * np.append(_RATES, 0.0)
     power = _turning_power(conditions, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))
@@ -419,7 +428,8 @@ def _arc(conditions: FlightConditions) -> tuple[float, float]:
 
     Mean of both senses and all courses.
     """
-    speeds = conditions.speed_mps * _RATES
+    # Fins need the whole speed.
+    speeds = conditions.speed_mps * (_RATES[:1] if conditions.craft.fins else _RATES)
     rates = speeds / conditions.turn_radius_m
     both = np.concatenate([rates, -rates])
     power = _turning_power(conditions, np.tile(speeds, 2), both)
@@ -457,8 +467,14 @@ def _sway_step(
     return step_mps, (powers[0] + powers[1]) / 2
 
 
-def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
-    """Rate of descent and ascent, and their mean power, heading into the current and held there."""
+def _heave(conditions: FlightConditions) -> tuple[float, float]:
+    """Rate of descent and ascent, and their mean power, heading into the current and held there.
+
+    A vehicle that fins steer pitches, and goes round.
+    """
+    craft, current = conditions.craft, conditions.current_ne_mps
+    if craft.fins:
+        return conditions.speed_mps * math.sin(MOST_PITCH_RAD), _arc(conditions)[0]
     rates = np.concatenate([_HEAVES_MPS, -_HEAVES_MPS])
     nu = np.zeros((len(rates), 6))
     nu[:, 0], nu[:, 2] = math.hypot(*current), rates
@@ -480,7 +496,7 @@ def flies_everywhere(conditions: FlightConditions) -> bool:
     """
     current = conditions.current_ne_mps
     try:
-        _heave(conditions.craft, current)
+        _heave(conditions)
     except PlanError:
         return False
     downstream = math.atan2(current[1], current[0])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
 from missions.values.flight import Flight
@@ -20,7 +20,7 @@ from tests.missions.flown_plans import flown, planned
 LEAST_M = 1.0
 """Half the altitude of 2 m."""
 DEPTH_M = 12.0
-HULL = vehicle("alice").hull
+HULL = vehicle_from("alice").hull
 AT_M = np.arange(-15.0, 15.05, 0.1)
 
 

@@ -12,10 +12,11 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.base.config import SurveyConfig, changed, parse_config
-from alice_survey.base.errors import ConfigError
+from alice_survey.base.errors import ConfigError, VehicleError
 from alice_survey.base.executor import SERIAL
 from alice_survey.cli.main import app
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle import files
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from missions.fly.compare import (
@@ -30,6 +31,7 @@ from missions.fly.compare import (
     fly_variant,
     summarised,
     turn_rows,
+    variants_of,
 )
 from missions.fly.compare_report import compare_report
 from missions.fly.flight_plots import true_current
@@ -39,6 +41,7 @@ from missions.values.plan_file import Plan
 from tests.missions.flown_plans import planned
 from tests.oracles_guidance import los_offset_m
 
+HEAVY = str(Path(files.__file__).parent / "fleet_files" / "bluerov2_heavy.toml")
 STILL = Case(current_mps=0.0, towards_deg=0.0)
 BY_NAME = {variant.name: variant for variant in VARIANTS}
 
@@ -227,6 +230,26 @@ def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None
     assert len(list((tmp_path / "one").glob("*.png"))) == 2
 
 
+def test_any_vehicles_are_compared(tmp_path: Path) -> None:
+    """Each as it can be steered, under its own name; the paper's figures are left out."""
+    text, data = compare_report(
+        CONFIG, tmp_path, currents=["0.05@90"], seed=4, flights=1, executor=SERIAL,
+        vehicles=["sparus2", HEAVY],
+    )  # fmt: skip
+    found = data["cases"][0]["variants"]
+    assert list(found) == ["sparus2", "bluerov2_heavy"]
+    assert [data["variants"][name]["controller"] for name in found] == ["los", "sway"]
+    assert all(figures["complete"]["mean"] == 1.0 for figures in found.values())
+    errors = [figures["lines_true_m"]["mean"] for figures in found.values()]
+    assert 0.005 < errors[1] < 0.2 < errors[0] < 2.0
+    assert "paper" not in text
+    assert len(list(tmp_path.glob("*.png"))) == 1
+    with pytest.raises(VehicleError, match="two have one name"):
+        variants_of(["bluerov2_heavy", HEAVY])
+    with pytest.raises(VehicleError, match="'nautilus' is not known"):
+        variants_of(["nautilus"])
+
+
 @pytest.mark.parametrize(
     ("currents", "swell"),
     [
@@ -257,6 +280,6 @@ def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
 def test_variants_are_named_apart_and_fit_their_vehicle() -> None:
     assert len(BY_NAME) == len(VARIANTS)
     for variant in VARIANTS:
-        names = {thruster.name for thruster in vehicle(variant.vehicle).thrusters}
+        names = {thruster.name for thruster in vehicle_from(variant.vehicle).thrusters}
         assert set(variant.failed) <= names
         assert variant.controller == "los" or variant.vehicle == "alice"

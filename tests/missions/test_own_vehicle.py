@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.config import SurveyConfig, load_config, parse_config, with_settings
 from alice_survey.base.errors import AliceError, PlanError, VehicleError
+from alice_survey.survey import plan_report
 from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.pilot.gains import gains_for
 from missions.plan.strength import survey_costs
@@ -128,7 +130,7 @@ def test_no_vehicle_dives_deeper_than_it_is_built_for() -> None:
 @pytest.mark.parametrize(
     ("vehicle", "named"),
     [
-        ({"name": "nautilus"}, "alice, sparus2, bluerov2_heavy, or a TOML file"),
+        ({"name": "nautilus"}, "alice, bluerov2_heavy, remus100, sparus2, or a TOML file"),
         ({"name": "none.toml"}, "none.toml: cannot be read"),
         ({"name": "bluerov2_heavy", "coefficients": "cfd"}, "has its own coefficients, not 'cfd'"),
         ({"thruster_health": {"warp": 0.5}}, "no thruster 'warp'; it has starboard"),
@@ -138,3 +140,22 @@ def test_no_vehicle_dives_deeper_than_it_is_built_for() -> None:
 def test_what_is_not_known_is_named(vehicle: dict[str, object], named: str) -> None:
     with pytest.raises(AliceError, match=re.escape(named)):
         craft_of(survey(vehicle).vehicle)
+
+
+def test_a_vehicle_is_named_for_one_plan(tmp_path: Path) -> None:
+    """`plan --vehicle`: its energy is that of the survey with that vehicle in its settings."""
+    area = (
+        "[area]\nlength_m = 3.0\nwidth_m = 1.0\nseafloor_depth_m = 6.0\n[plan]\ncross_lines = 0\n"
+    )
+    (tmp_path / "survey.toml").write_text(area)
+    plan_report(tmp_path, None, vehicle="bluerov2_heavy")
+    given = read_json(tmp_path / "plan" / "plan.json")
+    config = load_config(tmp_path / "survey.toml")
+    heavy, own = (
+        planned(with_settings(config, {"vehicle.name": name})).energy_wh
+        for name in ("bluerov2_heavy", "alice")
+    )
+    assert given["energy_wh"] == pytest.approx(heavy, rel=1e-6)
+    assert abs(heavy - own) > 0.02 * own
+    with pytest.raises(VehicleError, match="'nautilus' is not known"):
+        plan_report(tmp_path, None, vehicle="nautilus")

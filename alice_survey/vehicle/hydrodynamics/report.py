@@ -20,7 +20,7 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from alice_survey.vehicle import fleet
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
 from alice_survey.vehicle.hydrodynamics.entrained import Entrained, entrained_water
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, Geometry
@@ -149,7 +149,7 @@ def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[Coefficient
         ConfigError: the suffix is not one of the three.
     """
     check_figure_path(path)
-    craft = fleet.vehicle(geometry.name)
+    craft = vehicle_from(geometry.name)
     thrusters = craft.thrusters
     inside = entrained_water(geometry, craft.rigid_body.buoyancy_kg, craft.density_kg_m3)
     figure = new_figure(_SIZE_IN[1], _SIZE_IN[0], layout="none")

@@ -9,7 +9,7 @@ import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients
+from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients, both_ways
 from alice_survey.vehicle.identification.sensitivity import (
     ADDED_MASS,
     BIAS,
@@ -19,6 +19,8 @@ from alice_survey.vehicle.identification.sensitivity import (
     LIFT,
     LINEAR,
     QUADRATIC,
+    QUADRATIC_NEG,
+    QUADRATIC_POS,
     TRIM,
     Physics,
     Terms,
@@ -39,6 +41,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"current": CURRENTS, "trim": TRIMS, "bias": BIASES, "buoyancy": (NET_BUOYANCY,), "gain": GAINS}
 )
 """Short names of several parameters."""
+_QUADRATICS = (QUADRATIC, QUADRATIC_POS, QUADRATIC_NEG)
 _GREATEST: Mapping[int, float] = MappingProxyType({CURRENT: 5.0, TRIM: 1.0})
 
 
@@ -73,7 +76,7 @@ class Parameters:
         lower, upper = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for k, name in enumerate(self.names):
             kind, i, j = _place(name)
-            if kind in (LINEAR, QUADRATIC, ADDED_MASS) and i == j:
+            if kind in (LINEAR, *_QUADRATICS, ADDED_MASS) and i == j:
                 upper[k] = 0.0
             elif kind == GAIN:
                 lower[k] = 0.0
@@ -120,7 +123,7 @@ class Parameters:
 
     def _given(self, name: str) -> float:
         if name not in OTHERS:
-            return self.vehicle.coefficients.values.get(name, 0.0)
+            return self.vehicle.coefficients.value(name)
         if name in self.fixed:
             return self.fixed[name]
         rigid, body = self.vehicle.rigid_body, self.vehicle.plant.body
@@ -150,6 +153,12 @@ def free_parameters(
         if place in places:
             raise VehicleError(f"{places[place]} and {name} are one parameter: free it once")
         places[place] = name
+    for name in flat:
+        if both_ways(name) != name and both_ways(name) in flat:
+            raise VehicleError(
+                f"{both_ways(name)} stands for both ways: free it, or {both_ways(name)}_pos and "
+                f"{both_ways(name)}_neg"
+            )
     for name in fixed or {}:
         if name not in OTHERS:
             raise VehicleError(f"{name} cannot be held by hand; these can: {', '.join(OTHERS)}")
@@ -175,7 +184,7 @@ def unit_of(name: str) -> str:
         return ("kg", "kg m", "kg m2")[int(i >= 3) + int(turning)]
     if kind == LIFT:
         return f"{force} s2/m2"
-    power = "2" if kind == QUADRATIC else ""
+    power = "2" if kind in _QUADRATICS else ""
     return f"{force} s{power}" + ("" if turning else f"/m{power}")
 
 
@@ -194,7 +203,10 @@ def _place(name: str) -> tuple[int, int, int]:
         return LIFT, FORCES.index(name[0]), MOTIONS.index(name[3])
     if len(name) > 2 and name[0] in FORCES and name[1] == "_" and name[2] in MOTIONS:
         kinds = {"dot": ADDED_MASS, "": LINEAR, name[2]: QUADRATIC}
+        kinds |= {f"{name[2]}_pos": QUADRATIC_POS, f"{name[2]}_neg": QUADRATIC_NEG}
         if name[3:] in kinds:
             return kinds[name[3:]], FORCES.index(name[0]), MOTIONS.index(name[2])
     known = ", ".join((*GROUPS, *OTHERS))
-    raise VehicleError(f"parameter {name!r} is not known; known: X_udot, X_u, X_uu, ..., {known}")
+    raise VehicleError(
+        f"parameter {name!r} is not known; known: X_udot, X_u, X_uu, Z_ww_neg, ..., {known}"
+    )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
@@ -67,7 +68,7 @@ _AS_GOOD = 1.0
 class IdentifyOptions:
     """Options of `vehicle identify`."""
 
-    vehicle: str = "alice"
+    vehicle: str = DEFAULT_VEHICLE
     """A name, or a TOML or JSON file."""
     coefficients: str | None = None
     """A named set or a file to start from; the vehicle's own if not given."""
@@ -111,6 +112,11 @@ def identify_report(
     if options.method not in ("joint", "two-step"):
         raise VehicleError(f"method {options.method!r} is not known: joint or two-step")
     vehicle = _start(options)
+    if vehicle.fins:
+        raise VehicleError(
+            f"{vehicle.name} is steered by fins, whose angles no log holds yet: give the file of a "
+            "vehicle without [[fins]], and logs of the whole wrench (X_n to N_nm)"
+        )
     thrust: list[ThrustCoefficient] = []
     if options.bollard is not None:
         thrust = fit_pulls(read_pulls(options.bollard), vehicle)

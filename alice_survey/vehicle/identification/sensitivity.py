@@ -26,7 +26,10 @@ from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping, add_w
 from alice_survey.vehicle.propulsion import Propulsion, add_thrust
 from alice_survey.vehicle.rotations import matrix_rows
 
-LINEAR, QUADRATIC, LIFT, ADDED_MASS, CURRENT, BUOYANCY, TRIM, BIAS, GAIN = range(9)
+(
+    LINEAR, QUADRATIC, LIFT, ADDED_MASS, CURRENT, BUOYANCY, TRIM, BIAS, GAIN, QUADRATIC_POS,
+    QUADRATIC_NEG,
+) = range(11)  # fmt: skip
 """Kinds of parameters."""
 STATES = 10
 """Length of the state."""
@@ -170,7 +173,8 @@ def slope_by_state(
     # Force by velocity: damping and lift,
     for i in range(6):
         for j in range(6):
-            by_nu[i, j] = body.linear[i, j] + 2.0 * body.quadratic[i, j] * abs(nu[j])
+            square = body.quadratic[i, j] if nu[j] > 0.0 else body.quadratic_back[i, j]
+            by_nu[i, j] = body.linear[i, j] + 2.0 * square * abs(nu[j])
     sign = 1.0 if u > 0.0 else (-1.0 if u < 0.0 else 0.0)
     by_nu[1, 0] += body.lift[0] * sign * v
     by_nu[1, 1] += body.lift[0] * abs(u)
@@ -267,6 +271,10 @@ def slope_by_parameters(
             force[i] = nu[j]
         elif kind == QUADRATIC:
             force[i] = nu[j] * abs(nu[j])
+        elif kind == QUADRATIC_POS:
+            force[i] = max(nu[j], 0.0) * abs(nu[j])
+        elif kind == QUADRATIC_NEG:
+            force[i] = min(nu[j], 0.0) * abs(nu[j])
         elif kind == LIFT:
             if i == 1:
                 force[1] = abs(u) * v

@@ -32,18 +32,33 @@ has a zero at -place / rate, nearer than its poles, by which it overshoots a wan
 proportional part therefore sees only a share of the wanted speed (set-point weighting: K. J.
 Astrom, T. Hagglund, Advanced PID Control, 2006, section 3.4), weight = (place / omega - d/m) /
 rate, which with the feed-forward of drag moves the zero onto a pole at -omega.
+
+A vehicle that fins steer has surge, yaw and pitch (roll where its fins give all three moments), by
+the same rules, its fins' damping counted with the hull's. Pitch is not bare either: heave, the Munk
+moment and the low centre of gravity are in its loop as sway is in that of yaw. Fins are weaker than
+their drives are fast: omega is so low that an error of KEPT_RAD takes no more than their moment.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.dynamics import Body, coriolis_matrix
+from alice_survey.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
+from alice_survey.vehicle.dynamics import Body
+from alice_survey.vehicle.fins import MOST_RAD, Fins, fin_slope, write_fin_matrix
+from alice_survey.vehicle.pilot.linear import (
+    LATERAL,
+    NO_FINS,
+    VERTICAL,
+    coupled_pair,
+    linear_damping,
+    mode_damping,
+)
 from alice_survey.vehicle.propulsion import thrust_limits
+from alice_survey.vehicle.under_way import keeps, least_radius_m
 from alice_survey.vehicle.vehicle import Vehicle
 
 SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = range(6)
@@ -53,7 +68,8 @@ DEGREES = (0, 1, 2, 5)
 STEERED = len(DEGREES)
 LEVEL = (3, 4)
 """The same of the rows after them, which are held level: by thrusters that can, else by gravity."""
-_LATERAL = [1, 5]
+_DEGREE = (*DEGREES, *LEVEL)
+_BY_FINS = (SURGE, YAW, PITCH, ROLL)
 
 MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
@@ -74,13 +90,13 @@ LEAST_HEADING_DAMPING = 0.5
 """Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
 PASSING_DAMPING = 0.2
 """Reduction of the heading loop's damping below the survey's speed (inferred)."""
+KEPT_RAD = math.radians(10.0)
+"""Tolerance within which a heading counts as kept."""
 _NO_FORCE = 1e-6
 """A force or moment of less is none, N or N m."""
-_AT_REST_PER_S = 1e-9
-"""Poles nearer to 0 do not move."""
 _RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
 _PLACE_FACTORS = np.geomspace(0.5, 16.0, 61)
-_SLOWER = (0.0, 0.5)
+_SLOWER, _SLOWER_BY_FINS = (0.0, 0.5), (0.5,)
 """Shares of the survey's speed."""
 STEADY_SHARE = 0.75
 """Share of the greatest force for steady motion; a quarter stays for feedback (inferred)."""
@@ -91,14 +107,35 @@ class Gains(NamedTuple):
 
     body: Body
     """Inertia and damping, for feed-forward."""
+    fins: Fins
+    """Those that are there: for feed-forward, not turned."""
+    straight: Array
+    """(m,) angles of fins that are not turned."""
+    level_rad: float
+    """Pitch of level flight; 0 but for a vehicle that fins steer."""
     axes: Array
-    """(6, 11) rows SURGE, SWAY, HEAVE, YAW, ROLL, PITCH; an axis that no thruster moves has zero
-    gains, and so have roll and pitch where the thrusters cannot hold both and steer as well."""
+    """(6, 11) rows SURGE, SWAY, HEAVE, YAW, ROLL, PITCH; an axis that nothing moves has zero gains,
+    and so have roll and pitch where the thrusters cannot hold both and steer as well."""
 
     @property
     def holds_level(self) -> bool:
-        """Whether thrusters hold roll and pitch."""
+        """Whether thrusters hold roll and pitch, or fins."""
         return bool(np.all(self.axes[[ROLL, PITCH], MASS] > 0.0))
+
+    @property
+    def axis_weights(self) -> Array:
+        """(6,) priorities of the axes in the allocation; 0 of those that nothing pushes along."""
+        weights = LEVEL_WEIGHTS if self.holds_level or self.dives_by_pitch else AXIS_WEIGHTS
+        weights = weights.copy()
+        if self.dives_by_pitch:
+            rows = [SURGE, SWAY, HEAVE, ROLL, PITCH, YAW]
+            weights[self.axes[rows, MASS] == 0.0] = 0.0
+        return weights
+
+    @property
+    def dives_by_pitch(self) -> bool:
+        """Whether nothing pushes the vehicle up or down: it goes where its fins point it."""
+        return bool(self.axes[HEAVE, MASS] == 0.0)
 
 
 def gains_for(
@@ -118,8 +155,11 @@ def gains_for(
         most_turn_rad_s: greatest commanded yaw rate, if the thrusters allow it.
 
     Raises:
-        VehicleError: surge, heave or yaw cannot be controlled, or yaw not damped at that speed.
+        VehicleError: surge, heave or yaw cannot be controlled, or yaw not damped at that speed; or
+            a vehicle with fins has vertical thrusters too, or does not fly level at that speed.
     """
+    if vehicle.fins:
+        return _gains_of_fins(vehicle, speed_mps, tick_s, navigation_hz, most_turn_rad_s)
     plant = vehicle.plant
     count = len(vehicle.thrusters)
     lower, upper = np.zeros(count), np.zeros(count)
@@ -168,19 +208,101 @@ def gains_for(
             rate, place, damped = _damped_together(
                 plant.body, speed_mps, bare, lag_s, omega, most_decay, sampled_rad_s
             )
-            if damped < LEAST_HEADING_DAMPING:
-                raise VehicleError(
-                    f"the yaw loop of {vehicle.name} with {vehicle.coefficients.name!r} "
-                    f"coefficients cannot be damped at {speed_mps:g} m/s (damping ratio "
-                    f"{damped:.2f} at best, {LEAST_HEADING_DAMPING:g} is needed): lower the speed"
-                )
+            _check_damped(vehicle, "yaw", damped, speed_mps)
             axes[axis, [RATE, PLACE, INNER]] = rate, place, rate
         axes[axis, INTEGRAL] = _integral(rate, place, omega, most_decay)
         axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
         if rate > 0.0:
             axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
     axes[YAW, FASTEST] = min(axes[YAW, FASTEST], most_turn_rad_s)
-    return Gains(plant.body, axes)
+    return Gains(plant.body, plant.fins, np.zeros(0), 0.0, axes)
+
+
+def _gains_of_fins(
+    vehicle: Vehicle,
+    speed_mps: float,
+    tick_s: float,
+    navigation_hz: float,
+    most_turn_rad_s: float,
+) -> Gains:
+    """Gains for a vehicle that fins steer; as `gains_for`."""
+    plant, count = vehicle.plant, len(vehicle.thrusters)
+    if np.any(np.abs(vehicle.configuration_matrix[[2, 4]]) > _NO_FORCE):
+        raise VehicleError(
+            f"{vehicle.name} has fins and thrusters that push it up or down, which are not "
+            "controlled together: leave out the one or the other"
+        )
+    cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    radius_m = least_radius_m(vehicle, speed_mps, STEADY_SHARE)
+    lower, upper = np.zeros(vehicle.actuators), np.zeros(vehicle.actuators)
+    thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
+    upper[count:] = plant.fins.drives[:, MOST_RAD]
+    lower[count:] = -upper[count:]
+    matrix = np.zeros((6, vehicle.actuators))
+    matrix[:, :count] = vehicle.configuration_matrix
+    write_fin_matrix(plant.fins, cruise, matrix, count)
+    rolls = np.linalg.matrix_rank(matrix[3:, count:]) == 3
+    used = _BY_FINS if rolls else _BY_FINS[:-1]
+    steers = matrix[[_DEGREE[axis] for axis in used]]
+    slowness_s = np.array([
+        *(thruster.time_constant_s for thruster in vehicle.thrusters),
+        *(fin.time_constant_s for fin in vehicle.fins),
+    ])  # fmt: skip
+    slope = linear_damping(plant.body, cruise) + fin_slope(plant.fins, cruise)
+    gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
+    slow_hz, quick_hz = navigation_hz, 1.0 / tick_s
+    axes = np.zeros((6, 11))
+    for row, axis in enumerate(used):
+        degree = _DEGREE[axis]
+        inertia = float(vehicle.mass[degree, degree])
+        least, most = authority(steers, lower, upper, row)
+        axes[axis, [MASS, LEAST, MOST]] = inertia, least, most
+        weakest = min(-least, most)
+        if weakest < _NO_FORCE:
+            name = ("surge", "", "", "yaw", "roll", "pitch")[axis]
+            raise VehicleError(
+                f"thrusters and fins of {vehicle.name} cannot control {name} both ways at "
+                f"{speed_mps:g} m/s ({least:.2g} to {most:.2g}): it cannot fly a survey"
+            )
+        lag_s = effective_lag_s(matrix[list(_DEGREE)], lower, upper, slowness_s, axis, gyradius_m)
+        lag_s += tick_s / 2
+        decay = float(slope[degree, degree]) / inertia
+        known_hz = slow_hz if axis in (SURGE, YAW) else quick_hz
+        fastest_rad_s = 2 * math.pi * known_hz / SAMPLES_PER_PERIOD
+        if axis != SURGE:
+            fastest_rad_s = min(fastest_rad_s, math.sqrt(weakest / inertia / KEPT_RAD))
+        omega, rate, place = placed(lag_s, decay, fastest_rad_s)
+        if axis in (YAW, PITCH):
+            plane = LATERAL if axis == YAW else VERTICAL
+            rate, place, damped = _damped_together(
+                plant.body, speed_mps, np.array([rate, place]), lag_s, omega, max(decay, 0.0),
+                2 * math.pi * known_hz / LEAST_SAMPLES_PER_PERIOD,
+                fins=plant.fins, plane=plane, slower=_SLOWER_BY_FINS,
+            )  # fmt: skip
+            _check_damped(vehicle, "yaw" if axis == YAW else "pitch", damped, speed_mps)
+        axes[axis, [RATE, PLACE, INNER]] = rate, place, rate
+        axes[axis, INTEGRAL] = _integral(rate, place, omega, max(decay, 0.0))
+        axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
+        if axis == PITCH:
+            held = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
+            axes[axis, FASTEST] = min(held, STEADY_SHARE * weakest / slope[degree, degree])
+        if axis == SURGE:
+            axes[axis, FASTEST] = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
+            if rate > 0.0:
+                axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
+    axes[YAW, FASTEST] = min(speed_mps / radius_m, most_turn_rad_s)
+    level = keeps(vehicle, speed_mps)
+    level_rad = 0.0 if level is None else level.pitch_rad
+    return Gains(plant.body, plant.fins, np.zeros(len(vehicle.fins)), level_rad, axes)
+
+
+def _check_damped(vehicle: Vehicle, axis: str, damped: float, speed_mps: float) -> None:
+    if damped < LEAST_HEADING_DAMPING:
+        raise VehicleError(
+            f"the {axis} loop of {vehicle.name} with {vehicle.coefficients.name!r} "
+            f"coefficients cannot be damped at {speed_mps:g} m/s (damping ratio "
+            f"{damped:.2f} at best, {LEAST_HEADING_DAMPING:g} is needed): lower the speed"
+        )
 
 
 def _holds(configuration: Array, lower: Array, upper: Array) -> bool:
@@ -218,61 +340,38 @@ def _integral(rate: float, place: float, omega: float, most_decay: float) -> flo
     return place * min(INTEGRAL_SHARE * omega, place / (rate + most_decay))
 
 
-def lateral_pair(body: Body, speed_mps: float) -> tuple[Array, Array]:
-    """Sway and yaw rate under way: (v, r)' = A (v, r) + b moment.
-
-    Args:
-        body: body of the vehicle.
-        speed_mps: surge; without drift or turning.
-
-    Returns:
-        (2, 2) and (2,)
-    """
-    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    lateral = np.ix_(_LATERAL, _LATERAL)
-    inverse = np.linalg.inv(body.mass[lateral])
-    slope = linear_damping(body, nu) + linear_coriolis(body, nu)
-    pair: Array = -inverse @ slope[lateral]
-    return pair, np.array(inverse[:, 1], np.float64)
-
-
-def heading_loop(body: Body, speed_mps: float, row: Array) -> Array:
-    """State matrix of the heading loop with the sway that it brings about.
+def heading_loop(
+    body: Body,
+    speed_mps: float,
+    row: Array,
+    fins: Fins = NO_FINS,
+    plane: tuple[int, int] = LATERAL,
+) -> Array:
+    """State matrix of the heading loop with the sway that it brings about; or of pitch and heave.
 
     States: integral of heading; heading; sway, m/s; yaw rate; yaw acceleration that the lagging
-    thrusters give.
+    thrusters or fins give.
 
     Args:
         body: body of the vehicle.
         speed_mps: surge.
-        row: row of yaw in `Gains.axes`.
+        row: row of yaw, or of pitch, in `Gains.axes`.
+        fins: of the vehicle.
+        plane: `LATERAL` or `VERTICAL`.
 
     Returns:
         (5, 5)
     """
-    pair, by_moment = lateral_pair(body, speed_mps)
+    pair, by_moment = coupled_pair(body, speed_mps, fins, plane)
     loop = np.zeros((5, 5))
     loop[0, 1] = loop[1, 3] = 1.0
     loop[2:4, 2:4] = pair
+    if plane == VERTICAL:  # the low centre of gravity
+        loop[2:4, 1] = -by_moment * body.weight_n * body.cg[2]
     loop[2:4, 4] = by_moment * row[MASS]
     loop[4, [0, 1, 3]] = -row[[INTEGRAL, PLACE, RATE]] / row[LAG]
     loop[4, 4] = -1.0 / row[LAG]
     return loop
-
-
-def damping_ratio(loop: Array) -> float:
-    """Least damping ratio of a state matrix's modes; negative if one grows."""
-    return float(_mode_damping(np.linalg.eigvals(loop)).min())
-
-
-def _mode_damping(poles: NDArray[Any]) -> Array:
-    """Damping ratio of each pole; 1 of one at rest: a sway that no water damps is its own loop's.
-
-    Args:
-        poles: complex.
-    """
-    size = np.abs(poles)
-    return np.where(size > _AT_REST_PER_S, -poles.real / np.maximum(size, _AT_REST_PER_S), 1.0)
 
 
 def _damped_together(
@@ -283,8 +382,12 @@ def _damped_together(
     omega: float,
     most_decay: float,
     sampled_rad_s: float,
+    *,
+    fins: Fins = NO_FINS,
+    plane: tuple[int, int] = LATERAL,
+    slower: tuple[float, ...] = _SLOWER,
 ) -> tuple[float, float, float]:
-    """Rate and place gains of yaw by the rule above, and the least damping ratio that they give.
+    """Rate and place gains of yaw, or pitch, by the rule above, and the least damping they give.
 
     Args:
         body: body of the vehicle.
@@ -294,9 +397,12 @@ def _damped_together(
         omega: natural frequency placed for the axis by itself.
         most_decay: greatest d / m.
         sampled_rad_s: bound on the frequency of a pair of poles.
+        fins: of the vehicle.
+        plane: `LATERAL` or `VERTICAL`.
+        slower: shares of the speed that are passed through.
     """
     row = np.zeros(11)
-    row[[MASS, LAG]] = body.mass[5, 5], lag_s
+    row[[MASS, LAG]] = body.mass[plane[1], plane[1]], lag_s
     factors = np.vstack([
         [1.0, 1.0],
         np.stack(np.meshgrid(_RATE_FACTORS, _PLACE_FACTORS), axis=-1).reshape(-1, 2),
@@ -305,8 +411,9 @@ def _damped_together(
     factors = factors[np.argsort(np.hypot(*np.log(factors).T), kind="stable")]
     damped = np.full(len(factors), math.inf)
     gains = bare * factors
-    for share in (1.0, *_SLOWER):
-        loops = np.repeat(heading_loop(body, share * speed_mps, row)[None], len(gains), axis=0)
+    for share in (1.0, *slower):
+        loop = heading_loop(body, share * speed_mps, row, fins, plane)
+        loops = np.repeat(loop[None], len(gains), axis=0)
         integral = [_integral(rate, place, omega, most_decay) for rate, place in gains]
         loops[:, 4, 0] = -np.array(integral) / lag_s
         loops[:, 4, [1, 3]] = -gains[:, ::-1] / lag_s
@@ -315,7 +422,7 @@ def _damped_together(
             loops = loops[:, [[0], [1], [3], [4]], [0, 1, 3, 4]]
         poles = np.linalg.eigvals(loops)
         size = np.abs(poles)
-        ratio = _mode_damping(poles).min(axis=1)
+        ratio = mode_damping(poles).min(axis=1)
         fast = np.any((np.abs(poles.imag) > 0.0) & (size > sampled_rad_s), axis=1)
         if share < 1.0:
             ratio += PASSING_DAMPING
@@ -323,30 +430,6 @@ def _damped_together(
     enough = np.flatnonzero(damped >= HEADING_DAMPING)
     best = int(enough[0]) if len(enough) else int(np.argmax(damped))
     return float(gains[best, 0]), float(gains[best, 1]), float(damped[best])
-
-
-def linear_damping(body: Body, nu: Array) -> Array:
-    """(6, 6) slope of damping and body lift by velocity at a velocity (6,)."""
-    slope = -(body.linear + 2.0 * body.quadratic * np.abs(nu))
-    u, v, w = nu[0], nu[1], nu[2]
-    y_uv, z_uw, m_uw, n_uv = body.lift
-    slope[1, [0, 1]] -= y_uv * np.sign(u) * v, y_uv * abs(u)
-    slope[2, [0, 2]] -= z_uw * np.sign(u) * w, z_uw * abs(u)
-    slope[4, [0, 2]] -= m_uw * w, m_uw * u
-    slope[5, [0, 1]] -= n_uv * v, n_uv * u
-    result: Array = slope
-    return result
-
-
-def linear_coriolis(body: Body, nu: Array) -> Array:
-    """(6, 6) slope of C(nu) nu by velocity at a velocity (6,).
-
-    C(a) b is bilinear, so that the slope's column j is C(e_j) nu + C(nu) e_j.
-    """
-    slope = coriolis_matrix(body.mass, nu)
-    columns = [coriolis_matrix(body.mass, unit) @ nu for unit in np.eye(6)]
-    result: Array = slope + np.array(columns).T
-    return result
 
 
 def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tuple[float, float]:
@@ -404,8 +487,9 @@ def effective_lag_s(
 
 
 def _steady_speed(body: Body, degree: int, force: float) -> float:
-    """Speed at which linear and quadratic drag of one degree of freedom take a force."""
-    linear, quadratic = -body.linear[degree, degree], -body.quadratic[degree, degree]
+    """Speed at which linear and quadratic drag of one degree of freedom take a force, both ways."""
+    linear = -body.linear[degree, degree]
+    quadratic = -min(body.quadratic[degree, degree], body.quadratic_back[degree, degree])
     if quadratic <= 0.0:
         return force / linear if linear > 0.0 else math.inf
     return float((math.sqrt(linear**2 + 4.0 * quadratic * force) - linear) / (2.0 * quadratic))

@@ -11,7 +11,8 @@ A mission's phases (memory.py): DIVE to the altitude, as near to the start as th
 stay; APPROACH to the start of a straight way in, however far the current has carried the vehicle;
 FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an ascent with a reason
 (safety.py). Close to the sea floor the vehicle slows down and climbs. Without bottom lock it stops
-and holds its depth, rising as the floor last did, until the lock is lost for too long.
+and holds its depth, rising as the floor last did, until the lock is lost for too long. A vehicle
+that fins steer goes on at the survey's speed in all of these, on a circle where it would wait.
 """
 
 import math
@@ -20,6 +21,10 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as slot
+from alice_survey.vehicle.pilot.following import (
+    follow,
+    go_to,
+)
 from alice_survey.vehicle.pilot.gains import HEAVE, LEAST, STEADY_SHARE, Gains
 from alice_survey.vehicle.pilot.memory import (
     ABORT,
@@ -52,8 +57,7 @@ from alice_survey.vehicle.pilot.standing import (
 from alice_survey.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
-    follow,
-    go_to,
+    clamped,
     head_for,
     hear_floor,
     hold_level,
@@ -62,6 +66,7 @@ from alice_survey.vehicle.pilot.steering import (
     write_point,
     write_wrench,
 )
+from alice_survey.vehicle.rotations import wrapped
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
@@ -129,9 +134,17 @@ def steer(
     elif phase == DIVE or phase == APPROACH:  # noqa: SIM109  a tuple is slower here
         _on_the_way(dt_s, estimate, path, guidance, gains, pilot)
     else:
-        sink_to(0.0, 0.0, estimate, dt_s, gains, pilot)
-        head_for(report[slot.WANTED_HEADING], 0.0, 0.0, estimate, dt_s, gains, pilot)
-        surge_at(0.0, dt_s, guidance, gains, pilot)
+        sink_to(0.0, 0.0, dt_s, estimate, path, guidance, gains, pilot)
+        turning, speed = 0.0, 0.0
+        if guidance.under_way.circle_m > 0.0:
+            speed = path.speed_mps
+            turning = guidance.under_way.side * speed / guidance.under_way.circle_m
+        heading = report[slot.WANTED_HEADING] + turning * dt_s
+        if turning != 0.0:  # no farther ahead of the vehicle than it keeps up with
+            behind = wrapped(heading - estimate[vector.HEADING])
+            heading = estimate[vector.HEADING] + clamped(behind, HEADING_KEPT_RAD)
+        head_for(heading, turning, 0.0, estimate, dt_s, gains, pilot)
+        surge_at(speed, dt_s, guidance, gains, pilot)
         report[slot.LINE], report[slot.BY_SWAY] = -1.0, 0.0
         if estimate[vector.DEPTH] < guidance.surface_m:
             report[slot.AT_SURFACE] = 1.0
@@ -167,6 +180,15 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
         limits = guidance.limits
         return float(min(limits.blind_depth_m, limits.most_depth_m - _CAUTION_M))
     return float(pilot.memory[slot.FLOOR] - path.altitude_m)
+
+
+@kernel
+def _minded_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
+    """Wanted depth of the origin, clear of the sea floor; the pace is slowed where one can."""
+    target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
+    if guidance.under_way.circle_m > 0.0:
+        pilot.memory[slot.PACE] = 1.0
+    return float(target)
 
 
 @kernel
@@ -208,8 +230,8 @@ def _on_the_way(
     """Dive or approach for a tick."""
     memory, report, point = pilot.memory, pilot.report, pilot.point
     phase = report[slot.PHASE]
-    target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
-    sink_to(target, memory[slot.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
+    target = _minded_m(estimate, path, guidance, pilot)
+    sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
     n, e, heading = _goal(path, guidance, pilot)
     distance, error = go_to(n, e, heading, dt_s, estimate, path, guidance, gains, pilot)
     dn, de = point[slot.POINT_NORTH] - n, point[slot.POINT_EAST] - e
@@ -224,7 +246,8 @@ def _on_the_way(
             and abs(point[slot.SINK_SPEED]) < _DEPTH_SPEED_KEPT_MPS
         )
     else:
-        heads = guidance.sway == 0.0 or abs(error) < HEADING_KEPT_RAD
+        hovers = guidance.under_way.circle_m == 0.0
+        heads = (hovers and guidance.sway == 0.0) or abs(error) < HEADING_KEPT_RAD
         settled = distance < guidance.capture_m and heads
         swings = _is_near_on_the_mean(dn, de, dt_s, guidance.capture_m, pilot) and heads
     memory[slot.SETTLED_S] = memory[slot.SETTLED_S] + dt_s if settled else 0.0
@@ -281,8 +304,8 @@ def _on_path(
         if must_brake(path, guidance, gains, pilot, leg, along):
             speed = max(point[slot.SURGE_SPEED], 0.0)
             brake(speed, along, estimate[vector.HEADING], gains, pilot)
-    target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
-    sink_to(target, memory[slot.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
+    target = _minded_m(estimate, path, guidance, pilot)
+    sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
     if memory[slot.STANDING] == 0.0:
         follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
     elif stand(leg, dt_s, estimate, path, guidance, gains, pilot):

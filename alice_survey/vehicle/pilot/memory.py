@@ -27,28 +27,32 @@ DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
     SETTLED_S, BEST, SINCE_BEST_S, RETURNS, LOST_S, LOW_S, PITCHED_S,
     UNSAFE_S, PACE, STANDING, REF, REF_SPEED, WAITED_S,
     PLACE_SUM_N, PLACE_SUM_E, RAMP, RAMP_SPEED, ROLL_SUM, PITCH_SUM,
-    MEAN_N, MEAN_E, NEAR_S,
-) = range(30)  # fmt: skip
+    MEAN_N, MEAN_E, NEAR_S, LEAN_N, LEAN_E,
+) = range(32)  # fmt: skip
 """Places in the memory: the depth, m, that the origin's depth and the altitude add up to, smoothed,
 its slope, m/s, and whether there is one; integrals of the inner loops as speeds, that of sway as a
-vector in NED; the time that depth, or place and heading, are kept; the watchdog's best value and
-its age; returns to the path; how long bottom lock is lost, the altitude too low, the pitch too
-large, s; how long the clearance is less than half of what is allowed, s; the share of the wanted
-surge that the sea floor leaves; 1 while the vehicle follows a place that moves along the leg or a
-heading that turns on the spot (standing.py), how far these have got, m or rad, and how fast; how
-long it waits at the leg's end, s; the integral, as a speed, of keeping that place by surge, a
-vector in NED; the place or heading, and its speed, that thrusters without lag would be at; the
-integrals of roll and pitch, as accelerations; how far the followed point is from its goal on the
-mean of some time, m, and how long that is little, s."""
-MEMORY = 30
+vector in NED, that of heave as an angle where the vehicle dives by its pitch; the time that depth,
+or place and heading, are kept; the watchdog's best value and its age; returns to the path; how long
+bottom lock is lost, the altitude too low, the pitch too large, s; how long the clearance is less
+than half of what is allowed, s; the share of the wanted surge that the sea floor leaves; 1 while
+the vehicle follows a place that moves along the leg or a heading that turns on the spot
+(standing.py), how far these have got, m or rad, and how fast; how long it waits at the leg's end,
+s; the integral, as a speed, of keeping that place by surge, a vector in NED; the place or heading,
+and its speed, that thrusters without lag would be at; the integrals of roll and pitch, as
+accelerations; how far the followed point is from its goal on the mean of some time, m, and how long
+that is little, s; the integral of the cross-track error of a vehicle that fins steer, as an angle,
+a vector in NED."""
+MEMORY = 32
 
 (
     REF_SURGE, REF_SWAY, REF_HEAVE, REF_YAW, ACC_SURGE, ACC_SWAY, ACC_HEAVE, ACC_YAW,
     FULL_SURGE, FULL_SWAY, FULL_HEAVE, FULL_YAW,
-) = range(12)  # fmt: skip
+    REF_PITCH, REF_PITCH_RATE,
+) = range(14)  # fmt: skip
 """Places in the demand on the inner loops: body velocity that feed-forward is for, m/s and rad/s;
-wanted acceleration; and +1 or -1 where the last wrench was cut at the greatest or least."""
-DEMAND = 12
+wanted acceleration; +1 or -1 where the last wrench was cut at the greatest or least; and wanted
+pitch, rad, with its rate, rad/s, which are 0 but for a vehicle that dives by its pitch."""
+DEMAND = 14
 
 
 (POINT_NORTH, POINT_EAST, SURGE_SPEED, SWAY_SPEED, SINK_SPEED, TURN_SPEED) = range(6)

@@ -1,6 +1,7 @@
 """Settings of the guidance, and their derivation from the vehicle and the path."""
 
 import math
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
+from alice_survey.vehicle.pilot.diving import HOVERS, UnderWay, dive_loop
 from alice_survey.vehicle.pilot.gains import (
     BANDWIDTH,
     FASTEST,
@@ -16,6 +18,7 @@ from alice_survey.vehicle.pilot.gains import (
     LEAST,
     MASS,
     MOST,
+    PITCH,
     PLACE,
     RATE,
     STEADY_SHARE,
@@ -23,8 +26,10 @@ from alice_survey.vehicle.pilot.gains import (
     SWAY,
     YAW,
     Gains,
+)
+from alice_survey.vehicle.pilot.linear import (
+    coupled_pair,
     damping_ratio,
-    lateral_pair,
 )
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import SafetyLimits
@@ -40,6 +45,8 @@ _STRAIGHT_PER_M = 1e-9
 _TERRAIN_SMOOTHING_M = 1.5
 """Relief shorter than this is not followed."""
 _LOOK_AHEADS_M = np.geomspace(CONTROL_LENGTH_M, 100.0, 400)
+_DEPTH_OFF_M = 0.2
+"""Offset in depth for which fins do not have to be at their limits."""
 _RAMP_PERIODS = 2.0
 """A reference gains its speed in this many times 1 / bandwidth of the loop that follows it: a
 critically damped pair has then done most of what it does (inferred)."""
@@ -86,6 +93,8 @@ class Guidance(NamedTuple):
     step_mps2: float
     """Acceleration of that step."""
     limits: SafetyLimits
+    under_way: UnderWay = HOVERS
+    """How a vehicle that cannot hover flies."""
 
 
 def pilot_guidance(
@@ -133,6 +142,8 @@ def pilot_guidance(
         )
     if look_ahead_m is None:
         look_ahead_m = shortest_look_ahead_m(gains, speed, point_body_m[0])
+    if gains.dives_by_pitch:
+        look_ahead_m = max(look_ahead_m, _gentle_m(gains, YAW, speed, 0.5 * CONTROL_LENGTH_M))
     if math.isnan(look_ahead_m) and not by_sway:
         raise VehicleError(
             f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
@@ -140,6 +151,9 @@ def pilot_guidance(
         )
     weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
     tightest = float(np.abs(path.curvature_per_m).max())
+    under_way = HOVERS
+    if gains.dives_by_pitch:
+        under_way = _under_way(gains, path, tightest)
     turning = turning_speed_mps(gains, tightest, abs(point_body_m[0]) if by_sway else 0.0)
     spot_rad_s, step_mps = stop_speeds(gains, point_body_m[0], by_sway, spot_rad_s)
     return Guidance(
@@ -161,6 +175,47 @@ def pilot_guidance(
         step_mps=step_mps,
         step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
         limits=limits or SafetyLimits(0.5 * path.altitude_m, most_depth_m),
+        under_way=under_way,
+    )
+
+
+def _gentle_m(gains: Gains, axis: int, speed_mps: float, off_m: float) -> float:
+    """The look-ahead with which an offset asks for no tighter a turn than fins hold.
+
+    A path that closes as exp(-x / look-ahead) has a curvature of off / look-ahead^2.
+    """
+    return math.sqrt(off_m * speed_mps / float(gains.axes[axis, FASTEST]))
+
+
+def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
+    """How a vehicle that fins steer flies a path; it waits on a circle as wide as the path's turns.
+
+    Raises:
+        VehicleError: it cannot.
+    """
+    speed, fastest = path.speed_mps, float(gains.axes[YAW, FASTEST])
+    if np.any(path.stop > 0.0):
+        raise VehicleError(
+            "the route has turns on the spot or sway steps, and a vehicle that fins steer cannot "
+            "stop: plan it with turns = 'arcs', and with the room for them (area.turn_margin_m)"
+        )
+    if tightest_per_m * speed > fastest:
+        raise VehicleError(
+            f"the route has turns of {1 / tightest_per_m:.2f} m radius, and the fins hold "
+            f"{speed / fastest:.2f} m at {speed:g} m/s: raise plan.turn_radius_m"
+        )
+    look_ahead_m = _shortest_m(lambda ahead_m: damping_ratio(dive_loop(gains, speed, ahead_m)))
+    if math.isnan(look_ahead_m):
+        raise VehicleError(
+            f"no look-ahead up to {_LOOK_AHEADS_M[-1]:g} m keeps the vehicle from weaving about "
+            f"its depth at {speed:g} m/s: change the speed, or check fins and coefficients"
+        )
+    radius_m = 1.0 / tightest_per_m if tightest_per_m > _STRAIGHT_PER_M else 2.0 * speed / fastest
+    return UnderWay(
+        circle_m=radius_m,
+        side=1.0,
+        dive_ahead_m=max(look_ahead_m, _gentle_m(gains, PITCH, speed, _DEPTH_OFF_M)),
+        level_rad=gains.level_rad,
     )
 
 
@@ -230,7 +285,7 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     Returns:
         (5, 5)
     """
-    pair, by_moment = lateral_pair(gains.body, speed_mps)
+    pair, by_moment = coupled_pair(gains.body, speed_mps, gains.fins)
     row = gains.axes[YAW]
     loop = np.zeros((5, 5))
     loop[0, 1:4] = speed_mps, 1.0, lever_m
@@ -266,9 +321,12 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
     Returns:
         NaN where no look-ahead up to 100 m gives that damping.
     """
-    ratios = np.array([
-        damping_ratio(los_loop(gains, speed_mps, lever_m, float(each))) for each in _LOOK_AHEADS_M
-    ])  # fmt: skip
+    return _shortest_m(lambda ahead_m: damping_ratio(los_loop(gains, speed_mps, lever_m, ahead_m)))
+
+
+def _shortest_m(damping: Callable[[float], float]) -> float:
+    """The shortest look-ahead with LOS_DAMPING_RATIO; NaN where there is none."""
+    ratios = np.array([damping(float(each)) for each in _LOOK_AHEADS_M])
     if not np.any(ratios >= LOS_DAMPING_RATIO):
         return math.nan
     first = int(np.argmax(ratios >= LOS_DAMPING_RATIO))
@@ -277,6 +335,5 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
     low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
     while high - low > 1e-3:
         middle = 0.5 * (low + high)
-        enough = damping_ratio(los_loop(gains, speed_mps, lever_m, middle)) >= LOS_DAMPING_RATIO
-        low, high = (low, middle) if enough else (middle, high)
+        low, high = (low, middle) if damping(middle) >= LOS_DAMPING_RATIO else (middle, high)
     return high

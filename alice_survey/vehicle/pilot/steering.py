@@ -18,13 +18,15 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
+from alice_survey.vehicle.fins import add_fins
 from alice_survey.vehicle.pilot import memory as slot
+from alice_survey.vehicle.pilot.diving import fly_to_depth
 from alice_survey.vehicle.pilot.gains import (
-    BANDWIDTH,
     FASTEST,
     HEAVE,
     INNER,
     INTEGRAL,
+    KEPT_RAD,
     LEAST,
     MASS,
     MOST,
@@ -40,9 +42,9 @@ from alice_survey.vehicle.pilot.gains import (
     Gains,
 )
 from alice_survey.vehicle.pilot.memory import PilotState
-from alice_survey.vehicle.pilot.path import LEAST_SLANT, Path, heading_at, place_at
+from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import restart_watch
-from alice_survey.vehicle.pilot.settings import Guidance, turning_speed_mps
+from alice_survey.vehicle.pilot.settings import Guidance
 from alice_survey.vehicle.rotations import wrapped
 
 
@@ -146,6 +148,7 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
         motion[axis if axis < 3 else 5] = demand[slot.REF_SURGE + axis]
     add_damping(body, motion, force)
     add_coriolis(body, motion, force)
+    add_fins(gains.fins, gains.straight, motion, force)
     for axis in range(4):
         i = axis if axis < 3 else 5
         asked = -force[i]
@@ -162,7 +165,9 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
 def hold_level(
     estimate: Array, dt_s: float, gains: Gains, pilot: PilotState, wrench: Array
 ) -> None:
-    """Add the moments that hold roll and pitch level, where thrusters can: PID and computed torque.
+    """Add the moments that hold roll level and pitch as wanted, where thrusters or fins can.
+
+    PID and computed torque.
 
     The computed part is what the wanted motion and the centre of gravity do at level attitude,
     which is why `write_wrench` comes first. What gravity rights by itself comes on top.
@@ -175,6 +180,9 @@ def hold_level(
         i = 3 if axis == ROLL else 4
         angle = estimate[vector.ROLL] if axis == ROLL else estimate[vector.PITCH]
         rate = estimate[vector.P] if axis == ROLL else estimate[vector.Q]
+        if axis == PITCH:
+            angle -= pilot.demand[slot.REF_PITCH]
+            rate -= pilot.demand[slot.REF_PITCH_RATE]
         place = slot.ROLL_SUM if axis == ROLL else slot.PITCH_SUM
         total = pilot.memory[place]
         asked = -row[MASS] * (row[PLACE] * angle + row[RATE] * rate + total) - pilot.force[i]
@@ -189,7 +197,7 @@ def hold_level(
 
 
 DEPTH_KEPT_M = 0.2
-HEADING_KEPT_RAD = math.radians(10.0)
+HEADING_KEPT_RAD = KEPT_RAD
 """Tolerances within which a depth or heading counts as kept."""
 _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
@@ -201,10 +209,6 @@ ledge is not to be dived from at once."""
 _RISE_ON_S = 5.0
 """Without bottom lock the floor is assumed to rise for this long at full speed: about as long as
 the vehicle goes on until it is at rest (inferred)."""
-_HOVER_M = 2.0
-"""Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
-_HOVER_SHARE = 0.25
-"""Bandwidth of keeping place by surge, over that of the surge loop."""
 
 
 @kernel
@@ -255,9 +259,19 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
 
 @kernel
 def sink_to(
-    depth_m: float, feed_mps: float, estimate: Array, dt_s: float, gains: Gains, pilot: PilotState
+    depth_m: float,
+    feed_mps: float,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
 ) -> None:
-    """Command the heave that takes the origin to a depth, which itself moves at a speed."""
+    """Command the heave, or the pitch, that takes the origin to a depth, which moves at a speed."""
+    if guidance.under_way.circle_m > 0.0:
+        fly_to_depth(depth_m, feed_mps, path.speed_mps, estimate, dt_s, guidance.under_way, pilot)
+        return
     memory, demand = pilot.memory, pilot.demand
     error, most = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
     demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
@@ -367,136 +381,3 @@ def sway_by(
         bound = sum_bound(gains, SWAY)
         cut = min(1.0, bound / max(math.hypot(north, east), 1e-9))
         memory[slot.SWAY_SUM_N], memory[slot.SWAY_SUM_E] = cut * north, cut * east
-
-
-@kernel
-def go_to(
-    goal_n: float,
-    goal_e: float,
-    heading: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> tuple[float, float]:
-    """Go to a place and stay there, with a heading if the vehicle can sway.
-
-    A vehicle without sway faces its goal and waits until the current has carried it off again.
-
-    Returns:
-        Distance from the goal, and the error of the wanted heading.
-    """
-    now = estimate[vector.HEADING]
-    dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
-    distance = math.hypot(dn, de)
-    ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
-    speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
-    hover = guidance.sway > 0.0 and distance < _HOVER_M
-    if hover:
-        error = head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    elif distance > guidance.capture_m:
-        error = head_for(math.atan2(de, dn), 0.0, 0.0, estimate, dt_s, gains, pilot)
-        speed = path.speed_mps * max(math.cos(error), 0.0)
-    else:
-        facing = pilot.report[slot.WANTED_HEADING]
-        if not math.isfinite(facing):
-            facing = heading
-        error = head_for(facing, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    surge_at(speed, dt_s, guidance, gains, pilot)
-    if hover:
-        sway_by(-abeam, 0.0, estimate, dt_s, guidance, gains, pilot)
-    pilot.report[slot.BY_SWAY] = 1.0 if hover else 0.0
-    return distance, error
-
-
-@kernel
-def follow(
-    leg: int,
-    along: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
-    """Follow the path from where the progress is."""
-    report, point, now = pilot.report, pilot.point, estimate[vector.HEADING]
-    north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
-    n, e, beta, _ = place_at(path, leg, along)
-    cross = (east - e) * math.cos(beta) - (north - n) * math.sin(beta)
-    # A turn begins before its arc and ends after it: the path's heading averaged over a window.
-    window = guidance.smooth_m
-    back, k_back = heading_at(path, leg, along - window)
-    front, k_front = heading_at(path, leg, along + window)
-    curvature = (front - back) / (2.0 * window)
-    smooth = _mean_heading(path, leg, along, window)
-    speed = _wanted_speed(path, guidance, gains, leg, along, curvature)
-    course = now - beta
-    sine, cosine = math.sin(course), math.cos(course)
-    surge, sway = point[slot.SURGE_SPEED], point[slot.SWAY_SPEED]
-    slant = max(1.0 - curvature * cross, LEAST_SLANT)
-    pace = min(max(surge * cosine - sway * sine, 0.0), 2.0 * speed) / slant
-    feed = curvature * pace
-    quicken = (k_front - k_back) / (2.0 * window) * pace * pace
-
-    by_sway = report[slot.BY_SWAY] > 0.0
-    if by_sway and abs(cross) > guidance.far_m:
-        by_sway = False
-    elif not by_sway and guidance.sway > 0.0 and abs(cross) < guidance.near_m:
-        by_sway = True
-    if by_sway:
-        head_for(smooth, feed, quicken, estimate, dt_s, gains, pilot)
-        surge_at(speed * max(cosine, 0.0), dt_s, guidance, gains, pilot)
-        # The cross-track error as the sway sees it (paper, eq. los_sway_e).
-        sway_by(cross * cosine, -speed * sine, estimate, dt_s, guidance, gains, pilot)
-    else:
-        ahead = guidance.look_ahead_m
-        aim_n, aim_e = n + ahead * math.cos(beta), e + ahead * math.sin(beta)
-        heading = math.atan2(aim_e - east, aim_n - north)
-        # The aim turns as the offset changes: what its heading does is known, not awaited.
-        drift = surge * sine + sway * cosine
-        feed -= ahead * drift / (ahead * ahead + cross * cross)
-        error = head_for(heading + (smooth - beta), feed, quicken, estimate, dt_s, gains, pilot)
-        surge_at(speed * max(math.cos(error), 0.0), dt_s, guidance, gains, pilot)
-        if guidance.sway > 0.0:
-            # Lateral thrusters keep the vehicle from slipping sideways, so that it goes where it
-            # heads: else a current could hold it off the path indefinitely.
-            sway_by(0.0, 0.0, estimate, dt_s, guidance, gains, pilot)
-    report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
-    report[slot.CROSS], report[slot.PATH_HEADING] = cross, beta
-    report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, along, path.line[leg]
-
-
-@kernel
-def _mean_heading(path: Path, leg: int, along_m: float, window_m: float) -> float:
-    """Heading of the path averaged over a window: Simpson's rule on its halves."""
-    a, _ = heading_at(path, leg, along_m - window_m)
-    b, _ = heading_at(path, leg, along_m - 0.5 * window_m)
-    c, _ = heading_at(path, leg, along_m)
-    d, _ = heading_at(path, leg, along_m + 0.5 * window_m)
-    e, _ = heading_at(path, leg, along_m + window_m)
-    return (a + 4.0 * b + 2.0 * c + 4.0 * d + e) / 12.0
-
-
-@kernel
-def _wanted_speed(
-    path: Path, guidance: Guidance, gains: Gains, leg: int, along_m: float, curvature: float
-) -> float:
-    """The speed now, low enough to brake before the turns ahead."""
-    lever = abs(guidance.point_body_m[0]) if guidance.sway > 0.0 else 0.0
-    speed = min(path.speed_mps, turning_speed_mps(gains, abs(curvature), lever))
-    distance = path.length_m[leg] - along_m - guidance.smooth_m
-    reach = path.speed_mps * path.speed_mps / (2.0 * guidance.brake_mps2)
-    following = leg + 1
-    while (
-        following < path.length_m.shape[0] and distance < reach and path.stop[following - 1] == 0.0
-    ):
-        there = turning_speed_mps(gains, abs(path.curvature_per_m[following]), lever)
-        braking = 2.0 * guidance.brake_mps2 * max(distance, 0.0)
-        speed = min(speed, math.sqrt(there * there + braking))
-        distance += path.length_m[following]
-        following += 1
-    return speed

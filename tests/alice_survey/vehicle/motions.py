@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import attitude_from_rotation, rotation_from_attitude
-from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.dynamics import Body, derivative, initial_state, rk4_step, scratch_for
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.sea import Current, constant_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
@@ -37,7 +37,7 @@ _PLAIN = (
 @cache
 def alice(coefficients: str = "calibrated") -> Vehicle:
     """ALICE trimmed neutral, propellers in open water: nothing that hull or flow take from them."""
-    full = fleet.vehicle("alice", coefficients)
+    full = vehicle_from("alice", coefficients)
     plain = tuple(
         Thruster(**{field: getattr(thruster, field) for field in _PLAIN})
         for thruster in full.thrusters
@@ -74,7 +74,8 @@ def damping_matrix(body: Body, nu: Array) -> Array:
     lift = np.zeros((6, 6))
     lift[1, 1], lift[2, 2] = body.lift[0] * abs(u), body.lift[1] * abs(u)
     lift[4, 2], lift[5, 1] = body.lift[2] * u, body.lift[3] * u
-    matrix: Array = -(body.linear + body.quadratic * np.abs(nu) + lift)
+    quadratic = np.where(nu > 0.0, body.quadratic, body.quadratic_back)
+    matrix: Array = -(body.linear + quadratic * np.abs(nu) + lift)
     return matrix
 
 
@@ -85,9 +86,7 @@ def state_of(
     position_ned: tuple[float, float, float] = (0.0, 0.0, 5.0),
     rps: Array | None = None,
 ) -> Array:
-    state = initial_state(
-        np.array(position_ned), np.array(attitude_rad), len(vehicle.thrusters), nu
-    )
+    state = initial_state(np.array(position_ned), np.array(attitude_rad), vehicle.actuators, nu)
     if rps is not None:
         state[13:] = rps
     return state
@@ -102,7 +101,7 @@ def rates(
     command_rps: Array | None = None,
 ) -> Array:
     """Rate of change of a state."""
-    count = len(vehicle.thrusters)
+    count = vehicle.actuators
     out = np.full_like(state, np.nan)
     derivative(
         time_s,
@@ -128,7 +127,7 @@ def advance(
     command_rps: Array | None = None,
 ) -> Array:
     """States after each step, (steps + 1, 13 + n), the first included."""
-    count = len(vehicle.thrusters)
+    count = vehicle.actuators
     plant, scratch = vehicle.plant, scratch_for(count)
     command = np.zeros(count) if command_rps is None else command_rps
     load = np.zeros(6) if load is None else load

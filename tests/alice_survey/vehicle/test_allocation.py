@@ -10,13 +10,13 @@ from alice_survey.vehicle.allocation import (
     allocation_scratch,
     preference_weights,
 )
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import add_thrust, speeds_for, thrust_limits
 from alice_survey.vehicle.vehicle import Vehicle
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
-ALICE, SPARUS = vehicle("alice"), vehicle("sparus2")
+ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 REST = np.zeros(6)
 REACH = np.array([120.0, 80.0, 60.0, 0.0, 0.0, 60.0])
 """Wrenches some way beyond what the thrusters can give together."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.files import SETS
 from tests.alice_survey.vehicle.motions import alice
 
 
@@ -63,7 +63,7 @@ def test_replacing_an_added_mass_drops_its_mirror() -> None:
     assert before.added_mass[1, 5] == 8.5  # the old set is as it was
 
 
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_signs_of_the_papers_sets(coefficients: str) -> None:
     """Diagonals resist; the nose and the stern are alike in sway and heave but for the mast."""
     kinds = alice(coefficients).coefficients
@@ -75,3 +75,20 @@ def test_signs_of_the_papers_sets(coefficients: str) -> None:
     assert m_uw == -n_uv < 0  # both turn the bow into the drift
     # Mirror image of yaw-sway in pitch-heave: M_wdot has the other sign than N_vdot.
     assert kinds.added_mass[4, 2] < 0 < kinds.added_mass[5, 1]
+
+
+def test_damping_may_differ_by_the_way_of_the_motion() -> None:
+    """A value of one way counts instead of that of both; a new one of both drops those of one."""
+    kinds = Coefficients(
+        name="test", values={"Z_ww": -200.0, "Z_ww_neg": -260.0, "X_uu_pos": -5.0, "Y_vv": -9.0}
+    )
+    assert (kinds.quadratic[2, 2], kinds.quadratic_back[2, 2]) == (-200.0, -260.0)
+    assert (kinds.quadratic[0, 0], kinds.quadratic_back[0, 0]) == (-5.0, 0.0)
+    assert kinds.quadratic[1, 1] == kinds.quadratic_back[1, 1] == -9.0
+    assert (kinds.value("Z_ww_pos"), kinds.value("Z_ww_neg")) == (-200.0, -260.0)
+    both = kinds.replaced("both", {"Z_ww": -100.0})
+    assert both.quadratic[2, 2] == both.quadratic_back[2, 2] == -100.0
+    one = kinds.replaced("one", {"Z_ww_pos": -100.0})
+    assert (one.quadratic[2, 2], one.quadratic_back[2, 2]) == (-100.0, -260.0)
+    with pytest.raises(VehicleError, match="Z_w_neg"):
+        Coefficients(name="test", values={"Z_w_neg": -1.0})

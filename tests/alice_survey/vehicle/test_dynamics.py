@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import fleet
 from alice_survey.vehicle.dynamics import (
     GRAVITY,
     STATE,
@@ -19,6 +18,7 @@ from alice_survey.vehicle.dynamics import (
     coriolis_matrix,
     initial_state,
 )
+from alice_survey.vehicle.files import SETS
 from alice_survey.vehicle.vehicle import Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.vehicle.motions import (
@@ -50,7 +50,7 @@ ATTITUDES = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-3.1
 
 @settings(deadline=None)
 @given(nu=VELOCITIES)
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_both_coriolis_matrices_are_skew_and_do_no_work(coefficients: str, nu: Array) -> None:
     vehicle = alice(coefficients)
     for mass in (vehicle.rigid_body.mass_matrix, vehicle.coefficients.added_mass):
@@ -81,7 +81,7 @@ def test_coriolis_kernel_and_matrices_match_the_textbook(nu: Array) -> None:
 
 @settings(deadline=None)
 @given(nu=VELOCITIES)
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_damping_kernel_and_matrix_match_the_sum_by_names(coefficients: str, nu: Array) -> None:
     vehicle = alice(coefficients)
     force = np.zeros(6)
@@ -91,7 +91,7 @@ def test_damping_kernel_and_matrix_match_the_sum_by_names(coefficients: str, nu:
     np.testing.assert_allclose(-damping_matrix(vehicle.plant.body, nu) @ nu, by_names, atol=1e-10)
 
 
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_damping_takes_power_at_any_velocity(coefficients: str) -> None:
     """The least of 20,000 draws, over what the diagonal alone takes; a search for it finds
     0.87, 0.77 and 0.89 of the diagonal's for the paper's three sets and 0.67 for the computed one
@@ -109,7 +109,7 @@ def test_damping_takes_power_at_any_velocity(coefficients: str) -> None:
 
 @settings(deadline=None)
 @given(nu=VELOCITIES, attitude=ATTITUDES)
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_energy_falls_by_what_damping_takes(
     coefficients: str, nu: Array, attitude: tuple[float, float, float]
 ) -> None:
@@ -129,7 +129,7 @@ def test_energy_falls_by_what_damping_takes(
 
 @settings(max_examples=25, deadline=None)
 @given(nu=VELOCITIES, attitude=ATTITUDES, net_kg=st.sampled_from([-1.0, 0.0, 1.0]))
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 def test_no_motion_gains_energy(
     coefficients: str, nu: Array, attitude: tuple[float, float, float], net_kg: float
 ) -> None:
@@ -303,7 +303,7 @@ def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
 
 def test_drag_of_the_mast_leans_the_vehicle_over() -> None:
     """The mast is above the origin: in a sway to starboard its drag pushes the top to port."""
-    for coefficients in fleet.SETS:
+    for coefficients in SETS:
         vehicle = alice(coefficients)
         force = np.zeros(6)
         add_damping(vehicle.plant.body, np.array([0, 0.5, 0, 0, 0, 0]), force)

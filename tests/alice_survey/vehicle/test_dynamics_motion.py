@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import fleet
+from alice_survey.vehicle.files import SETS, vehicle_from
 from alice_survey.vehicle.sea import Current, constant_current, sheared_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 from tests import oracles_dynamics as oracle
@@ -47,7 +47,7 @@ def test_from_rest_the_speed_follows_a_hyperbolic_tangent(axis: int, newtons: fl
     assert states[-1, 7 + axis] == pytest.approx(terminal, rel=0.05)
 
 
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 @pytest.mark.parametrize(("axis", "newtons"), [(0, 0.6), (0, -8.0), (1, 4.0), (2, 5.0), (2, -5.0)])
 def test_terminal_speed_of_the_whole_vehicle(axis: int, newtons: float, coefficients: str) -> None:
     """At u = sqrt(X / |X_uu|) nothing changes any more: the low centre of gravity holds against
@@ -73,6 +73,24 @@ def test_terminal_speed_of_the_whole_vehicle(axis: int, newtons: float, coeffici
         np.testing.assert_allclose(np.delete(end[7:13], axis), 0.0, atol=0.02)
 
 
+def test_it_rises_slower_than_it_sinks_where_drag_differs() -> None:
+    """At 1.277 times the drag upwards the terminal speed is 13 % less, as of the paper's ALICE."""
+    vehicle = block({"Z_ww_pos": -200.0, "Z_ww_neg": -1.277 * 200.0, "Y_vv": -300.0})
+    ends = [
+        advance(vehicle, state_of(vehicle), 60.0, 0.02, newtons * W)[-1, 9]
+        for newtons in (5.0, -5.0)
+    ]
+    assert ends[0] == pytest.approx(math.sqrt(5.0 / 200.0), rel=1e-6)
+    assert ends[0] / -ends[1] == pytest.approx(1.13, abs=1e-3)
+    turning = state_of(vehicle, np.array([0.3, -0.2, -0.4, 0.1, 0.2, -0.3]), (0.1, 0.2, 0.3))
+    eta = np.concatenate([turning[:3], (0.1, 0.2, 0.3)])
+    _, expected, _ = oracle.derivative(
+        0.0, eta, turning[7:13], np.zeros(0), np.zeros(0), np.zeros(6), vehicle,
+        constant_current(0.0, 0.0),
+    )  # fmt: skip
+    np.testing.assert_allclose(rates(vehicle, turning)[7:13], expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("coefficients", "holds"), [("estimated", False), ("cfd", False), ("calibrated", True)]
 )
@@ -80,7 +98,7 @@ def test_a_disturbed_course_follows_the_linear_equations(coefficients: str, hold
     """Ahead at 1 m/s, v and r alone, by hand: the Munk moment (m_x - m_y) u v drives the bow away,
     so that the bare hull does not hold its course. The calibrated set does, only since its X_udot
     exceeds its Y_vdot."""
-    named = fleet.vehicle("alice", coefficients).coefficients.values
+    named = vehicle_from("alice", coefficients).coefficients.values
     kept = ("X_udot", "Y_vdot", "Y_rdot", "N_rdot", "Y_uv", "N_uv")
     vehicle = block({name: named[name] for name in kept}, entrained_kg=20.0)
     m_x, m_y = 70.0 - named["X_udot"], 70.0 - named["Y_vdot"]
@@ -114,7 +132,7 @@ def test_coasting_down_follows_the_hyperbola(axis: int, name: str) -> None:
         np.testing.assert_allclose(states[:, axis] - states[0, axis], run, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("coefficients", SETS)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str) -> None:
     """Omega^2 = W BG (M^-1)_ii: with M^-1, as the body is free to sway and surge meanwhile."""
@@ -146,7 +164,7 @@ def test_a_uniform_current_carries_the_motion_along(
     speed: float, towards_deg: float, attitude: tuple[float, float, float], surge: float
 ) -> None:
     """Galilean invariance: the same motion in the water, the current's way added to the track."""
-    vehicle = fleet.vehicle("alice")
+    vehicle = vehicle_from("alice")
     state = state_of(vehicle, np.array([surge, 0.1, -0.1, 0.2, 0.1, -0.3]), attitude)
     commands = np.array([30.0, -20.0, 15.0, 25.0, -30.0])
     still = advance(vehicle, state, 5.0, command_rps=commands)[-1]
@@ -253,7 +271,7 @@ def thrust_of_all_laws(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
     ("vehicle", "thrust", "seconds", "at_10_ms", "at_5_ms"),
     [
         (alice(), oracle.plain_thrust, 60, 5e-6, 1e-6),
-        (fleet.vehicle("alice"), thrust_of_all_laws, 16, 2e-5, 5e-6),
+        (vehicle_from("alice"), thrust_of_all_laws, 16, 2e-5, 5e-6),
     ],
     ids=["open-water", "all-laws"],
 )
@@ -303,7 +321,7 @@ def test_runge_kutta_agrees_with_an_adaptive_method(
 
 def test_the_step_is_of_fourth_order() -> None:
     """Halving the step divides the error by 16, on a motion in which nothing changes sign."""
-    vehicle = fleet.vehicle("alice")
+    vehicle = vehicle_from("alice")
     state = state_of(vehicle, np.array([0.6, 0.2, 0.15, 0.1, 0.1, 0.3]), (0.3, 0.2, 0.5))
     state[13:] = 20.0
     load = np.array([4.0, 9.0, 9.0, 1.5, 4.0, 9.0])
@@ -319,7 +337,7 @@ def test_the_step_is_of_fourth_order() -> None:
 
 
 def test_attitude_stays_a_rotation() -> None:
-    vehicle = fleet.vehicle("alice")
+    vehicle = vehicle_from("alice")
     spinning = state_of(vehicle, np.array([0.5, 0.2, 0.1, 4.0, -3.0, 5.0]), (1.0, 1.5, 2.0))
     states = advance(vehicle, spinning, 20.0, 0.01)
     np.testing.assert_allclose(np.linalg.norm(states[:, 3:7], axis=1), 1.0, atol=1e-14)

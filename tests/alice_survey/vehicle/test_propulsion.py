@@ -9,19 +9,15 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import propulsion as kernels
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import Thruster, pack, weakened
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
 DENSITY, DISPLACED = 1025.0, 75.0
-ALICE = vehicle("alice")
+ALICE = vehicle_from("alice")
 STARBOARD, PORT, VERTICAL, BOW, STERN = ALICE.thrusters
-EVERY = tuple(
-    # Arms that no source gives, so that their law is still tested.
-    replace(t, jet_centre_m=0.3) if t.kind == "tunnel" else t
-    for t in ALICE.thrusters
-)
+EVERY = ALICE.thrusters
 PACKED = pack(EVERY, DENSITY, DISPLACED)
 REST = np.zeros(6)
 
@@ -120,16 +116,6 @@ def test_the_jet_loss_is_c_at_the_jets_own_speed() -> None:
             whole * math.exp(-BOW.jet_loss), rel=1e-12
         )
     assert thrust_of(BOW, 20.0, np.array([1e-9, 0, 0, 0, 0, 0])) == pytest.approx(whole, rel=1e-12)
-
-
-def test_the_bent_jets_suction_acts_downstream() -> None:
-    """The thrust keeps its arm, what is lost of it pulls back a way further aft."""
-    ahead = np.array([0.5, 0, 0, 0, 0, 0])
-    bow = replace(BOW, jet_centre_m=0.2)
-    lost = thrust_of(BOW, 15.0) - thrust_of(BOW, 15.0, ahead)
-    moment, arm = wrench_of((bow,), [15.0], ahead)[5], BOW.position_body_m[0]
-    assert lost > 0.1
-    assert moment == pytest.approx(thrust_of(BOW, 15.0) * arm - lost * (arm - 0.2), rel=1e-12)
 
 
 def drag_of(n: float, u: float) -> float:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.dynamics import STATE, rk4_step, scratch_for
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.navigation.sensors import SensorSuite
 from alice_survey.vehicle.pilot.gains import gains_for
@@ -25,7 +25,7 @@ GUSTS = Disturbance(sigma=(3.0, 3.0, 3.0, 0.0, 0.0, 0.0))
 
 def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
     """A line of 6 m, 2 m above a floor at 5 m."""
-    craft = vehicle("alice")
+    craft = vehicle_from("alice")
     path = path_from_legs([(0.0, 0.0)], [0.3], [6.0], [0.0], [0], 2.0, 0.2)
     gains = gains_for(craft, 0.2)
     return Setup(
@@ -81,7 +81,7 @@ def test_velocity_over_ground_is_that_through_water_and_the_current(calm: Flown)
 
 
 def test_commands_replayed_give_the_same_motion(calm: Flown) -> None:
-    plant, state = vehicle("alice").plant, calm.state[0].copy()
+    plant, state = vehicle_from("alice").plant, calm.state[0].copy()
     scratch, load = scratch_for(5), np.zeros(6)
     for k in range(len(calm.time_s) - 1):
         for i in range(STEPS):

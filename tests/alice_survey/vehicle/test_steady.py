@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from alice_survey.vehicle.dynamics import derivative, initial_state, scratch_for
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.sea import constant_current
 from alice_survey.vehicle.steady import BALANCED, drag_power, steady_flight
 
-ALICE, SPARUS = vehicle("alice"), vehicle("sparus2")
+ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 RNG = np.random.default_rng(1)
 
 

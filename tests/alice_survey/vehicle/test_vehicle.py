@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.dynamics import GRAVITY
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.vehicle import RigidBody
 from tests.alice_survey.vehicle.motions import block
@@ -81,7 +81,7 @@ def test_an_inertia_that_is_not_positive_is_refused() -> None:
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 def test_configuration_matrix_is_the_thrusters_at_work(name: str) -> None:
     """Each column is the wrench of one thruster at rest in the water, per newton of its thrust."""
-    vehicle = fleet.vehicle(name)
+    vehicle = vehicle_from(name)
     matrix = vehicle.configuration_matrix
     assert matrix.shape == (6, len(vehicle.thrusters))
     for i, thruster in enumerate(vehicle.thrusters):
@@ -95,7 +95,7 @@ def test_configuration_matrix_is_the_thrusters_at_work(name: str) -> None:
 
 
 def test_thrusters_and_coefficients_can_be_exchanged() -> None:
-    full = fleet.vehicle("alice")
+    full = vehicle_from("alice")
     failed = full.without(["bow"])
     assert [t.name for t in failed.thrusters] == [t.name for t in full.thrusters if t.name != "bow"]
     assert failed.configuration_matrix.shape == (6, 4)

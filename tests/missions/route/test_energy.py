@@ -13,7 +13,7 @@ import pytest
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import ConfigError, PlanError
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.steady import steady_flight
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.plan.strength import arcs_fit, held_current_mps, survey_costs, too_strong
@@ -114,7 +114,7 @@ def test_without_a_current_all_courses_are_alike_and_ways_are_as_lines() -> None
     np.testing.assert_allclose(costs.way_w, costs.line_w, rtol=1e-12)
     nu = np.zeros((1, 6))
     nu[0, 0] = 0.2
-    ahead = steady_flight(vehicle("alice"), nu).power_w[0]
+    ahead = steady_flight(vehicle_from("alice"), nu).power_w[0]
     assert costs.line_w[0] == pytest.approx(60.0 + ahead)
 
 
@@ -177,7 +177,7 @@ def test_an_arc_costs_the_swing_of_the_hull_about_the_glass() -> None:
     nu[:, 5] = 0.4, -0.4
     nu[:, 0] = 0.2 + nu[:, 5] * -0.05
     nu[:, 1] = -nu[:, 5] * 0.55
-    extra_w = steady_flight(vehicle("alice"), nu).power_w.mean() + 60.0 - tight.way_w[0]
+    extra_w = steady_flight(vehicle_from("alice"), nu).power_w.mean() + 60.0 - tight.way_w[0]
     assert tight.arc_extra_w == pytest.approx(extra_w, rel=1e-9)
     # Much more than a straight, whose thrusters take 2 W; and little of that on a wide arc.
     assert tight.arc_extra_w > 50.0
@@ -189,7 +189,7 @@ def test_a_descent_is_as_fast_as_three_quarters_of_the_thrust_allow() -> None:
     """Going up is the vertical thruster's weaker way; buoyancy helps with 1 N."""
     costs = survey_costs(_config(0.0))
     rates = np.linspace(0.1, 0.4, 3001)
-    rps, thruster = math.sqrt(0.75) * 50.0, vehicle("alice").thrusters[2]
+    rps, thruster = math.sqrt(0.75) * 50.0, vehicle_from("alice").thrusters[2]
     thrust = 1025.0 * 0.08**3 * rps * (0.278 * 0.08 * rps - thruster.advance_slope * rates)
     most = rates[thrust + 0.1 * 9.80665 > 326.169 * rates**2].max()
     assert most - 0.0101 <= costs.heave_mps <= most

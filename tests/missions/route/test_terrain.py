@@ -11,7 +11,7 @@ from pyproj import Transformer
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array, Datum
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.hull import Hull
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
 from missions.route.terrain import (
@@ -29,7 +29,7 @@ from tests.oracles_energy import envelope as slow_envelope
 from tests.oracles_energy import highest_within
 
 DATUM = Datum(32.8236, 34.9553)
-ALICE, SPARUS2 = vehicle("alice").hull, vehicle("sparus2").hull
+ALICE, SPARUS2 = vehicle_from("alice").hull, vehicle_from("sparus2").hull
 REACH = reach_of(ALICE, (0.55, -0.05, 0.08), 0.7, 0.6)
 LIMITS = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=math.radians(20.0))
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from alice_survey.base.errors import AliceError
 from alice_survey.cli.main import app
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE
 from alice_survey.vehicle.hydrodynamics.paper_tables import (
     CALIBRATED,
@@ -91,7 +91,7 @@ def test_tables_agree_where_they_repeat_each_other() -> None:
 def test_the_surge_fit_is_about_the_water_inside() -> None:
     fit = row("V", "X_udot")
     assert fit.paper_other is not None
-    inside_kg = vehicle("alice").rigid_body.entrained_kg
+    inside_kg = vehicle_from("alice").rigid_body.entrained_kg
     assert fit.paper_other - fit.paper == pytest.approx(-inside_kg, rel=0.05)
 
 

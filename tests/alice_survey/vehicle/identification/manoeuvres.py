@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import initial_state, rk4_step, scratch_for
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.log import VehicleLog, vehicle_log
 from alice_survey.vehicle.sea import constant_current
 from alice_survey.vehicle.vehicle import Vehicle
@@ -40,7 +40,7 @@ def survey_like(time_s: float) -> Array:
 
 def hidden(values: Mapping[str, float]) -> Vehicle:
     """ALICE with other coefficients than it is known by."""
-    known = vehicle("alice")
+    known = vehicle_from("alice")
     return known.with_coefficients(known.coefficients.replaced("hidden", values))
 
 

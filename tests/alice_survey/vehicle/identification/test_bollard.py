@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.bollard import fit_pulls, read_pulls, with_thrust
 from alice_survey.vehicle.propulsion import add_thrust
 
-KNOWN = vehicle("alice")
+KNOWN = vehicle_from("alice")
 
 
 def pull_csv(

@@ -17,7 +17,6 @@ from alice_survey.vehicle.files import (
     vehicle_from_file,
     write_coefficients,
 )
-from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
 from alice_survey.vehicle.identification.windows import inputs, make_windows
 from alice_survey.vehicle.log import vehicle_log
@@ -78,7 +77,7 @@ def test_json_says_the_same(tmp_path: Path) -> None:
 
 
 def test_a_name_is_a_known_vehicle() -> None:
-    assert vehicle_from("alice").thrusters == vehicle("alice").thrusters
+    assert vehicle_from("alice").thrusters == vehicle_from("alice").thrusters
     with pytest.raises(VehicleError, match="'nautilus'"):
         vehicle_from("nautilus")
 
@@ -175,7 +174,7 @@ def test_faults_of_column_maps_are_named(tmp_path: Path, text: str, message: str
     ],
 )
 def test_logs_without_what_a_fit_needs_are_refused(change: dict[str, Any], named: str) -> None:
-    known = vehicle("alice")
+    known = vehicle_from("alice")
     enough = {
         "quaternion_xyzw": np.tile([0.0, 0, 0, 1], (20, 1)),
         "velocity_body": np.zeros((20, 3)),
@@ -186,7 +185,7 @@ def test_logs_without_what_a_fit_needs_are_refused(change: dict[str, Any], named
 
 
 def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[str]) -> None:
-    known, time_s = vehicle("alice"), np.arange(60) * 0.1
+    known, time_s = vehicle_from("alice"), np.arange(60) * 0.1
     rpm = {t.name: np.full(60, 600.0) for t in known.thrusters}
     rpm["port"][10:14] = np.nan
     rpm["port"][30:50] = np.nan

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array, rotation_from_attitude
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.parameters import Parameters, free_parameters
 from alice_survey.vehicle.identification.sensitivity import (
     CHANNELS,
@@ -20,9 +20,9 @@ from alice_survey.vehicle.identification.sensitivity import (
 from tests.oracles_identification import integrated, numpy_observation
 
 ALL = (
-    "X_u", "K_p", "N_r", "X_uu", "Y_vv", "Z_ww", "M_qq", "N_rr", "N_vv", "Y_uv", "Z_uw", "M_uw",
-    "N_uv", "X_udot", "Y_vdot", "Y_rdot", "M_wdot", "K_pdot", "N_rdot", "current", "buoyancy",
-    "trim", "bias", "gain",
+    "X_u", "K_p", "N_r", "X_uu", "Y_vv", "Z_ww_pos", "Z_ww_neg", "M_qq", "N_rr", "N_vv", "Y_uv",
+    "Z_uw", "M_uw", "N_uv", "X_udot", "Y_vdot", "Y_rdot", "M_wdot", "K_pdot", "N_rdot", "current",
+    "buoyancy", "trim", "bias", "gain",
 )  # fmt: skip
 ROWS, STEP_S = 41, 0.05
 
@@ -69,7 +69,7 @@ def a_start() -> Array:
 
 
 def a_case() -> tuple[Parameters, Array, Record, Array]:
-    parameters = free_parameters(vehicle("alice"), ALL)
+    parameters = free_parameters(vehicle_from("alice"), ALL)
     rng = np.random.default_rng(4)
     values = parameters.start * rng.uniform(0.8, 1.2, len(parameters.names))
     for name, value in (
@@ -81,7 +81,7 @@ def a_case() -> tuple[Parameters, Array, Record, Array]:
 
 
 def test_a_window_is_what_the_simulators_equations_give() -> None:
-    truth = vehicle("alice")
+    truth = vehicle_from("alice")
     parameters = free_parameters(truth, ("X_uu",))
     rps, load = np.array([25.0, -10.0, 12.0, 30.0, -20.0]), np.array([3.0, -2, 4, 0.1, 0.5, -1])
     time_s = np.arange(201) * STEP_S
@@ -150,7 +150,7 @@ def test_observations_are_what_sensors_measure() -> None:
 
 
 def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:
-    truth = vehicle("alice")
+    truth = vehicle_from("alice")
     parameters = free_parameters(truth, ("X_uu",))
     lag = np.array([t.time_constant_s for t in truth.thrusters])
     coarse_s, fine_s = np.arange(11) * 0.2, np.arange(201) * 0.01
@@ -169,7 +169,7 @@ def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:
 
 
 def test_held_inputs_stay_until_the_next_row() -> None:
-    parameters = free_parameters(vehicle("alice").without(
+    parameters = free_parameters(vehicle_from("alice").without(
         ("starboard", "port", "vertical", "bow", "stern")), ("X_uu",))  # fmt: skip
     wrench = np.zeros((3, 6))
     wrench[1, 0] = 10.0

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.parameters import free_parameters
 from alice_survey.vehicle.identification.two_step import calibrate
 from alice_survey.vehicle.identification.windows import make_windows
 from tests.alice_survey.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
 
-KNOWN = vehicle("alice")
+KNOWN = vehicle_from("alice")
 TRUTH = {
     "X_udot": -15.0, "X_uu": -12.0, "Z_wdot": -35.0, "Z_ww": -380.0, "N_rdot": -9.0, "N_rr": -70.0,
     "Y_vdot": -40.0, "Y_vv": -260.0,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.parameters import free_parameters
 from alice_survey.vehicle.identification.validation import fit_percent, validate
 from alice_survey.vehicle.identification.windows import make_windows
@@ -25,8 +25,8 @@ def test_the_fit_is_as_defined() -> None:
 def test_the_truth_predicts_itself_and_a_wrong_model_does_not() -> None:
     truth = hidden({"X_uu": -12.0, "N_rr": -70.0})
     log = fly(truth, duration_s=40.0, current=(0.1, 0.05))
-    parameters = free_parameters(vehicle("alice"), ("X_uu", "N_rr", "current"))
-    windows = make_windows(log, vehicle("alice"), window_s=10.0)
+    parameters = free_parameters(vehicle_from("alice"), ("X_uu", "N_rr", "current"))
+    windows = make_windows(log, vehicle_from("alice"), window_s=10.0)
     right = validate(windows, parameters, np.array([-12.0, -70.0, 0.1, 0.05]))
     wrong = validate(windows, parameters, np.array([-24.0, -35.0, 0.1, 0.05]))
     assert np.all(right.fit_percent > 99.0)
@@ -40,8 +40,8 @@ def test_the_truth_predicts_itself_and_a_wrong_model_does_not() -> None:
 
 def test_a_kept_velocity_errs_by_what_the_velocity_changes() -> None:
     log = fly(hidden({}), duration_s=20.0)
-    windows = make_windows(log, vehicle("alice"))
-    parameters = free_parameters(vehicle("alice"), ("X_uu",))
+    windows = make_windows(log, vehicle_from("alice"))
+    parameters = free_parameters(vehicle_from("alice"), ("X_uu",))
     (found,) = validate(windows, parameters, parameters.start, horizons_s=(1.0,)).forecasts
     starts = np.arange(0, 380, 10)
     change = log.velocity_body[starts + 20] - log.velocity_body[starts]
@@ -50,8 +50,10 @@ def test_a_kept_velocity_errs_by_what_the_velocity_changes() -> None:
 
 
 def test_a_motion_that_follows_the_log_is_not_scored() -> None:
-    windows = make_windows(fly(hidden({}), duration_s=10.0), vehicle("alice"), given=("p", "q"))
-    parameters = free_parameters(vehicle("alice"), ("X_uu",))
+    windows = make_windows(
+        fly(hidden({}), duration_s=10.0), vehicle_from("alice"), given=("p", "q")
+    )
+    parameters = free_parameters(vehicle_from("alice"), ("X_uu",))
     found = validate(windows, parameters, parameters.start)
     assert np.all(np.isnan(found.fit_percent[3:5]))
     assert np.all(found.fit_percent[[0, 1, 2, 5]] > 99.0)

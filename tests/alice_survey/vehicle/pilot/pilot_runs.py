@@ -18,7 +18,7 @@ from alice_survey.vehicle.dynamics import (
     rk4_step,
     scratch_for,
 )
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
 from alice_survey.vehicle.pilot.guidance import steer
@@ -164,7 +164,7 @@ class Rows:
 
 @cache
 def gains_of(name: str, speed_mps: float = 0.2) -> Gains:
-    return gains_for(vehicle(name), speed_mps)
+    return gains_for(vehicle_from(name), speed_mps)
 
 
 def straight(length_m: float, heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
@@ -224,7 +224,7 @@ def launch(
     following: bool = False,
 ) -> Flight:
     """A vehicle at rest over a plane; `following`: at depth, with the path begun."""
-    craft, gains = vehicle(name), gains_of(name, path.speed_mps)
+    craft, gains = vehicle_from(name), gains_of(name, path.speed_mps)
     guidance = pilot_guidance(gains, path, controller, most_depth_m=DEEPEST_M)
     pilot = new_pilot()
     if following:

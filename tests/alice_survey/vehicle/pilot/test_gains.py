@@ -11,13 +11,15 @@ from hypothesis import strategies as st
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
-from alice_survey.vehicle.fleet import SETS, vehicle
+from alice_survey.vehicle.files import SETS, vehicle_from
 from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot.gains import (
     DEGREES,
     Gains,
-    damping_ratio,
     gains_for,
+)
+from alice_survey.vehicle.pilot.linear import (
+    damping_ratio,
     linear_coriolis,
     linear_damping,
 )
@@ -128,7 +130,7 @@ def test_slopes_are_those_of_the_forces(u: float, v: float, w: float, r: float) 
 
 @pytest.mark.parametrize("axis", range(4))
 def test_authority_is_reached_and_not_exceeded_by_any_thrusts(axis: int) -> None:
-    craft, rng = vehicle("alice"), np.random.default_rng(axis)
+    craft, rng = vehicle_from("alice"), np.random.default_rng(axis)
     matrix = craft.configuration_matrix[list(DEGREES)]
     upper = rng.uniform(10.0, 80.0, matrix.shape[1])
     lower = -rng.uniform(10.0, 40.0, matrix.shape[1])
@@ -182,7 +184,7 @@ def _coupled_loop(body: Body, speed_mps: float, row: Array) -> Array:
 def test_heading_is_damped_with_the_sway_that_it_brings(
     name: str, coefficients: str, speed_mps: float
 ) -> None:
-    craft = vehicle(name, coefficients)
+    craft = vehicle_from(name, coefficients)
     if name == "sparus2" and speed_mps == 1.0:
         with pytest.raises(VehicleError, match="1 m/s"):
             gains_for(craft, speed_mps)
@@ -237,14 +239,14 @@ def test_faster_thrusters_give_a_faster_loop() -> None:
 
 
 def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() -> None:
-    whole, lame = vehicle("alice"), vehicle("alice").weakened({"bow": 0.0})
+    whole, lame = vehicle_from("alice"), vehicle_from("alice").weakened({"bow": 0.0})
     slow = gains_for(lame, 0.2).axes[g.SWAY]
     assert slow[g.LAG] > 2.0 * gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
     assert slow[g.LAG] < 0.85
 
 
 def test_a_weak_thruster_asks_for_less() -> None:
-    whole, weak = vehicle("alice"), vehicle("alice").weakened({"vertical": 0.25})
+    whole, weak = vehicle_from("alice"), vehicle_from("alice").weakened({"vertical": 0.25})
     strong, feeble = (gains_for(craft, 0.2).axes[g.HEAVE] for craft in (whole, weak))
     # Force by the square of the speed, speed by the root of the force: drag is quadratic.
     assert feeble[g.MOST] == pytest.approx(0.25 * strong[g.MOST], rel=0.05)
@@ -253,11 +255,11 @@ def test_a_weak_thruster_asks_for_less() -> None:
 
 
 def test_slow_navigation_bounds_the_bandwidth() -> None:
-    slow = gains_for(vehicle("alice"), 0.2, navigation_hz=1.0)
+    slow = gains_for(vehicle_from("alice"), 0.2, navigation_hz=1.0)
     assert slow.axes[g.SWAY, g.BANDWIDTH] == pytest.approx(2 * math.pi / 20)
 
 
 @pytest.mark.parametrize(("name", "lost"), [("alice", "vertical"), ("sparus2", "port")])
 def test_a_vehicle_that_cannot_be_controlled_is_refused(name: str, lost: str) -> None:
     with pytest.raises(VehicleError):
-        gains_for(vehicle(name).weakened({lost: 0.0}), 0.2)
+        gains_for(vehicle_from(name).weakened({lost: 0.0}), 0.2)

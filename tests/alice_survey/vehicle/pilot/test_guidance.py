@@ -11,11 +11,16 @@ from hypothesis.extra.numpy import arrays
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
-from alice_survey.vehicle.fleet import SETS, vehicle
+from alice_survey.vehicle.files import SETS, vehicle_from
 from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.gains import damping_ratio, gains_for
+from alice_survey.vehicle.pilot.gains import (
+    gains_for,
+)
 from alice_survey.vehicle.pilot.guidance import steer
+from alice_survey.vehicle.pilot.linear import (
+    damping_ratio,
+)
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.vehicle.pilot.path import Path, place_at
 from alice_survey.vehicle.pilot.settings import (
@@ -217,7 +222,7 @@ def test_small_offsets_fade_as_the_linear_loop_says(name: str) -> None:
 def test_look_ahead_hangs_on_the_coefficients_as_documented(
     coefficients: str, expected_m: float
 ) -> None:
-    gains = gains_for(vehicle("sparus2", coefficients), 0.2)
+    gains = gains_for(vehicle_from("sparus2", coefficients), 0.2)
     assert shortest_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
     with_port = shortest_look_ahead_m(gains, 0.2, 0.55)
     assert with_port == pytest.approx(2.23 if coefficients == "calibrated" else 1.6, abs=0.006)
@@ -227,7 +232,7 @@ def test_look_ahead_hangs_on_the_coefficients_as_documented(
 @pytest.mark.parametrize("coefficients", SETS)
 @pytest.mark.parametrize("speed_mps", [0.1, 0.2, 0.5])
 def test_los_is_damped_with_every_set(name: str, coefficients: str, speed_mps: float) -> None:
-    gains = gains_for(vehicle(name, coefficients), speed_mps)
+    gains = gains_for(vehicle_from(name, coefficients), speed_mps)
     for lever_m in (0.0, 0.55):
         look_ahead_m = shortest_look_ahead_m(gains, speed_mps, lever_m)
         ratio = damping_ratio(los_loop(gains, speed_mps, lever_m, look_ahead_m))
@@ -238,7 +243,7 @@ def test_los_is_damped_with_every_set(name: str, coefficients: str, speed_mps: f
 
 def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> None:
     gains = gains_of("alice", 1.0)
-    loose = g.Gains(gains.body, gains.axes.copy())
+    loose = gains._replace(axes=gains.axes.copy())
     loose.axes[g.YAW, [g.RATE, g.INNER]] = 0.1  # hardly damps the heading
     path = straight(20.0, speed_mps=1.0)
     with pytest.raises(VehicleError, match="1 m/s"):

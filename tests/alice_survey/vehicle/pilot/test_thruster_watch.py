@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.pilot.thruster_watch import FoundFailure, ThrusterWatch
 
 TICK_S = 0.05
 STRETCH = 100
-(STERN,) = (t for t in vehicle("alice").thrusters if t.name == "stern")
+(STERN,) = (t for t in vehicle_from("alice").thrusters if t.name == "stern")
 
 
 def turned(command_rps: Array, *, share: float = 1.0, slower: float = 1.0) -> Array:

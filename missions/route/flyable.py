@@ -1,0 +1,54 @@
+"""A plan as its vehicle can fly it: turns of one that fins steer, which cannot stop."""
+
+import math
+
+from alice_survey.base.config import PlanConfig, SurveyConfig
+from alice_survey.base.errors import PlanError
+from alice_survey.vehicle.pilot.gains import STEADY_SHARE
+from alice_survey.vehicle.under_way import held, least_radius_m
+from alice_survey.vehicle.vehicle import Vehicle
+from missions.route.energy import craft_of
+
+_ROOM = 1.25
+"""Radius of turns over the tightest that fins hold (inferred): room to come back to the path."""
+
+
+def as_flown(config: SurveyConfig) -> SurveyConfig:
+    """A survey whose turns its vehicle can fly; itself for a vehicle that can stop.
+
+    Raises:
+        PlanError: turns are set that it cannot fly.
+    """
+    plan = plan_as_flown(config.plan, craft_of(config.vehicle))
+    return config if plan is config.plan else config.model_copy(update={"plan": plan})
+
+
+def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
+    """Settings with arcs that fins hold and run-ins as long as their radius.
+
+    They are widened where `turns = "auto"`. At a speed at which it does not fly at all they are
+    left: the speed is refused elsewhere.
+
+    Raises:
+        PlanError: turns are set that it cannot fly.
+    """
+    if not craft.fins:
+        return plan
+    if plan.turns not in ("auto", "arcs"):
+        raise PlanError(
+            f"{craft.name} is steered by fins and cannot stop: plan.turns = {plan.turns!r} cannot "
+            "be flown; set 'arcs', or leave it out"
+        )
+    if held(craft, plan.speed_mps, 0.0, STEADY_SHARE) is None:
+        return plan
+    least_m = least_radius_m(craft, plan.speed_mps, STEADY_SHARE)
+    if plan.turns == "auto":
+        radius_m = max(plan.arc_radius_m, math.ceil(10.0 * _ROOM * least_m) / 10.0)
+        run_in_m = max(plan.run_in_m, radius_m)
+        return plan.model_copy(update={"turn_radius_m": radius_m, "run_in_m": run_in_m})
+    if plan.turn_radius_m < least_m:
+        raise PlanError(
+            f"turn_radius_m {plan.turn_radius_m:g} is tighter than the {least_m:.2f} m that the "
+            f"fins of {craft.name} hold at {plan.speed_mps:g} m/s: raise it, or set turns = 'auto'"
+        )
+    return plan
