@@ -49,8 +49,8 @@ def load_ros() -> Ros:
         from std_msgs.msg import String
     except ImportError as error:
         raise VehicleError(
-            f"ROS 2 is not installed ({error}): pip install 'alice-survey[ros]' with Python 3.11, "
-            "or source the setup file of a ROS 2 installation"
+            f"ROS 2 is not installed ({error}): pip install 'alice-survey[ros]', or source the "
+            "setup file of a ROS 2 installation"
         ) from None
     messages = SimpleNamespace(
         Time=Time, Twist=TwistWithCovarianceStamped, Wrench=WrenchStamped,

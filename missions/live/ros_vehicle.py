@@ -2,7 +2,7 @@
 
 Stamps are of the simulation's own clock, which `/clock` publishes: whoever listens uses simulated
 time. With a rate the simulation keeps pace with the wall; without, it waits at each tick for the
-command of that tick, so that it is as fast, and as repeatable, as what commands it.
+command of that tick, so that it is as fast as what commands it, on any machine.
 """
 
 import math
