@@ -10,6 +10,7 @@ import typer
 from alice_survey.base.errors import known_fault
 from alice_survey.cli.camera import app as camera_app
 from alice_survey.cli.intake import app as import_app
+from alice_survey.cli.live import app as live_app
 from alice_survey.cli.options import (
     CONTEXT,
     WORK,
@@ -45,6 +46,7 @@ app = typer.Typer(
 )
 app.add_typer(plan_app, name="plan")
 app.add_typer(import_app)
+app.add_typer(live_app)
 app.add_typer(reconstruct_app, name="reconstruct")
 app.add_typer(model_app)
 app.add_typer(report_app)

@@ -12,6 +12,7 @@ from alice_survey.base.executor import Executor, progress
 from alice_survey.base.records import FlightRecord
 from alice_survey.base.trajectory import write_track
 from alice_survey.seafloor.terrain import survey_terrain
+from alice_survey.vehicle.floor import FloorGrid
 from alice_survey.vehicle.log import write_vehicle_log
 from camera_calib.rig import design_rig
 from missions.fly.flight_plots import draw_flight, draw_vehicle
@@ -21,7 +22,7 @@ from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
 from missions.logs.bag import write_bag
 from missions.values.flight import Flight, rms
 from missions.values.navigation import write_navigation
-from missions.values.plan_file import read_plan
+from missions.values.plan_file import Plan, read_plan
 
 _SEED_STREAM = 20
 MOST_HEADING_DEG = 10.0
@@ -43,18 +44,9 @@ def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]
     """Write the files of a flight, and say after each step what is done."""
     plan = one_dive(read_plan(plan_path), survey.vehicle.dive)
     planned = stations_of_dives(plan)
-    floor = floor_grid(
-        survey_terrain(
-            survey.seafloor,
-            plan.area.allowed_corners_ne,
-            margin_m=survey.plan.altitude_m,
-            depth_m=survey.area.seafloor_depth_m,
-            seed=survey.seed,
-        )
-    )
+    floor = true_floor(plan, survey)
     yield "sea floor"
-    rng = np.random.default_rng([survey.seed, _SEED_STREAM])
-    flight = simulate_plan(plan, flight_settings(survey), floor, rng)
+    flight = simulate_plan(plan, flight_settings(survey), floor, flight_noise(survey.seed))
     _check_pictures(flight, planned, "swell" if survey.sea.swell_m > 0.0 else "current")
     yield "flight"
     write_track(folder / "truth" / "track.csv", flight.truth)
@@ -70,6 +62,24 @@ def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]
     draw_flight(folder / "track.png", flight)
     draw_vehicle(folder / "vehicle.png", flight)
     yield "plots"
+
+
+def true_floor(plan: Plan, survey: SurveyConfig) -> FloorGrid:
+    """The simulated sea floor below a plan."""
+    return floor_grid(
+        survey_terrain(
+            survey.seafloor,
+            plan.area.allowed_corners_ne,
+            margin_m=survey.plan.altitude_m,
+            depth_m=survey.area.seafloor_depth_m,
+            seed=survey.seed,
+        )
+    )
+
+
+def flight_noise(seed: int) -> np.random.Generator:
+    """Source of all noise of a survey's flight."""
+    return np.random.default_rng([seed, _SEED_STREAM])
 
 
 def _check_pictures(flight: Flight, planned: int, sea: str) -> None:

@@ -29,8 +29,10 @@ from alice_survey.vehicle.navigation.sensors import (
     UsblSpec,
 )
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
+from alice_survey.vehicle.pilot.command import Without
 from alice_survey.vehicle.pilot.gains import Gains, gains_for
 from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
+from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
 from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
 from alice_survey.vehicle.sea import (
@@ -141,21 +143,31 @@ def longest_mission_s(plan: Plan) -> float:
     return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
 
 
-def mission_setup(
-    plan: Plan,
-    settings: FlightSettings,
-    floor: FloorGrid,
-    longest_s: float,
-    rng: np.random.Generator,
-) -> Setup:
-    """Vehicle, path, pilot, instruments and sea of a survey.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piloting:
+    """How a vehicle flies a plan, at sea or simulated."""
+
+    vehicle: Vehicle
+    """With all its thrusters."""
+    path: Path
+    gains: Gains
+    guidance: Guidance
+    known_health: Mapping[str, float]
+    """Share left of thrusters that are known not to be intact."""
+    without: Without | None
+    """How to go on once failures are found; not looked for if None."""
+
+
+def piloting_of(plan: Plan, settings: FlightSettings, longest_s: float) -> Piloting:
+    """Vehicle, path, gains and guidance of a survey.
 
     Args:
         plan: what to fly.
-        settings: vehicle, sea and sensors.
-        floor: the true sea floor.
+        settings: vehicle and cameras.
         longest_s: after which the vehicle gives up.
-        rng: for what is drawn once a mission.
+
+    Raises:
+        VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
     """
     craft = sound_craft_of(settings.vehicle)
     diverging_mps = math.inf if craft.fins else pitch_divergence_speed_mps(craft)
@@ -175,9 +187,6 @@ def mission_setup(
         )
     # A floor is followed down to two altitudes below the planned one.
     deepest_m = plan.seafloor_depth_m + plan.altitude_m
-    # The pilot flies as well as the thrusters allow that he knows to be sound.
-    impaired = settings.vehicle.impaired
-    known = impaired if settings.vehicle.health_known else {}
 
     def piloted(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
         gains = gains_for(craft.weakened(left), plan.speed_mps)
@@ -200,7 +209,37 @@ def mission_setup(
         under_way = guidance.under_way._replace(side=side)
         return gains, guidance._replace(way_in_m=way_in_m, under_way=under_way)
 
+    # The pilot flies as well as the thrusters allow that he knows to be sound.
+    known = settings.vehicle.impaired if settings.vehicle.health_known else {}
     gains, guidance = piloted(known)
+    return Piloting(
+        vehicle=craft,
+        path=path,
+        gains=gains,
+        guidance=guidance,
+        known_health=known,
+        without=piloted if settings.vehicle.finds_failures else None,
+    )
+
+
+def mission_setup(
+    plan: Plan,
+    settings: FlightSettings,
+    floor: FloorGrid,
+    longest_s: float,
+    rng: np.random.Generator,
+) -> Setup:
+    """Vehicle, path, pilot, instruments and sea of a survey.
+
+    Args:
+        plan: what to fly.
+        settings: vehicle, sea and sensors.
+        floor: the true sea floor.
+        longest_s: after which the vehicle gives up.
+        rng: for what is drawn once a mission.
+    """
+    flies = piloting_of(plan, settings, longest_s)
+    craft, path = flies.vehicle, flies.path
     gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
     glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(settings.camera.position_body_m)
@@ -208,8 +247,8 @@ def mission_setup(
     return Setup(
         vehicle=craft,
         path=path,
-        guidance=guidance,
-        gains=gains,
+        guidance=flies.guidance,
+        gains=flies.gains,
         sensors=sensors_of(settings.navigation, settings.camera).pack(craft.hull),
         floor=floor,
         current=current_of(settings.sea, plan.seafloor_depth_m, longest_s, rng),
@@ -217,12 +256,12 @@ def mission_setup(
             sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=settings.sea.gust_correlation_s
         ),
         exact_allocation=settings.vehicle.allocation == "exact",
-        health=impaired,
-        known_health=known,
+        health=settings.vehicle.impaired,
+        known_health=flies.known_health,
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
         failures=_failures(craft, settings.vehicle),
-        without=piloted if settings.vehicle.finds_failures else None,
+        without=flies.without,
     )
 
 

@@ -20,12 +20,13 @@ from alice_survey.cli.main import app, main
 from alice_survey.stages import names
 from alice_survey.survey import init_survey
 from camera_calib.rig import design_rig, write_rig
+from tests.missions.flown_plans import plan_of, walk
 
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-control",
     "import-log", "measure", "control", "quality", "mosaic-tiles", "report", "studio", "view",
-    "join",
+    "join", "pilot", "simulate",
 )  # fmt: skip
 
 
@@ -310,3 +311,18 @@ cli.main()
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == ["600.0", "1"]
+
+
+def test_a_plan_is_not_flown_without_ros(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line says what to install, whatever is installed here."""
+    plan = plan_of([walk((0.0, 0.0), 0.0, [("line", 4.0, 0)])])
+    (tmp_path / "plan").mkdir()
+    (tmp_path / "plan" / "plan.json").write_text(json.dumps(plan.to_json()))
+    (tmp_path / "survey.toml").write_text("")
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    assert "alice-survey[ros]" in fails(["pilot", str(tmp_path)], capsys, monkeypatch)
+    monkeypatch.setitem(sys.modules, "pymavlink", None)
+    mavlink = ["pilot", str(tmp_path), "--mavlink", "udpin:127.0.0.1:14550"]
+    assert "alice-survey[mavlink]" in fails(mavlink, capsys, monkeypatch)

@@ -16,7 +16,8 @@ from alice_survey.vehicle.pilot.memory import APPROACH, ASCEND, DIVE, DONE, FOLL
 from alice_survey.vehicle.pilot.path import path_from_legs
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import Disturbance, constant_current
-from alice_survey.vehicle.simulator import STEPS, TICK_S, Flown, Setup, simulate
+from alice_survey.vehicle.simulated_vehicle import STEPS, TICK_S
+from alice_survey.vehicle.simulator import Flown, Setup, simulate
 
 CURRENT = constant_current(0.1, 60.0)
 STILL = Disturbance()

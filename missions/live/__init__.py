@@ -1,0 +1,1 @@
+"""Plans flown by real vehicles, or by others' simulators: ROS 2 and MAVLink."""

@@ -1,0 +1,269 @@
+"""The simulated vehicle as a ROS 2 node: thruster speeds or a wrench in, sensors and truth out.
+
+Stamps are of the simulation's own clock, which `/clock` publishes: whoever listens uses simulated
+time. With a rate the simulation keeps pace with the wall; without, it waits at each tick for the
+command of that tick, so that it is as fast as what commands it, on any machine.
+"""
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import VehicleError, warn
+from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.base.trajectory import Trajectory
+from alice_survey.vehicle import estimate_vector as vector
+from alice_survey.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
+from alice_survey.vehicle.dynamics import STATE
+from alice_survey.vehicle.floor import floor_range
+from alice_survey.vehicle.navigation.filter import DVL_TIME, DVL_VELOCITY, PUSH, RATES
+from alice_survey.vehicle.navigation.sensors import DVL
+from alice_survey.vehicle.navigation.tick import LOG_ROW, LOG_SIGMA, log_row
+from alice_survey.vehicle.pilot.command import allocate, new_allocation
+from alice_survey.vehicle.simulated_vehicle import TICK_S, SimulatedVehicle
+from missions.live.loop import Odometry
+from missions.live.ros_messages import (
+    Ros,
+    imu_message,
+    load_ros,
+    odometry_message,
+    range_message,
+    seconds,
+    speeds_from,
+    speeds_message,
+    stamp,
+    velocity_message,
+    wrench_from,
+)
+
+START_S = 1.0
+"""The clock at the first tick: 0 would mean that it has not begun."""
+_KEPT_S = 0.5
+"""A command that is older is not followed: the thrusters stop, as a driver's own watchdog does."""
+_REPEAT_S = 0.5
+"""Wall time after which a tick without an answer is published again."""
+_EXACT = np.zeros(6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How fast the simulation runs, and how long."""
+
+    rate: float
+    """Simulated over wall time; 0 waits for the command of each tick."""
+    longest_s: float = math.inf
+    """Simulated time after which it ends."""
+    patience_s: float = 60.0
+    """Wall time for which it waits for a command, at rate 0."""
+
+
+def vehicle_over_ros(
+    vehicle: SimulatedVehicle,
+    takes: Literal["thrusters", "wrench"],
+    pace: Pace,
+    rng: np.random.Generator,
+) -> tuple[Trajectory, str]:
+    """Simulate a vehicle that others command, until they leave or it is interrupted.
+
+    Args:
+        vehicle: at rest on the surface.
+        takes: which command is followed.
+        pace: how fast and how long.
+        rng: noise of the altimeter.
+
+    Returns:
+        The true track on the clock of the stamps, and why it ended.
+
+    Raises:
+        VehicleError: ROS 2 is not installed, or no command came in time.
+    """
+    ros = load_ros()
+    from rclpy.signals import SignalHandlerOptions
+
+    ros.rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = _Node(ros, vehicle, takes, rng)
+        try:
+            why = node.run(pace)
+        except KeyboardInterrupt:
+            why = "interrupted"
+        finally:
+            node.node.destroy_node()
+    finally:
+        ros.rclpy.try_shutdown()
+    rows = np.array(node.track)
+    poses = RigidTransform.from_components(rows[:, 1:4], Rotation.from_quat(rows[:, 4:8]))
+    return Trajectory(time_s=rows[:, 0], ned_from_body=poses), why
+
+
+class _Node:
+    def __init__(
+        self,
+        ros: Ros,
+        vehicle: SimulatedVehicle,
+        takes: Literal["thrusters", "wrench"],
+        rng: np.random.Generator,
+    ) -> None:
+        name = vehicle.vehicle.name
+        self.ros, self.vehicle, self.rng = ros, vehicle, rng
+        self.thrusters = tuple(thruster.name for thruster in vehicle.vehicle.thrusters)
+        self.track: list[list[float]] = []
+        self.command: tuple[float, Array] | None = None
+        self.frames = {part: f"{name}/{part}" for part in ("base_link", "imu", "dvl")}
+        count = len(self.thrusters)
+        holds_level = np.linalg.matrix_rank(vehicle.vehicle.configuration_matrix) == 6
+        axes = LEVEL_WEIGHTS if holds_level else AXIS_WEIGHTS
+        self.allocation = new_allocation(vehicle.vehicle, np.ones(count), exact=True, axes=axes)
+        self.row = np.zeros(LOG_ROW)
+        self.node = ros.rclpy.create_node("vehicle", namespace=name)
+        kinds, publisher = ros.messages, self.node.create_publisher
+        self.clock = publisher(kinds.Clock, "/clock", ros.qos)
+        self.navigation = publisher(kinds.Odometry, "navigation/odometry", ros.qos)
+        self.truth = publisher(kinds.Odometry, "truth/odometry", ros.qos)
+        self.altimeter = publisher(kinds.Range, "altimeter", ros.qos)
+        self.imu = publisher(kinds.Imu, "imu", ros.qos)
+        self.dvl = publisher(kinds.Twist, "dvl", ros.qos)
+        self.turning = publisher(kinds.JointState, "thrusters/state", ros.qos)
+        if takes == "thrusters":
+            topic, kind, take = "thrusters/command", kinds.JointState, self._on_speeds
+        else:
+            topic, kind, take = "pilot/wrench", kinds.Wrench, self._on_wrench
+        self.commands = self.node.create_subscription(kind, topic, take, ros.qos)
+
+    @property
+    def now_s(self) -> float:
+        """Time on the simulation's clock."""
+        return START_S + self.vehicle.tick * TICK_S
+
+    def run(self, pace: Pace) -> str:
+        """Simulate tick by tick; why it ended."""
+        begun, late = time.monotonic(), 0
+        while self.now_s - START_S < pace.longest_s:
+            estimate = self.vehicle.sense()
+            self.track.append([self.now_s, *self.vehicle.world.now[:7].tolist()])
+            if self.vehicle.touches_floor:
+                return "the hull touched the sea floor"
+            readings = self._readings(estimate)
+            self._publish(readings)
+            if pace.rate == 0.0:
+                if not self._answered(readings, pace.patience_s):
+                    return "its commander left"
+            else:
+                due = begun + (self.vehicle.tick + 1) * TICK_S / pace.rate
+                late += time.monotonic() > due
+                self._spin_until(due)
+            self.vehicle.move(self._speeds())
+        if late > 0.01 * self.vehicle.tick:
+            warn(
+                f"{late} of {self.vehicle.tick} ticks were late: the machine does not keep the "
+                f"rate {pace.rate:g}; lower it"
+            )
+        return f"{pace.longest_s:g} s are over"
+
+    def _answered(self, readings: list[tuple[Any, Any]], patience_s: float) -> bool:
+        """Wait for the command of this tick; whether one came, or false if none will."""
+        begun = published = time.monotonic()
+        while self.command is None or self.command[0] < self.now_s - 1e-6:
+            self.ros.rclpy.spin_once(self.node, timeout_sec=0.05)
+            now = time.monotonic()
+            if self.command is not None and not self._is_commanded:
+                return False
+            if now - begun > patience_s:
+                raise VehicleError(
+                    f"no command came on {self.commands.topic_name} for {patience_s:g} s: start "
+                    "what commands the vehicle with simulated time, or give --rate 1"
+                )
+            if now - published > _REPEAT_S:
+                published = now
+                self._publish(readings)
+        return True
+
+    @property
+    def _is_commanded(self) -> bool:
+        """Whether anyone publishes commands."""
+        return bool(self.node.count_publishers(self.commands.topic_name))
+
+    def _spin_until(self, due: float) -> None:
+        while (left := due - time.monotonic()) > 0.0:
+            self.ros.rclpy.spin_once(self.node, timeout_sec=left)
+
+    def _speeds(self) -> Array:
+        """Thruster speeds to follow, (n,) rev/s."""
+        if self.command is None or self.now_s - self.command[0] > _KEPT_S:
+            return np.zeros(len(self.thrusters))
+        return self.command[1]
+
+    def _on_speeds(self, message: Any) -> None:
+        speeds = speeds_from(message, self.thrusters)
+        if np.all(np.isfinite(speeds)):
+            self.command = (seconds(message.header.stamp), speeds)
+
+    def _on_wrench(self, message: Any) -> None:
+        wrench = wrench_from(message)
+        if np.all(np.isfinite(wrench)):
+            allocate(wrench, self.vehicle.world.estimate, self.allocation)
+            speeds = self.allocation.command.copy()
+            self.command = (seconds(message.header.stamp), speeds)
+
+    def _publish(self, readings: list[tuple[Any, Any]]) -> None:
+        for publisher, message in readings:
+            publisher.publish(message)
+
+    def _readings(self, estimate: Array) -> list[tuple[Any, Any]]:
+        """What is published at this tick, the clock last."""
+        ros, frames, now_s = self.ros, self.frames, self.now_s
+        world, navigation = self.vehicle.world, self.vehicle.navigation
+        log_row(navigation, self.row)
+        north, east, depth, roll, pitch, heading = self.row[LOG_SIGMA : LOG_SIGMA + 6] ** 2
+        believed = rotation_from_attitude(*estimate[vector.ROLL : vector.U]).as_quat()
+        navigated = Odometry(
+            stamp_s=now_s,
+            position_ned=estimate[: vector.ROLL],
+            quaternion_xyzw=believed,
+            velocity_body=estimate[vector.U : vector.P],
+            rates_body=estimate[vector.P : vector.ALTITUDE],
+        )
+        turn = Rotation.from_quat(world.now[3:7])
+        true = Odometry(
+            stamp_s=now_s,
+            position_ned=world.now[:3],
+            quaternion_xyzw=world.now[3:7],
+            velocity_body=turn.inv().apply(world.now[7:10]),
+            rates_body=world.now[10:13],
+        )
+        base, readings = frames["base_link"], navigation.readings
+        variances = np.array([east, north, depth, roll, pitch, heading])
+        sent: list[tuple[Any, Any]] = [
+            (self.truth, odometry_message(ros, true, f"{base}_truth", _EXACT)),
+            (self.navigation, odometry_message(ros, navigated, base, variances)),
+            (self.turning, speeds_message(ros, now_s, self.thrusters, world.state[STATE:])),
+        ]
+        if self.vehicle.tick > 0:
+            force = readings[PUSH : PUSH + 3] / TICK_S
+            rates = readings[RATES : RATES + 3]
+            sent.append((self.imu, imu_message(ros, now_s, frames["imu"], believed, rates, force)))
+        if self.vehicle.tick % self.vehicle.sensors.dvl_every == 0:
+            most_m = self.vehicle.sensors.dvl.most_range_m
+            reach = self._altimeter_range(turn)
+            sent.append((self.altimeter, range_message(ros, now_s, frames["dvl"], reach, most_m)))
+            velocity = readings[DVL_VELOCITY : DVL_VELOCITY + 3]
+            if np.all(np.isfinite(velocity)) and readings[DVL_TIME] == self.vehicle.tick * TICK_S:
+                sent.append((self.dvl, velocity_message(ros, now_s, frames["dvl"], velocity)))
+        clock = ros.messages.Clock(clock=stamp(ros, now_s))
+        return [*sent, (self.clock, clock)]
+
+    def _altimeter_range(self, turn: Rotation) -> float:
+        """Range, m, of a beam straight down from the DVL's place; NaN is no echo."""
+        dvl, place = self.vehicle.sensors.dvl, self.vehicle.sensors.place[DVL]
+        north, east, depth = self.vehicle.world.now[:3] + turn.apply(place)
+        beam_n, beam_e, beam_d = turn.apply([0.0, 0.0, 1.0])
+        reach = floor_range(
+            self.vehicle.floor, north, east, depth, beam_n, beam_e, beam_d, dvl.most_range_m
+        )
+        noise = math.hypot(dvl.range_noise_m, dvl.range_noise_fraction * reach)
+        found = reach + noise * float(self.rng.standard_normal())
+        return found if found >= dvl.least_range_m else math.nan

@@ -1,0 +1,137 @@
+"""A vehicle that speaks MAVLink as ArduSub in GUIDED does: `python -m ... PORT SETTINGS TRACK`.
+
+Its dynamics are the simulator's; loops of its own turn velocity and heading into a wrench. It goes
+on when the set-point of a tick has come, and ends when none comes any more at the surface.
+"""
+
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from pymavlink import mavutil
+from scipy.spatial.transform import Rotation
+
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.base.frames import Array, Datum, attitude_from_rotation
+from alice_survey.vehicle.floor import floor_range
+from alice_survey.vehicle.navigation.sensors import DVL
+from alice_survey.vehicle.pilot.command import allocate, new_allocation
+from alice_survey.vehicle.pilot.gains import (
+    HEAVE,
+    LEAST,
+    MASS,
+    MOST,
+    SURGE,
+    SWAY,
+    YAW,
+    gains_for,
+)
+from alice_survey.vehicle.rotations import wrapped
+from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
+from missions.live.mission import plan_to_fly
+from tests.missions.live.flights import vehicle_afloat
+
+GUIDED, ARMED, SUBMARINE, ARDUPILOT = 4, 128, 12, 3
+AXES = (SURGE, SWAY, HEAVE, YAW)
+
+
+class InnerLoops:
+    """PI loops on body velocity, and on the heading by its rate."""
+
+    def __init__(self, vehicle: SimulatedVehicle) -> None:
+        gains = gains_for(vehicle.vehicle, 0.2)
+        self.mass, self.least, self.most = (gains.axes[list(AXES), k] for k in (MASS, LEAST, MOST))
+        self.allocation = new_allocation(
+            vehicle.vehicle, np.ones(len(vehicle.vehicle.thrusters)), exact=True, holds_level=False
+        )
+        self.total = np.zeros(4)
+
+    def speeds(self, truth: Array, velocity_ned: Array, heading_rad: float) -> Array:
+        turn = Rotation.from_quat(truth[3:7])
+        heading = float(attitude_from_rotation(turn)[2])
+        body = turn.inv()
+        off = body.apply(velocity_ned - truth[7:10])
+        turning = np.clip(0.6 * wrapped(heading_rad - heading), -0.25, 0.25)
+        error = np.array([*off, turning - truth[12]])
+        self.total = np.clip(self.total + 0.05 * 0.3 * self.mass * error, self.least, self.most)
+        asked = np.clip(1.0 * self.mass * error + self.total, self.least, self.most)
+        wrench = np.array([asked[0], asked[1], asked[2], 0.0, 0.0, asked[3]])
+        estimate = np.zeros(14)
+        estimate[6:9], estimate[9:12] = body.apply(truth[7:10]), truth[10:13]
+        allocate(wrench, estimate, self.allocation)
+        return self.allocation.command_rps.copy()
+
+
+def fly(port: int, settings: Path, track: Path) -> None:
+    survey: SurveyConfig = load_config(settings)
+    plan = plan_to_fly(settings.parent, None)
+    vehicle = vehicle_afloat(plan, survey)
+    loops = InnerLoops(vehicle)
+    link = mavutil.mavlink_connection(
+        f"udpout:127.0.0.1:{port}", dialect="ardupilotmega", source_system=1, source_component=1
+    )
+    origin = Datum(plan.datum.latitude_deg + 1e-4, plan.datum.longitude_deg)
+    # The origin of its filter is some 11 m north of the plan's datum.
+    shift = plan.datum.ned_from_geodetic(
+        np.array([[origin.latitude_deg, origin.longitude_deg, 0.0]])
+    )[0]
+    target, answered_ms, dived = (np.zeros(3), 0.0), -1, False
+    rows: list[list[float]] = []
+
+    def hear(message: object) -> None:
+        nonlocal target, answered_ms
+        kind = message.get_type()  # type: ignore[attr-defined]
+        if kind == "COMMAND_LONG" and message.command == 512:  # type: ignore[attr-defined]
+            link.mav.gps_global_origin_send(
+                round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7), 0
+            )
+        if kind == "SET_POSITION_TARGET_LOCAL_NED":
+            m = message
+            heading = m.yaw if not m.type_mask & 1024 else target[1]  # type: ignore[attr-defined]
+            assert m.coordinate_frame == 1  # type: ignore[attr-defined]
+            target = (np.array([m.vx, m.vy, m.vz]), heading)  # type: ignore[attr-defined]
+            answered_ms = m.time_boot_ms  # type: ignore[attr-defined]
+
+    while vehicle.tick < 8000:
+        vehicle.sense()
+        truth = vehicle.world.now
+        rows.append([vehicle.tick * 0.05, *truth[:7].tolist()])
+        stamp_ms = 1000 + 50 * vehicle.tick
+        sent, asked = -math.inf, time.monotonic()
+        while answered_ms < stamp_ms:
+            waited_s = time.monotonic() - asked
+            if waited_s > 60.0 or (dived and truth[2] < 0.35 and waited_s > 3.0):
+                break
+            if time.monotonic() - sent > 0.25:
+                sent = time.monotonic()
+                send(link, vehicle, stamp_ms, shift)
+            message = link.recv_match(blocking=True, timeout=0.05)
+            if message is not None:
+                hear(message)
+        dived = dived or truth[2] > 2.0
+        if answered_ms < stamp_ms:
+            break
+        vehicle.move(loops.speeds(truth, *target))
+    columns = ("time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
+    write_csv(track, columns, rows)
+
+
+def send(link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array) -> None:
+    mav, truth = link.mav, vehicle.world.now  # type: ignore[attr-defined]
+    turn = Rotation.from_quat(truth[3:7])
+    roll, pitch, heading = attitude_from_rotation(turn)
+    mav.heartbeat_send(SUBMARINE, ARDUPILOT, 1 | ARMED, GUIDED, 4)
+    mav.attitude_send(stamp_ms, roll, pitch, heading, *truth[10:13])
+    place = vehicle.sensors.place[DVL]
+    north, east, depth = truth[:3] + turn.apply(place)
+    down = turn.apply([0.0, 0.0, 1.0])
+    reach = floor_range(vehicle.floor, north, east, depth, *down, 75.0)
+    mav.rangefinder_send(reach if math.isfinite(reach) else 0.0, 0.0)
+    mav.local_position_ned_send(stamp_ms, *(truth[:3] - shift), *truth[7:10])
+
+
+if __name__ == "__main__":
+    fly(int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]))

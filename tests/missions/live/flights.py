@@ -1,0 +1,101 @@
+"""A small plan, and a vehicle in the water that a pilot's loop can fly, tick by tick."""
+
+import math
+
+import numpy as np
+
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.frames import Array
+from alice_survey.vehicle.floor import level_floor
+from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
+from missions.fly.simulation import flight_settings, mission_setup
+from missions.live.loop import LinkLimits, Odometry
+from missions.live.mission import Mission, mission_of
+from missions.values.plan_file import Plan
+from tests.missions.flown_plans import plan_of, walk
+
+FLOOR_M = 6.0
+START_S = 100.0
+"""The clock's time at the first tick."""
+
+
+def small_plan() -> Plan:
+    """Two lines of 4 m, 1 m apart, in water of 6 m."""
+    moves = [("line", 4.0, 0), ("spot", 90.0), ("go", 1.0), ("spot", 90.0), ("line", 4.0, 1)]
+    return plan_of([walk((0.0, 0.0), 0.0, moves)])
+
+
+def vehicle_afloat(plan: Plan, survey: SurveyConfig, seed: int = 1) -> SimulatedVehicle:
+    """The vehicle at the start of a plan."""
+    rng = np.random.default_rng(seed)
+    setup = mission_setup(plan, flight_settings(survey), level_floor(FLOOR_M), 1000.0, rng)
+    return SimulatedVehicle(
+        setup.vehicle, setup.sensors, setup.floor, setup.current, setup.disturbance, rng,
+        start_ne_m=setup.start_ne_m, start_heading_rad=setup.start_heading_rad,
+    )  # fmt: skip
+
+
+class LoopFlight:
+    """A loop that flies a simulated vehicle by its true motion; tests spoil what it hears."""
+
+    def __init__(self, survey: SurveyConfig | None = None, **limits: object) -> None:
+        survey = survey or SurveyConfig()
+        self.plan = small_plan()
+        self.vehicle = vehicle_afloat(self.plan, survey)
+        self.mission: Mission = mission_of(self.plan, flight_settings(survey), LinkLimits(**limits))  # type: ignore[arg-type]
+        self.loop = self.mission.loop
+        self.glass: list[Array] = []
+        self.clock_offset_s = 0.0
+
+    @property
+    def now_s(self) -> float:
+        return START_S + 0.05 * self.vehicle.tick + self.clock_offset_s
+
+    @property
+    def truth(self) -> Array:
+        """(13,) position, quaternion, velocity over ground in NED, body rates."""
+        return self.vehicle.world.now
+
+    def true_odometry(self, stamp_s: float | None = None) -> Odometry:
+        from scipy.spatial.transform import Rotation
+
+        truth = self.truth.copy()
+        velocity = Rotation.from_quat(truth[3:7]).inv().apply(truth[7:10])
+        stamp = self.now_s if stamp_s is None else stamp_s
+        return Odometry(
+            stamp_s=stamp, position_ned=truth[:3], quaternion_xyzw=truth[3:7],
+            velocity_body=velocity, rates_body=truth[10:],
+        )  # fmt: skip
+
+    def true_range(self) -> float:
+        """Of the altimeter at the DVL's place to the level floor."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_quat(self.truth[3:7])
+        place = SurveyConfig().camera.dvl_position_body_m
+        down = float(turn.apply([0.0, 0.0, 1.0])[2])
+        return float(FLOOR_M - self.truth[2] - turn.apply(place)[2]) / down
+
+    def tick(self, *, odometry: Odometry | str = "true", altitude: bool = True) -> None:
+        """A tick: `odometry` may be another, or "none"."""
+        from scipy.spatial.transform import Rotation
+
+        self.vehicle.sense()
+        if isinstance(odometry, Odometry):
+            self.loop.hear_odometry(odometry, self.now_s)
+        elif odometry == "true":
+            self.loop.hear_odometry(self.true_odometry(), self.now_s)
+        if altitude:
+            self.loop.hear_range(self.now_s, self.true_range(), self.now_s)
+        self.command = self.mission.tick(self.now_s)
+        point = SurveyConfig().camera.position_body_m
+        self.glass.append(self.truth[:3] + Rotation.from_quat(self.truth[3:7]).apply(point))
+        self.vehicle.move(self.command.rps)
+
+    def until(self, phase: str, most_s: float = 400.0) -> None:
+        """Fly until the guidance is in a phase."""
+        for _ in range(math.ceil(most_s / 0.05)):
+            if self.mission.phase == phase:
+                return
+            self.tick()
+        raise AssertionError(f"no {phase} within {most_s} s, but {self.mission.phase}")

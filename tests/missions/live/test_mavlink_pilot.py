@@ -1,0 +1,271 @@
+"""The MAVLink bridge: what it sends, its safe states, and a dive with a vehicle over UDP."""
+
+import json
+import math
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from alice_survey.base.artefacts import read_csv
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import VehicleError
+from missions.fly.simulation import flight_settings
+from missions.live.loop import LinkLimits, LinkState
+from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot, pilot_over_mavlink
+from missions.live.mission import mission_of
+from missions.values.flight import trigger_times
+from tests.missions.live.flights import FLOOR_M, small_plan
+
+ARMED = 128
+
+
+class Sink:
+    """Takes packets, and gives them back as messages."""
+
+    def __init__(self) -> None:
+        self.parser = dialect.MAVLink(None)
+        self.messages: list[dialect.MAVLink_message] = []
+
+    def write(self, data: bytes) -> None:
+        self.messages += self.parser.parse_buffer(data) or []
+
+    def take(self, kind: str) -> list[dialect.MAVLink_message]:
+        """All of a kind since the last time."""
+        found = [m for m in self.messages if m.get_type() == kind]
+        self.messages = [m for m in self.messages if m.get_type() != kind]
+        return found
+
+
+class Vehicle:
+    """Packets of a submarine that lies still at a place, through the protocol's own encoder."""
+
+    def __init__(self, system: int = 1, **limits: object) -> None:
+        plan = small_plan()
+        self.mission = mission_of(plan, flight_settings(SurveyConfig()), LinkLimits(**limits))  # type: ignore[arg-type]
+        self.sink = Sink()
+        self.out = dialect.MAVLink(self.sink, srcSystem=255, srcComponent=191)
+        self.pilot = MavlinkPilot(self.mission, self.out, sim_time=False)
+        self.own, self.back = dialect.MAVLink(None, srcSystem=system, srcComponent=1), Sink()
+        self.wall_s, self.boot_s = 5000.0, 20.0
+        self.mode, self.armed = GUIDED, True
+
+    def say(self, message: dialect.MAVLink_message) -> None:
+        message.pack(self.own)
+        (heard,) = self.back.parser.parse_buffer(message.get_msgbuf())
+        self.pilot.hear(heard, self.wall_s)
+
+    def heartbeat(self) -> None:
+        base = 1 | (ARMED if self.armed else 0)
+        self.say(self.own.heartbeat_encode(12, 3, base, self.mode, 4))
+
+    def origin(self) -> None:
+        datum = self.mission.plan.datum
+        place = [round(d * 1e7) for d in (datum.latitude_deg, datum.longitude_deg)]
+        self.say(self.own.gps_global_origin_encode(*place, 0))
+
+    def motion(self, *, north: float = -1.6, depth: float = 4.0, late_s: float = 0.0) -> None:
+        stamp = round((self.boot_s - late_s) * 1e3)
+        self.say(self.own.attitude_encode(stamp, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0))
+        self.say(self.own.rangefinder_encode(FLOOR_M - depth, 0.0))
+        self.say(self.own.local_position_ned_encode(stamp, north, 0.0, depth, 0.0, 0.0, 0.0))
+
+    def step(
+        self, count: int = 1, *, moves: bool = True, beats: bool = True, **motion: float
+    ) -> None:
+        for _ in range(count):
+            self.wall_s += 0.05
+            self.boot_s += 0.05
+            if beats:
+                self.heartbeat()
+            if moves:
+                self.motion(**motion)
+            self.pilot.step(self.wall_s)
+
+    def targets(self) -> list[dialect.MAVLink_message]:
+        return self.sink.take("SET_POSITION_TARGET_LOCAL_NED")
+
+
+@pytest.fixture
+def flying() -> Iterator[Vehicle]:
+    """A vehicle that is being flown."""
+    vehicle = Vehicle()
+    vehicle.heartbeat()
+    vehicle.origin()
+    vehicle.step(20)
+    assert vehicle.mission.loop.state == LinkState.FLYING
+    vehicle.targets()
+    yield vehicle
+
+
+def test_setpoints_are_velocities_in_ned_and_a_heading(flying: Vehicle) -> None:
+    """The vehicle is 1 m above the wanted depth, 2 m off the start: it is sent down and there."""
+    flying.step(1, north=-3.0, depth=2.5)
+    (target,) = flying.targets()
+    assert (target.target_system, target.target_component) == (1, 1)
+    assert target.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
+    # Positions, accelerations and the rate of the yaw are not to be followed.
+    assert target.type_mask == 0b100111000111
+    command = flying.mission.loop.tick(flying.mission.rows[-1][0])
+    c, s = math.cos(0.3), math.sin(0.3)
+    surge, sway, heave = command.velocity_body
+    expected = [c * surge - s * sway, s * surge + c * sway, heave]
+    np.testing.assert_allclose([target.vx, target.vy, target.vz], expected, atol=1e-6)
+    assert 0.05 < target.vz < 0.6
+    assert np.hypot(target.vx, target.vy) > 0.01
+    assert target.yaw == pytest.approx(command.heading_rad, abs=1e-6)
+
+
+def test_setpoints_come_at_the_rate_of_the_loop(flying: Vehicle) -> None:
+    flying.step(100)
+    assert 99 <= len(flying.targets()) <= 101
+
+
+@pytest.mark.parametrize(("mode", "armed"), [(19, True), (GUIDED, False)])
+def test_nothing_is_commanded_before_the_operator_clears_it(mode: int, armed: bool) -> None:
+    vehicle = Vehicle()
+    vehicle.mode, vehicle.armed = mode, armed
+    vehicle.heartbeat()
+    vehicle.origin()
+    vehicle.step(100)
+    assert not vehicle.targets()
+    assert vehicle.mission.loop.ticks == 0
+    vehicle.mode, vehicle.armed = GUIDED, True
+    vehicle.step(5)
+    assert vehicle.targets()
+
+
+def test_operator_takes_over(flying: Vehicle) -> None:
+    flying.mode = 19
+    flying.step(3)
+    assert flying.mission.loop.state == LinkState.OVER
+    assert flying.mission.loop.ending.startswith("ended: the vehicle was disarmed or taken out")
+    assert not flying.targets()
+
+
+def test_lost_position_stops_then_surfaces(flying: Vehicle) -> None:
+    flying.step(15, moves=False)
+    flying.targets()
+    flying.step(80, moves=False)
+    stops = flying.targets()
+    assert len(stops) >= 79
+    for target in stops:
+        assert (target.vx, target.vy, target.vz) == (0.0, 0.0, 0.0)
+        assert target.type_mask & 1024
+    flying.step(60, moves=False)
+    assert flying.mission.loop.state == LinkState.GIVEN_UP
+    modes = [m for m in flying.sink.take("COMMAND_LONG") if m.command == 176]
+    assert modes
+    assert {(m.param1, m.param2) for m in modes} == {(1.0, float(SURFACE))}
+    flying.mode = SURFACE
+    flying.step(1, moves=False)
+    assert flying.mission.loop.ending.startswith("given up")
+
+
+def test_lost_position_with_drift_keeps_its_mode() -> None:
+    vehicle = Vehicle(on_loss="drift", grace_s=1.0)
+    vehicle.heartbeat()
+    vehicle.origin()
+    vehicle.step(20)
+    vehicle.step(200, moves=False)
+    assert vehicle.mission.loop.state == LinkState.GIVEN_UP
+    assert not [m for m in vehicle.sink.take("COMMAND_LONG") if m.command == 176]
+    assert all(m.vz == 0.0 for m in vehicle.targets()[-100:])
+
+
+@pytest.mark.parametrize("spoilt", ["late", "nan", "no heartbeat", "rebooted"])
+def test_what_is_not_of_now_is_not_flown_by(flying: Vehicle, spoilt: str) -> None:
+    if spoilt == "late":
+        flying.step(30, late_s=0.7)
+    elif spoilt == "nan":
+        flying.step(30, north=math.nan)
+    elif spoilt == "no heartbeat":
+        flying.step(80, beats=False)
+    else:
+        flying.boot_s = 1.0
+        flying.step(30)
+    assert flying.mission.loop.state == LinkState.HELD
+    last = flying.targets()[-1]
+    assert (last.vx, last.vy, last.vz) == (0.0, 0.0, 0.0)
+
+
+def test_packets_of_other_systems_are_not_looked_at(flying: Vehicle) -> None:
+    flying.own = dialect.MAVLink(None, srcSystem=7, srcComponent=1)
+    flying.step(30)
+    assert flying.mission.loop.state == LinkState.HELD
+
+
+def test_vehicle_without_an_origin_is_given_the_datum() -> None:
+    vehicle = Vehicle()
+    vehicle.heartbeat()
+    vehicle.step(110)
+    asked = [m for m in vehicle.sink.take("COMMAND_LONG") if m.command == 512]
+    (given, *_) = vehicle.sink.take("SET_GPS_GLOBAL_ORIGIN")
+    assert len(asked) >= 4
+    assert {m.param1 for m in asked} == {49.0}
+    datum = vehicle.mission.plan.datum
+    assert given.latitude * 1e-7 == pytest.approx(datum.latitude_deg, abs=1e-7)
+    assert given.longitude * 1e-7 == pytest.approx(datum.longitude_deg, abs=1e-7)
+    assert not vehicle.targets()
+
+
+def test_address_that_cannot_be_opened_is_a_line() -> None:
+    vehicle = Vehicle()
+    with pytest.raises(VehicleError, match="nowhere"):
+        pilot_over_mavlink(vehicle.mission, "nowhere:1:2:3", sim_time=False)
+
+
+@pytest.mark.slow
+def test_dive_over_udp(tmp_path: Path) -> None:
+    """The command flies a vehicle of another process, whose own loops follow the set-points."""
+    plan = small_plan()
+    (tmp_path / "plan").mkdir()
+    (tmp_path / "plan" / "plan.json").write_text(json.dumps(plan.to_json()))
+    settings = tmp_path / "survey.toml"
+    settings.write_text("[area]\nseafloor_depth_m = 6.0\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    track, record = tmp_path / "track.csv", tmp_path / "record.csv"
+    fake = subprocess.Popen(
+        [
+            sys.executable, "-m", "tests.missions.live.fake_ardusub", str(port), str(settings),
+            str(track),
+        ]
+    )  # fmt: skip
+    try:
+        ended = subprocess.run(
+            [
+                sys.executable, "-m", "alice_survey", "pilot", "-w", str(tmp_path), "--sim-time",
+                "--mavlink", f"udpin:127.0.0.1:{port}", "--record", str(record), "--json",
+            ],
+            capture_output=True, text=True, timeout=280, check=False,
+        )  # fmt: skip
+        fake.wait(60)
+    finally:
+        fake.kill()
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout)["ending"] == "complete"
+
+    _, truth = read_csv(track)
+    _, rows = read_csv(record)
+    true = np.array([[float(cell) for cell in row.values()] for _, row in truth])
+    time_s = np.array([float(row["time_s"]) for _, row in rows]) - 1.0
+    line = np.array([float(row["line"]) for _, row in rows])
+    glass = np.array(
+        [[float(row[f"glass_{axis}_m"] or "nan") for axis in ("north", "east")] for _, row in rows]
+    )
+    known = np.isfinite(glass[:, 0])
+    at_s, lines = trigger_times(plan, time_s[known], line[known], glass[known])
+    assert lines == (0,) * 6 + (1,) * 6
+    # The body's origin is 0.55 m behind the glass, and 0.05 m to starboard of it.
+    north = np.interp(at_s, true[:, 0], true[:, 1])
+    east = np.interp(at_s, true[:, 0], true[:, 2])
+    there = np.array([*np.linspace(0, 4, 6) - 0.55, *np.linspace(4, 0, 6) + 0.55])
+    np.testing.assert_allclose(north, there, atol=0.15)
+    np.testing.assert_allclose(east, [0.05] * 6 + [0.95] * 6, atol=0.15)

@@ -1,0 +1,296 @@
+"""The ROS 2 nodes: messages and frames, a dive of two processes, and a lost navigation."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.artefacts import read_csv
+from alice_survey.base.config import load_config
+from alice_survey.base.frames import Array, attitude_from_rotation, interpolate_poses
+from alice_survey.base.trajectory import read_track
+from alice_survey.vehicle.floor import floor_depth
+from camera_calib.rig import design_rig
+from missions.coverage.certificate import certificate
+from missions.coverage.stations import Stations, plan_pattern, stations_of_flight
+from missions.fly.run import flight_noise, true_floor
+from missions.fly.simulation import flight_settings, simulate_plan
+from missions.live import ros_messages
+from missions.live.loop import Odometry
+from missions.live.ros_vehicle import START_S
+from missions.values.flight import trigger_times
+from tests.missions.live.flights import small_plan
+
+rclpy = pytest.importorskip(
+    "rclpy", reason="ROS 2 is not installed: pip install 'alice-survey[ros]'"
+)
+
+pytestmark = pytest.mark.xdist_group("ros")
+DOMAIN = {
+    **os.environ,
+    "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+}
+"""One domain a test process, on the loopback alone."""
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """A workspace with a small plan."""
+    (tmp_path / "plan").mkdir()
+    (tmp_path / "plan" / "plan.json").write_text(json.dumps(small_plan().to_json()))
+    (tmp_path / "survey.toml").write_text("seed = 5\n[area]\nseafloor_depth_m = 6.0\n")
+    return tmp_path
+
+
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "alice_survey", *words]
+
+
+# ------------------------------------------------------------------ messages
+
+
+def test_odometry_is_in_the_frames_of_rep_103() -> None:
+    """2 m north, 3 m east, 5 m deep, heading east, bow up by 0.1 rad, going ahead."""
+    ros = ros_messages.load_ros()
+    turn = Rotation.from_euler("ZYX", [math.pi / 2, 0.1, 0.0])
+    odometry = Odometry(
+        stamp_s=12.25,
+        position_ned=np.array([2.0, 3.0, 5.0]),
+        quaternion_xyzw=turn.as_quat(),
+        velocity_body=np.array([0.4, 0.1, 0.2]),
+        rates_body=np.array([0.01, 0.02, 0.3]),
+    )
+    message = ros_messages.odometry_message(ros, odometry, "alice/base_link", np.arange(6.0))
+
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 250_000_000)
+    assert (message.header.frame_id, message.child_frame_id) == ("map", "alice/base_link")
+    place, twist = message.pose.pose.position, message.twist.twist
+    assert (place.x, place.y, place.z) == (3.0, 2.0, -5.0)
+    assert (twist.linear.x, twist.linear.y, twist.linear.z) == (0.4, -0.1, -0.2)
+    assert (twist.angular.x, twist.angular.y, twist.angular.z) == (0.01, -0.02, -0.3)
+    q = message.pose.pose.orientation
+    forward = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(forward, [math.cos(0.1), 0.0, math.sin(0.1)], atol=1e-12)
+    np.testing.assert_array_equal(np.diag(np.reshape(message.pose.covariance, (6, 6))), range(6))
+
+    back = ros_messages.odometry_from(message)
+    for name in ("position_ned", "velocity_body", "rates_body"):
+        np.testing.assert_allclose(getattr(back, name), getattr(odometry, name), atol=1e-15)
+    same = Rotation.from_quat(back.quaternion_xyzw) * turn.inv()
+    assert same.magnitude() < 1e-12
+    assert back.stamp_s == 12.25
+
+
+def test_wrench_and_speeds_come_back() -> None:
+    ros = ros_messages.load_ros()
+    wrench = np.array([1.0, 2.0, -3.0, 0.1, -0.2, 0.3])
+    message = ros_messages.wrench_message(ros, 1.0, "alice/base_link", wrench)
+    force, torque = message.wrench.force, message.wrench.torque
+    # To starboard is to -y, and up is +z.
+    assert (force.x, force.y, force.z) == (1.0, -2.0, 3.0)
+    assert (torque.x, torque.y, torque.z) == (0.1, 0.2, -0.3)
+    np.testing.assert_array_equal(ros_messages.wrench_from(message), wrench)
+
+    names = ("port", "stern")
+    message = ros_messages.speeds_message(
+        ros, 1.0, names, np.array([2.0, -3.0]), np.array([5, -6.0])
+    )
+    np.testing.assert_allclose(message.velocity, [4 * math.pi, -6 * math.pi])
+    assert list(message.effort) == [5.0, -6.0]
+    # By name, in whatever order.
+    message.name, message.velocity = ["stern", "bow", "port"], [1.0, 2.0, 3.0]
+    speeds = ros_messages.speeds_from(message, ("port", "stern", "vertical"))
+    np.testing.assert_allclose(speeds * 2 * math.pi, [3.0, 1.0, math.nan])
+
+
+def test_ranges_out_of_bounds_are_no_echo() -> None:
+    ros = ros_messages.load_ros()
+    for value, expected in ((2.0, 2.0), (math.nan, math.inf), (80.0, math.inf)):
+        message = ros_messages.range_message(ros, 1.0, "alice/dvl", value, 75.0)
+        assert ros_messages.range_from(message) == expected
+
+
+# ------------------------------------------------------------------ a dive
+
+
+@pytest.mark.slow
+def test_dive_of_two_processes_covers_what_the_closed_loop_does(workspace: Path) -> None:
+    """Tick by tick on the simulation's clock: `simulate --ros` and `pilot` over the loopback."""
+    track, record = workspace / "track.csv", workspace / "record.csv"
+    at_sea = subprocess.Popen(
+        command("simulate", "--ros", "-w", str(workspace), "--rate", "0", "--track", str(track)),
+        env=DOMAIN, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        pilot = subprocess.run(
+            command(
+                "pilot", "-w", str(workspace), "--sim-time", "--record", str(record), "--json"
+            ),
+            env=DOMAIN, capture_output=True, text=True, timeout=280, check=False,
+        )  # fmt: skip
+        said, _ = at_sea.communicate(timeout=60)
+    finally:
+        at_sea.kill()
+    assert pilot.returncode == 0, pilot.stderr
+    result = json.loads(pilot.stdout)
+    assert result["ending"] == "complete"
+    assert (result["late_ticks"], result["clock_jumps"]) == (0, 0)
+    assert "its commander left" in said
+
+    survey, plan = load_config(workspace / "survey.toml"), small_plan()
+    floor = true_floor(plan, survey)
+    closed = simulate_plan(plan, flight_settings(survey), floor, flight_noise(survey.seed))
+    rig = design_rig(survey.camera, survey.water)
+    glass_body = survey.camera.position_body_m
+
+    true = read_track(track)
+    _, rows = read_csv(record)
+    time_s, line, glass = (
+        np.array([[float(row[name] or "nan") for name in names] for _, row in rows])
+        for names in (("time_s",), ("line",), ("glass_north_m", "glass_east_m"))
+    )
+    known = np.isfinite(glass[:, 0])
+    at_s, lines = trigger_times(plan, time_s[known, 0], line[known, 0], glass[known])
+    assert lines == closed.trigger_line == (0,) * 6 + (1,) * 6
+    poses = interpolate_poses(true.time_s, true.ned_from_body, at_s)
+    taken = _stations(poses, np.array(glass_body), floor, lines)
+
+    wanted = plan_pattern(plan, rig)
+    seen = certificate(plan.area, rig, taken, wanted)
+    expected = certificate(plan.area, rig, stations_of_flight(closed), wanted)
+    assert 0.1 < expected.covered_share < 1.0
+    assert seen.covered_share == pytest.approx(expected.covered_share, abs=0.02)
+    assert seen.every_camera_share == pytest.approx(expected.every_camera_share, abs=0.02)
+    # The same navigation errors in the same sea: only the altimeter differs.
+    np.testing.assert_allclose(taken.glass_ne, stations_of_flight(closed).glass_ne, atol=0.1)
+    assert true.time_s[-1] - START_S == pytest.approx(closed.flown.time_s[-1], rel=0.1)
+
+
+def _stations(
+    poses: RigidTransform, glass_body: Array, floor: Any, lines: tuple[int, ...]
+) -> Stations:
+    glass = poses.apply(glass_body)
+    depths = np.array([floor_depth(floor, float(n), float(e)) for n, e in glass[:, :2]])
+    return Stations(
+        glass_ne=glass[:, :2],
+        altitude_m=depths - glass[:, 2],
+        attitude_rad=attitude_from_rotation(poses.rotation).reshape(-1, 3),
+        line=np.array(lines, dtype=np.intp),
+    )
+
+
+# ------------------------------------------------------------------ safe states
+
+
+class Navigator:
+    """A node that says where the vehicle is, and keeps what the pilot commands."""
+
+    def __init__(self) -> None:
+        self.ros = ros_messages.load_ros()
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.context = Context()
+        rclpy.init(args=[], context=self.context, domain_id=int(DOMAIN["ROS_DOMAIN_ID"]))
+        self.node = rclpy.create_node("navigator", namespace="alice", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        kinds, qos = self.ros.messages, self.ros.qos
+        self.odometry = self.node.create_publisher(kinds.Odometry, "navigation/odometry", qos)
+        self.wrenches: list[Array] = []
+        self.speeds: list[Array] = []
+        self.node.create_subscription(
+            kinds.Wrench, "pilot/wrench",
+            lambda m: self.wrenches.append(ros_messages.wrench_from(m)), qos,
+        )  # fmt: skip
+        self.node.create_subscription(
+            kinds.JointState, "thrusters/command",
+            lambda m: self.speeds.append(np.array(m.velocity)), qos,
+        )  # fmt: skip
+
+    def publish(self, depth: float) -> None:
+        odometry = Odometry(
+            stamp_s=self.node.get_clock().now().nanoseconds * 1e-9,
+            position_ned=np.array([0.0, 0.0, depth]),
+            quaternion_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+            velocity_body=np.zeros(3),
+            rates_body=np.zeros(3),
+        )
+        self.odometry.publish(
+            ros_messages.odometry_message(self.ros, odometry, "alice/base_link", np.zeros(6))
+        )
+
+    def until(self, holds: Any, *, depth: float | None, most_s: float = 120.0) -> None:
+        """Spin, and publish odometry if there is a depth, until something holds."""
+        end = time.monotonic() + most_s
+        while not holds():
+            assert time.monotonic() < end, (len(self.wrenches), self.wrenches[-1:])
+            if depth is not None:
+                self.publish(depth)
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def navigator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Navigator]:
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTDDS_BUILTIN_TRANSPORTS"):
+        monkeypatch.setenv(name, DOMAIN[name])
+    made = Navigator()
+    yield made
+    made.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["silent", "nan"])
+def test_lost_odometry_stops_then_surfaces(
+    workspace: Path, navigator: Navigator, lost: str
+) -> None:
+    """In real time: a pilot process, whose odometry stops, or goes on as NaN."""
+    pilot = subprocess.Popen(
+        command("pilot", "-w", str(workspace), "--grace", "1"),
+        env=DOMAIN, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    depth = None if lost == "silent" else math.nan
+    try:
+        # It dives from 1 m: the wrench is down, and thrusters turn.
+        navigator.until(
+            lambda: (
+                navigator.wrenches
+                and navigator.wrenches[-1][2] > 1.0
+                and np.any(navigator.speeds[-1])
+            ),
+            depth=1.0,
+        )
+        begun = len(navigator.wrenches)
+        navigator.until(lambda: navigator.wrenches[-1][2] < -5.0, depth=depth)
+        after = np.array(navigator.wrenches[begun:])
+        off = np.flatnonzero(~np.any(after, axis=1))
+        # First off, then up and nothing else.
+        assert len(off) > 5
+        assert not np.any(after[-1, [0, 1, 3, 4, 5]])
+        # At the surface it ends, with no thrust.
+        navigator.until(lambda: pilot.poll() is not None, depth=0.1)
+        navigator.until(
+            lambda: not np.any(navigator.wrenches[-1]) and not np.any(navigator.speeds[-1]),
+            depth=None,
+        )
+    finally:
+        pilot.kill()
+    assert pilot.returncode == 1
+    assert pilot.stdout is not None
+    assert pilot.stdout.read().startswith("given up: ")
