@@ -152,8 +152,8 @@ def _thrust(pulses: Array, columns: ColumnMap, source: str) -> Array:
     beyond = (sent < curve[0, 0]) | (sent > curve[-1, 0])
     if beyond.any():
         raise VehicleError(
-            f"{source} has a pulse of {sent[beyond][0]:g}; thrust_of_pulse knows {curve[0, 0]:g} to "
-            f"{curve[-1, 0]:g}"
+            f"{source} has a pulse of {sent[beyond][0]:g}; thrust_of_pulse knows {curve[0, 0]:g} "
+            f"to {curve[-1, 0]:g}"
         )
     thrust: Array = np.interp(sent, *curve.T)
     return np.where(pulses == 0.0, 0.0, thrust)

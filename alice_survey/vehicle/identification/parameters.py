@@ -54,7 +54,7 @@ class Parameters:
     @cached_property
     def terms(self) -> Terms:
         """For compiled code."""
-        places = [_place(name) for name in self.names]
+        places = [place_of(name) for name in self.names]
         columns = np.array(places, dtype=np.int64).reshape(-1, 3).T
         return Terms(*(np.ascontiguousarray(column) for column in columns))
 
@@ -72,7 +72,7 @@ class Parameters:
         """
         lower, upper = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for k, name in enumerate(self.names):
-            kind, i, j = _place(name)
+            kind, i, j = place_of(name)
             if kind in (LINEAR, QUADRATIC, ADDED_MASS) and i == j:
                 upper[k] = 0.0
             elif kind == GAIN:
@@ -145,7 +145,7 @@ def free_parameters(
         raise VehicleError("no parameter is free: name some, such as --free X_uu,Y_vv,current")
     places: dict[tuple[int, int, int], str] = {}
     for name in flat:
-        kind, i, j = _place(name)
+        kind, i, j = place_of(name)
         place = (kind, min(i, j), max(i, j)) if kind == ADDED_MASS else (kind, i, j)
         if place in places:
             raise VehicleError(f"{places[place]} and {name} are one parameter: free it once")
@@ -164,7 +164,7 @@ def unit_of(name: str) -> str:
     Raises:
         VehicleError: the name is not known.
     """
-    kind, i, j = _place(name)
+    kind, i, j = place_of(name)
     if kind == GAIN:
         return "1"
     if kind in (CURRENT, TRIM, BUOYANCY, BIAS):
@@ -179,7 +179,7 @@ def unit_of(name: str) -> str:
     return f"{force} s{power}" + ("" if turning else f"/m{power}")
 
 
-def _place(name: str) -> tuple[int, int, int]:
+def place_of(name: str) -> tuple[int, int, int]:
     """Kind, row and column of a parameter.
 
     Raises:
