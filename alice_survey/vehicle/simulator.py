@@ -35,7 +35,7 @@ from alice_survey.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.vehicle.navigation.filter import NavigationState, new_navigation
+from alice_survey.vehicle.navigation.filter import WATER, NavigationState, new_navigation
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.vehicle.pilot.gains import INNER, SWAY, Gains
@@ -56,6 +56,7 @@ from alice_survey.vehicle.pilot.memory import (
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import THRUSTER_LOST, TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.thrust_watch import ThrustWatch
 from alice_survey.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure, ThrusterWatch
 from alice_survey.vehicle.propulsion import (
     Propulsion,
@@ -63,6 +64,7 @@ from alice_survey.vehicle.propulsion import (
     speeds_for,
     thrust_limits,
     weakened,
+    without_thrust,
 )
 from alice_survey.vehicle.rotations import matrix_rows
 from alice_survey.vehicle.sea import Current, Disturbance, current_at
@@ -72,6 +74,8 @@ TICK_S = 0.05
 STEPS = 5
 """Runge-Kutta steps in a tick."""
 _CHUNK_TICKS = 1200
+_WATER_NE = slice(WATER + 1, WATER + 3)
+"""Current to the north and east in the filter's nominal state, whose quaternion is one longer."""
 _WATCHED_TICKS = round(WATCHED_S / TICK_S)
 
 
@@ -287,7 +291,9 @@ class Failure:
     time_s: float
     thruster: str
     left: float
-    """Share of its greatest speed squared that is left."""
+    """Share of its greatest speed squared that is left; of its thrust if it turns."""
+    turns: bool = False
+    """Whether it goes on turning as commanded, with the propeller gone or fouled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -383,8 +389,13 @@ def _chunks(
     """Rows of a minute each at most, until the mission is over; adds failures that are found."""
     vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
     sound = vehicle.plant
-    left = dict(setup.health)
-    plant = Plant(sound.body, weakened(sound.propulsion, vehicle.health_of(left)))
+    left, pushing = dict(setup.health), dict[str, float]()
+
+    def failed() -> Plant:
+        slower = weakened(sound.propulsion, vehicle.health_of(left))
+        return Plant(sound.body, without_thrust(slower, vehicle.health_of(pushing)))
+
+    plant = failed()
     world = _new_world(setup, n)
     navigation = new_navigation(setup.sensors, world.now, rng)
     pilot, allocation, scratch = new_pilot(), _allocation(setup), scratch_for(n)
@@ -395,13 +406,16 @@ def _chunks(
     last, first = math.ceil(longest_s / TICK_S), 0
     gains, guidance = setup.gains, setup.guidance
     known = dict(setup.health if setup.known_health is None else setup.known_health)
-    sees = ThrusterWatch(vehicle.thrusters, TICK_S)
+    sees, feels = (
+        ThrusterWatch(vehicle.thrusters, TICK_S),
+        ThrustWatch(setup.believed or vehicle, TICK_S),
+    )
     most = _CHUNK_TICKS if setup.without is None else _WATCHED_TICKS
     waiting = sorted(setup.failures, key=lambda failure: failure.time_s)
     while first < last:
         while waiting and round(waiting[0].time_s / TICK_S) <= first:
-            left[waiting[0].thruster] = waiting[0].left
-            plant = Plant(sound.body, weakened(sound.propulsion, vehicle.health_of(left)))
+            (pushing if waiting[0].turns else left)[waiting[0].thruster] = waiting[0].left
+            plant = failed()
             del waiting[0]
         end = min(first + most, last)
         if waiting:
@@ -417,7 +431,13 @@ def _chunks(
         first = end
         if setup.without is None:
             continue
-        new = sees.judge(first * TICK_S, rows.command_rps, rows.state[:, STATE:])
+        rps, now_s = rows.state[:, STATE:], first * TICK_S
+        new = sees.judge(now_s, rows.command_rps, rps)
+        for failure in new:
+            feels.known_gone(failure.thruster)
+        estimate, water_ne = rows.navigation[:, : vector.ALTITUDE], navigation.nominal[_WATER_NE]
+        water_sigma_mps = math.sqrt(navigation.covariance[WATER, WATER])
+        new += feels.judge(now_s, estimate, rps, water_ne, water_sigma_mps)
         for failure in new:
             found.append(failure)
             known[failure.thruster] = min(failure.left, known.get(failure.thruster, 1.0))

@@ -230,10 +230,13 @@ def _failures(craft: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
     Raises:
         VehicleError: one is not the vehicle's.
     """
-    craft.health_of({name: share for name, _, share in settings.failures})
+    kinds = ((settings.failures, False), (settings.lost_propellers, True))
+    for failures, _ in kinds:
+        craft.health_of({name: share for name, _, share in failures})
     return tuple(
-        Failure(thruster=name, time_s=time_s, left=share)
-        for name, time_s, share in settings.failures
+        Failure(thruster=name, time_s=time_s, left=share, turns=turns)
+        for failures, turns in kinds
+        for name, time_s, share in failures
     )
 
 

@@ -300,6 +300,26 @@ def test_a_thruster_that_fails_on_the_way_is_found_and_flown_without() -> None:
     np.testing.assert_array_equal(found.flown.state[before], whole.flown.state[: before.sum()])
 
 
+def test_a_thruster_that_turns_and_pushes_nothing_is_found_and_flown_without() -> None:
+    at_s = 70.0
+    lost = {"lost_propellers": [["stern", at_s, 0.0]]}
+    found, blind = (
+        fly(survey(vehicle={**lost, "finds_failures": finds})) for finds in (True, False)
+    )
+    (one,) = found.flown.found
+    assert (one.thruster, one.left, one.turns) == ("stern", 0.0, True)
+    assert at_s + 5.0 <= one.time_s <= at_s + 60.0
+    assert found.ending == "complete"
+    assert blind.flown.found == ()
+    assert heading_deg(found, one.time_s + 20.0) < 20.0
+    assert heading_deg(blind, at_s + 20.0) > 2.0 * heading_deg(found, one.time_s + 20.0)
+    # It turns as commanded until it is found, and stands still from then on.
+    stern = found.flown.rps[:, found.flown.thrusters.index("stern")]
+    seconds = found.truth.time_s
+    assert np.abs(stern[(seconds > at_s) & (seconds < one.time_s)]).max() > 5.0
+    assert np.abs(stern[seconds > one.time_s + 5.0]).max() < 1.0
+
+
 def test_nothing_is_found_where_nothing_fails() -> None:
     other = {"name": "sparus2", "controller": "los"}
     for changes in ({}, {"sea": {"current_mps": 0.3}}, {"vehicle": other}):

@@ -57,7 +57,7 @@ class ThrusterWatch:
             rps: (T, n) speeds that were turned.
         """
         found = []
-        time_s = self._tick_s * np.arange(len(rps))
+        time_s: Array = self._tick_s * np.arange(len(rps), dtype=np.float64)
         for i, thruster in enumerate(self._thrusters):
             if self._gone[i]:
                 continue
