@@ -333,6 +333,10 @@ class NavigationConfig(Config):
     compass_noise_deg: float = Field(0.3, gt=0, le=30)
     dvl_noise_mps: float = Field(0.0035, gt=0, le=1)
     dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
+    bottom_dropouts_s: tuple[tuple[float, float], ...] = Field((), exclude_if=lambda d: not d)
+    """Seconds (from, to) in which the DVL hears the water, and not the bottom."""
+    blind_sigma_m: float = Field(0.0, ge=0, le=100, exclude_if=lambda sigma: sigma == 0.0)
+    """Horizontal sigma up to which the vehicle goes on without bottom lock; 0: it does not."""
     usbl: bool = True
     usbl_noise_m: float = Field(0.5, gt=0, le=100)
 

@@ -47,6 +47,7 @@ from alice_survey.vehicle.pilot.memory import (
     PHASE,
     REASON,
     REPORT,
+    SIGMA_M,
     SWAY_SUM_E,
     SWAY_SUM_N,
     YAW_SUM,
@@ -201,6 +202,8 @@ def _fly_ticks(
             time_s, tick, TICK_S, world.before, world.now, world.water, floor, sensors,
             navigation, rng, world.estimate,
         )  # fmt: skip
+        spread = max(navigation.covariance[0, 0], navigation.covariance[1, 1])
+        pilot.memory[SIGMA_M] = math.sqrt(max(spread, 0.0))
         steer(time_s, TICK_S, world.estimate, path, guidance, gains, pilot, world.wrench)
         touched = _touches(world.now, sensors, floor)
         if touched:

@@ -192,6 +192,7 @@ def mission_setup(
                 0.5 * plan.altitude_m,
                 deepest_m,
                 longest_s=longest_s,
+                blind_sigma_m=settings.navigation.blind_sigma_m,
                 blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
             ),
         )
@@ -288,6 +289,7 @@ def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuit
             rate_hz=_USBL_HZ if navigation.usbl else 0.0, noise_m=navigation.usbl_noise_m
         ),
         dvl_dropouts_s=navigation.dvl_dropouts_s,
+        bottom_dropouts_s=navigation.bottom_dropouts_s,
         followed_body_m=camera.position_body_m,
     )
 
