@@ -32,7 +32,8 @@ class FlightChanges:
     current: str | None = None
     """SPEED@DIRECTION."""
     failed: Sequence[str] | None = None
-    """NAME of a thruster that has failed, NAME=SHARE that is left of it, either @SECONDS."""
+    """NAME of a thruster that has failed, NAME=SHARE that is left of it, NAME:propeller of
+    one that turns on, either @SECONDS."""
     dive: int | None = None
     """Number of the dive to fly, from 1."""
 
@@ -51,7 +52,8 @@ class FlightChanges:
         return changed(
             config, "vehicle",
             name=self.vehicle, controller=self.controller,
-            thruster_health=health.at_start, failures=health.later, dive=self.dive,
+            thruster_health=health.at_start, failures=health.later,
+            lost_propellers=health.propellers, dive=self.dive,
         )  # fmt: skip
 
 

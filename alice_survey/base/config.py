@@ -281,8 +281,10 @@ class VehicleConfig(Config):
     health_known: bool = True
     failures: tuple[tuple[str, Seconds, Share], ...] = Field((), exclude_if=lambda f: not f)
     """Thrusters that fail on the way: name, seconds from the start, share that is left."""
+    lost_propellers: tuple[tuple[str, Seconds, Share], ...] = Field((), exclude_if=lambda f: not f)
+    """Thrusters that go on turning with less thrust: name, seconds, share of it that is left."""
     finds_failures: bool = Field(True, exclude_if=bool)
-    """Whether the vehicle watches how its thrusters turn."""
+    """Whether the vehicle watches how its thrusters turn, and what they push."""
     battery_wh: float = Field(1400.0, ge=0.01, le=1_000_000)
     battery_reserve: float = Field(0.2, ge=0, lt=1)
     hotel_w: float = Field(60.0, ge=0, le=5000)
@@ -334,6 +336,10 @@ class NavigationConfig(Config):
     compass_noise_deg: float = Field(0.3, gt=0, le=30)
     dvl_noise_mps: float = Field(0.0035, gt=0, le=1)
     dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
+    bottom_dropouts_s: tuple[tuple[float, float], ...] = Field((), exclude_if=lambda d: not d)
+    """Seconds (from, to) in which the DVL hears the water, and not the bottom."""
+    blind_sigma_m: float = Field(0.0, ge=0, le=100, exclude_if=lambda sigma: sigma == 0.0)
+    """Horizontal sigma up to which the vehicle goes on without bottom lock; 0: it does not."""
     usbl: bool = True
     usbl_noise_m: float = Field(0.5, gt=0, le=100)
 
@@ -567,6 +573,9 @@ def parse_current(text: str | None) -> tuple[float | None, float | None]:
         ) from None
 
 
+_PROPELLER = ":propeller"
+
+
 class Health(NamedTuple):
     """What is left of thrusters."""
 
@@ -574,31 +583,40 @@ class Health(NamedTuple):
     """Shares by name; None of none."""
     later: list[tuple[str, float, float]] | None
     """Name, seconds from the start, share."""
+    propellers: list[tuple[str, float, float]] | None
+    """The same of those that turn on, without that share of their thrust."""
 
 
 def parse_health(texts: Sequence[str] | None) -> Health:
     """Thrusters and what is left of them, from `NAME` (nothing), `NAME=SHARE` and `...@SECONDS`.
+
+    `NAME:propeller`, and so on, is of one that turns on with that share of its thrust.
 
     Raises:
         ConfigError: a share or a time is not a number.
     """
     at_start: dict[str, float] = {}
     later: list[tuple[str, float, float]] = []
+    propellers: list[tuple[str, float, float]] = []
     for text in texts or ():
         what, at, seconds = text.partition("@")
         name, _, share = what.partition("=")
         try:
             left = float(share or 0.0)
-            if at:
+            if name.endswith(_PROPELLER):
+                start_s = float(seconds) if at else 0.0
+                propellers.append((name.removesuffix(_PROPELLER), start_s, left))
+            elif at:
                 later.append((name, float(seconds), left))
             else:
                 at_start[name] = left
         except ValueError:
             raise ConfigError(
                 f"thruster {text!r}: give NAME, or NAME=SHARE of its thrust that is left, as "
-                "stern=0.5, and @SECONDS for a failure on the way, as stern@600"
+                "stern=0.5, and @SECONDS for a failure on the way, as stern@600; NAME:propeller "
+                "turns on without it"
             ) from None
-    return Health(at_start or None, later or None)
+    return Health(at_start or None, later or None, propellers or None)
 
 
 def _one_line(error: ValidationError) -> str:

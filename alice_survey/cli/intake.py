@@ -171,7 +171,7 @@ def import_log(
         list[str] | None, typer.Option(metavar="ROLE=NAME", help="Topic or message to use.")
     ] = None,
     datum: Annotated[
-        tuple[float, float] | None, typer.Option(help="Origin of a bag's odometry, deg.")
+        tuple[float, float] | None, typer.Option(help="Origin of a bag's odometry or of XKF1, deg.")
     ] = None,
     lever_arm: Annotated[
         tuple[float, float, float], typer.Option(help="Of the logged position on the body, m.")

@@ -168,6 +168,7 @@ def fov(
         "fly -w before --vehicle sparus2 --controller los",
         "fly -w reef --fail stern --fail bow=0.5 --json",
         "fly -w reef --fail stern@600",
+        "fly -w reef --fail stern:propeller@600",
         "fly -w reef --dive 2",
     )
 )

@@ -131,6 +131,13 @@ def identify(
     hold_input: Annotated[
         bool, typer.Option("--hold-input", help="Inputs stay until the next row.")
     ] = False,
+    prior: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIGMAS",
+            help="Relative, about the start: damping=0.5,added_mass=0.3,...; a number; none.",
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")] = Path("identified"),
     as_json: AsJson = False,
 ) -> None:
@@ -139,12 +146,62 @@ def identify(
     Damping, added mass, body lift, a constant current and more, each with its sigma; and how well
     they predict another log.
     """
+    from alice_survey.vehicle.identification.prior import read_prior
     from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
 
     options = IdentifyOptions(
         vehicle=vehicle, coefficients=coefficients, validate=validate, bollard=bollard,
         free=tuple((free or "").split(",")) if free else (), held=tuple(held or ()),
         method=method, columns=columns, given=tuple(given.split(",")) if given else (),
-        window_s=window, hold_input=hold_input,
+        window_s=window, hold_input=hold_input, prior=read_prior(prior or ""),
     )  # fmt: skip
     print_result(*identify_report(logs, out, options), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "vehicle replay reef/flight/vehicle.csv",
+        "vehicle replay dive.csv --vehicle own.toml --coefficients found/coefficients.json",
+        "vehicle replay run1.csv --columns columns.toml --vehicle rov.toml --given p,q --reset 60",
+    )
+)
+def replay(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="docs/vehicle-logs.md")],
+    vehicle: Annotated[
+        str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
+    ] = "alice",
+    coefficients: Annotated[
+        str | None, typer.Option(help="Set or file, as of identify; the vehicle's if not given.")
+    ] = None,
+    held: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="As current_north_mps=0.1.")
+    ] = None,
+    columns: Annotated[Path | None, typer.Option(help="TOML: what other columns mean.")] = None,
+    given: Annotated[
+        str | None, typer.Option(help="Rates, of p,q,r, that follow the log, not the forces.")
+    ] = None,
+    commanded: Annotated[
+        bool, typer.Option("--commanded", help="Speeds are commands: add the thrusters' lag.")
+    ] = False,
+    reset: Annotated[
+        float | None, typer.Option(min=0.5, help="s between starts from the log; none if not set.")
+    ] = None,
+    hold_input: Annotated[
+        bool, typer.Option("--hold-input", help="Inputs stay until the next row.")
+    ] = False,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")] = Path("replayed"),
+    as_json: AsJson = False,
+) -> None:
+    """Run a whole log through the model, open loop.
+
+    Velocities, rates, attitude and place that the model makes of the log's thruster speeds, thrusts
+    or forces, next to what was measured: errors of each axis, and how fast they grow.
+    """
+    from alice_survey.vehicle.identification.replay import ReplayOptions, replay_report
+
+    options = ReplayOptions(
+        vehicle=vehicle, coefficients=coefficients, held=tuple(held or ()), columns=columns,
+        given=tuple(given.split(",")) if given else (), commanded=commanded, reset_s=reset,
+        hold_input=hold_input,
+    )  # fmt: skip
+    print_result(*replay_report(log, out, options), as_json)

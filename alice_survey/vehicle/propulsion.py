@@ -177,6 +177,27 @@ class Propulsion(NamedTuple):
     """(n, COLUMNS), a row a thruster; the constants above name its columns."""
 
 
+def turned_speeds(
+    time_s: Array, command_rps: Array, thruster: Thruster, start_rps: float = 0.0
+) -> Array:
+    """Speeds, (T,) rev/s, of a sound thruster that follows commands by its lag.
+
+    Args:
+        time_s: (T,) increasing.
+        command_rps: (T,) each holds until the next.
+        thruster: whose limits, dead band and time constant.
+        start_rps: speed at the first time.
+    """
+    wanted = np.clip(command_rps, -thruster.most_rps, thruster.most_rps)
+    wanted = np.where(np.abs(wanted) < thruster.dead_band_rps, 0.0, wanted)
+    kept = np.exp(-np.diff(time_s) / thruster.time_constant_s).tolist()
+    speeds, speed = [start_rps], start_rps
+    for asked, share in zip(wanted[:-1].tolist(), kept, strict=True):
+        speed = asked + (speed - asked) * share
+        speeds.append(speed)
+    return np.array(speeds)
+
+
 def pack(thrusters: Sequence[Thruster], density: float, displaced_kg: float) -> Propulsion:
     """Thrusters for compiled code, in water of a density, kg/m^3, on a hull of a displacement."""
     volume = (displaced_kg / density) ** (2.0 / 3.0)
@@ -220,6 +241,15 @@ def weakened(propulsion: Propulsion, health: Array) -> Propulsion:
         )
     table = propulsion.table.copy()
     table[:, MOST] *= np.sqrt(health)
+    return Propulsion(table)
+
+
+def without_thrust(propulsion: Propulsion, shares: Array) -> Propulsion:
+    """The same thrusters, turning as before, with shares, (n,), of their thrust and torque."""
+    table = propulsion.table.copy()
+    table[:, [FORWARD, REVERSE, ADVANCE, TORQUE_FORWARD, TORQUE_REVERSE, TORQUE_ADVANCE]] *= shares[
+        :, None
+    ]
     return Propulsion(table)
 
 

@@ -25,7 +25,7 @@ from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.navigation.filter import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.tick import navigation_tick
-from alice_survey.vehicle.propulsion import weakened
+from alice_survey.vehicle.propulsion import weakened, without_thrust
 from alice_survey.vehicle.rotations import matrix_rows
 from alice_survey.vehicle.sea import Current, Disturbance, current_at
 from alice_survey.vehicle.vehicle import Vehicle
@@ -190,11 +190,17 @@ class SimulatedVehicle:
         self.navigation = new_navigation(sensors, self.world.now, rng)
         self.scratch = scratch_for(vehicle.actuators)
 
-    def weaken(self, left: Mapping[str, float]) -> None:
-        """Leave thrusters a share of their thrust, as of `Vehicle.health_of`."""
+    def weaken(self, left: Mapping[str, float], pushing: Mapping[str, float] | None = None) -> None:
+        """Leave thrusters a share of their speed squared, or of their thrust at all speeds.
+
+        Args:
+            left: as of `Vehicle.health_of`.
+            pushing: the same, of propellers that turn as before.
+        """
         sound = self.vehicle.plant
-        health = self.vehicle.health_of(left)
-        self.plant = sound._replace(propulsion=weakened(sound.propulsion, health))
+        slower = weakened(sound.propulsion, self.vehicle.health_of(left))
+        propulsion = without_thrust(slower, self.vehicle.health_of(pushing or {}))
+        self.plant = sound._replace(propulsion=propulsion)
 
     def sense(self) -> Array:
         """Measure at this tick; the navigation's estimate, as `estimate_vector` has it."""

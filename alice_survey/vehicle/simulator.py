@@ -30,11 +30,13 @@ from alice_survey.vehicle.pilot.memory import (
     PHASE,
     REASON,
     REPORT,
+    SIGMA_M,
     PilotState,
 )
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.thrust_watch import navigated_stretch
 from alice_survey.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure
 from alice_survey.vehicle.propulsion import electrical_power
 from alice_survey.vehicle.sea import Current, Disturbance
@@ -91,6 +93,8 @@ def _fly_ticks(
     for k in range(count):
         tick = first + k
         sense(tick, sea, floor, sensors, navigation, world, rng)
+        spread = max(navigation.covariance[0, 0], navigation.covariance[1, 1])
+        pilot.memory[SIGMA_M] = math.sqrt(max(spread, 0.0))
         steer(tick * TICK_S, TICK_S, world.estimate, path, guidance, gains, pilot, wrench)
         touched = touches(world.now, sensors, floor)
         if touched:
@@ -154,7 +158,9 @@ class Failure:
     time_s: float
     thruster: str
     left: float
-    """Share of its greatest speed squared that is left."""
+    """Share of its greatest speed squared that is left; of its thrust if it turns."""
+    turns: bool = False
+    """Whether it goes on turning as commanded, with the propeller gone or fouled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -253,7 +259,7 @@ def _chunks(
     found: list[FoundFailure],
 ) -> Iterator[TickRows]:
     """Rows of a minute each at most, until the mission is over; adds failures that are found."""
-    left = dict(setup.health)
+    left, pushing = dict(setup.health), dict[str, float]()
     known = setup.health if setup.known_health is None else setup.known_health
     afloat = SimulatedVehicle(
         setup.vehicle, setup.sensors, setup.floor, setup.current, setup.disturbance, rng,
@@ -270,8 +276,8 @@ def _chunks(
     waiting = sorted(setup.failures, key=lambda failure: failure.time_s)
     while first < last:
         while waiting and round(waiting[0].time_s / TICK_S) <= first:
-            left[waiting[0].thruster] = waiting[0].left
-            afloat.weaken(left)
+            (pushing if waiting[0].turns else left)[waiting[0].thruster] = waiting[0].left
+            afloat.weaken(left, pushing)
             del waiting[0]
         end = min(first + most, last)
         if waiting:
@@ -287,7 +293,10 @@ def _chunks(
             return
         first = end
         found += pilot.judge(
-            first * TICK_S, rows.command_rps, rows.state[:, STATE : STATE + thrusters]
+            first * TICK_S,
+            rows.command_rps,
+            rows.state[:, STATE : STATE + thrusters],
+            navigated_stretch(rows.navigation, afloat.navigation),
         )
 
 

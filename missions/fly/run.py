@@ -99,8 +99,9 @@ def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
             f"{flight.truth.time_s[-1]:.0f} s): change the {sea}, the thrusters or the plan"
         )
     for one in flight.flown.found:
+        what = "turned, but gave no thrust" if one.turns else "did not turn as commanded"
         warn(
-            f"{one.thruster} did not turn as commanded, found after {one.time_s:.0f} s: from there "
+            f"{one.thruster} {what}, found after {one.time_s:.0f} s: from there "
             f"on {flight.vehicle.name} counted on {one.left:.0%} of its thrust"
         )
     _warn_of_heading(flight)

@@ -201,6 +201,7 @@ def piloting_of(plan: Plan, settings: FlightSettings, longest_s: float) -> Pilot
                 0.5 * plan.altitude_m,
                 deepest_m,
                 longest_s=longest_s,
+                blind_sigma_m=settings.navigation.blind_sigma_m,
                 blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
             ),
         )
@@ -271,10 +272,13 @@ def _failures(craft: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
     Raises:
         VehicleError: one is not the vehicle's.
     """
-    craft.health_of({name: share for name, _, share in settings.failures})
+    kinds = ((settings.failures, False), (settings.lost_propellers, True))
+    for failures, _ in kinds:
+        craft.health_of({name: share for name, _, share in failures})
     return tuple(
-        Failure(thruster=name, time_s=time_s, left=share)
-        for name, time_s, share in settings.failures
+        Failure(thruster=name, time_s=time_s, left=share, turns=turns)
+        for failures, turns in kinds
+        for name, time_s, share in failures
     )
 
 
@@ -326,6 +330,7 @@ def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuit
             rate_hz=_USBL_HZ if navigation.usbl else 0.0, noise_m=navigation.usbl_noise_m
         ),
         dvl_dropouts_s=navigation.dvl_dropouts_s,
+        bottom_dropouts_s=navigation.bottom_dropouts_s,
         followed_body_m=camera.position_body_m,
     )
 

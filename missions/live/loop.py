@@ -148,6 +148,7 @@ class PilotLoop:
             limits: for what is heard.
         """
         self.pilot, self.limits = pilot, limits or LinkLimits()
+        pilot.state.memory[slot.SIGMA_M] = math.inf  # odometry is not asked for its sigma
         self.state, self.failures = LinkState.WAITING, list[FoundFailure]()
         self.refused: Counter[str] = Counter()
         """How many messages were refused, by reason."""

@@ -44,14 +44,19 @@ _REBOOT_S = 1.0
 """A clock since boot that goes back by more has been started again."""
 
 
-def _from_origin(table: LogTable, tables: Tables) -> tuple[Array, Array] | None:
+def _from_origin(table: LogTable, tables: Tables) -> tuple[Array, Array] | str:
     """Latitude and longitude of north and east from the filter's origin (message ORGN, type 0)."""
+    if not table.has("PN", "PE", "PD"):
+        return "it lacks PN, PE or PD"
     origin = tables.get("ORGN")
-    if origin is None or not table.has("PN", "PE", "PD") or not origin.has("Type", "Lat", "Lng"):
-        return None
-    rows = np.flatnonzero(origin.columns["Type"] == 0)
-    if not len(rows):
-        return None
+    rows = np.empty(0, np.intp)
+    if origin is not None and origin.has("Type", "Lat", "Lng"):
+        rows = np.flatnonzero(origin.columns["Type"] == 0)
+    if origin is None or not len(rows):
+        return (
+            "it counts from the filter's origin, and the log holds none (ORGN): give it by --datum "
+            "LATITUDE LONGITUDE"
+        )
     last = rows[-1]
     datum = Datum(float(origin.columns["Lat"][last]), float(origin.columns["Lng"][last]))
     ned = table.stacked("PN", "PE", "PD")
@@ -134,12 +139,15 @@ _TLOG: Mapping[str, tuple[Source, ...]] = {
 }
 
 
-def read_ardusub_bin(path: Path, requested: Mapping[str, str]) -> LoggedDive:
+def read_ardusub_bin(
+    path: Path, requested: Mapping[str, str], datum: Datum | None = None
+) -> LoggedDive:
     """Read an on-board log.
 
     Args:
         path: a .BIN or a text .log.
         requested: the message to use for each role (`dive.ROLES`), `NAME` or `NAME[instance]`.
+        datum: the filter's origin instead of the log's ORGN.
 
     Raises:
         NavigationError: it is not such a log, or lacks what navigation needs.
@@ -155,6 +163,10 @@ def read_ardusub_bin(path: Path, requested: Mapping[str, str]) -> LoggedDive:
             timed[name] = with_time(table, time_s)
         elif "TimeMS" in table.columns and name != "GPS":
             timed[name] = with_time(table, table.columns["TimeMS"] * 1e-3 + offset_s)
+    if datum is not None:
+        values = {"Type": 0.0, "Lat": datum.latitude_deg, "Lng": datum.longitude_deg}
+        columns = {name: np.array([value]) for name, value in values.items()}
+        timed["ORGN"] = LogTable(name="ORGN", columns=columns, texts={})
     return dive_from(
         path, _BIN, requested, timed, present, lost,
         kind="an on-board log of ArduSub",

@@ -44,7 +44,8 @@ class ImportOptions:
     topics: Sequence[str] = ()
     """`ROLE=NAME`, roles as in `dive.ROLES`: which topic or message to use."""
     datum_deg: tuple[float, float] | None = None
-    """Latitude and longitude of the origin that a bag's odometry counts from."""
+    """Latitude and longitude of the origin that a bag's odometry, or the filter of an on-board log,
+    counts from."""
     lever_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Place on the body (FRD) that the logged position is of."""
     altitude_offset_m: float = 0.0
@@ -212,10 +213,12 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         raise NavigationError(f"{path}: no such file or folder")
     chosen = _roles(options.topics)
     suffix = path.suffix.lower()
-    if suffix not in ("", ".bag", ".mcap", ".db3") and options.datum_deg is not None:
-        raise NavigationError("--datum is for the odometry of a bag of ROS: leave it out")
+    datum = None if options.datum_deg is None else Datum(*options.datum_deg)
+    if suffix not in ("", ".bag", ".mcap", ".db3", ".bin", ".log") and datum is not None:
+        raise NavigationError(
+            "--datum is for the odometry of a bag of ROS and for ArduSub's .BIN: leave it out"
+        )
     if path.is_dir() or is_bag(path):
-        datum = None if options.datum_deg is None else Datum(*options.datum_deg)
         return read_ros_bag(path, chosen, datum)
     if suffix in _JSON and is_waterlinked(path):
         return read_waterlinked(path, chosen)
@@ -224,7 +227,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     if suffix == ".pd0" or is_pd0(path):
         return read_pd0(path, chosen)
     if suffix in (".bin", ".log"):
-        return read_ardusub_bin(path, chosen)
+        return read_ardusub_bin(path, chosen, datum)
     if suffix == ".tlog":
         return read_ardusub_tlog(path, chosen)
     if suffix == ".csv":

@@ -16,9 +16,8 @@ _INSTANCE = ("C", "I", "Instance", "id")
 """Fields that identify one of several cores or sensors."""
 
 Tables = Mapping[str, LogTable]
-Reader = Callable[[LogTable, Tables], tuple[Array, Array] | None]
-"""Takes the table of a message, and all tables, to times and values; None where a field or another
-table is missing."""
+Reader = Callable[[LogTable, Tables], tuple[Array, Array] | str]
+"""Takes the table of a message, and all tables, to times and values, or to what is missing."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,10 @@ def take(
 ) -> Reader:
     """Read fields of a message, times a scale; `keep` marks rows to use, `absent` what is NaN."""
 
-    def read(table: LogTable, _: Tables) -> tuple[Array, Array] | None:
-        if not table.has(*fields, *(keep.fields if keep is not None else ())):
-            return None
+    def read(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
+        needed = (*fields, *(keep.fields if keep is not None else ()))
+        if not table.has(*needed):
+            return f"it lacks {', '.join(name for name in needed if not table.has(name))}"
         if keep is not None:
             table = table.rows(keep.rows(table))
         values = table.stacked(*fields)
@@ -138,6 +138,7 @@ def _signal(
     known = [source.message for source in sources]
     if name and name not in known:
         raise NavigationError(f"{path}: {role} can come from {', '.join(known)}, not {name}")
+    why = f"the log has {', '.join(present)}"
     for source in sources:
         if name and source.message != name:
             continue
@@ -148,13 +149,15 @@ def _signal(
         if one is None:
             continue
         read = source.read(one, tables)
-        if read is None or not len(read[0]):
+        if isinstance(read, str):
+            why = read
             continue
-        found = cleaned(source.message, *read, lost)
+        found = cleaned(source.message, *read, lost) if len(read[0]) else None
         if found is not None:
             return found, f"{source.note}{others}".strip("; ")
+        why = "none of its rows can be used"
     if name:
-        raise NavigationError(f"{path}: {requested} gives no {role}; it has {', '.join(present)}")
+        raise NavigationError(f"{path}: {requested} gives no {role}: {why}")
     return None, ""
 
 

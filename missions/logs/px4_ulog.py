@@ -48,10 +48,10 @@ def _valid(*fields: str) -> Keep:
     )
 
 
-def _from_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | None:
+def _from_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
     """Latitude and longitude of north and east from the filter's origin, which may be set again."""
     if not table.has("x", "y", "xy_valid", "xy_global", "ref_lat", "ref_lon"):
-        return None
+        return "it lacks x, y or the filter's origin (xy_global, ref_lat, ref_lon)"
     table = table.rows(
         (table.columns["xy_valid"] > 0)
         & (table.columns["xy_global"] > 0)
@@ -67,9 +67,9 @@ def _from_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | None:
     return table.columns["time_s"], places
 
 
-def _attitude(table: LogTable, _: Tables) -> tuple[Array, Array] | None:
+def _attitude(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
     if not table.has(*(f"q[{i}]" for i in range(4))):
-        return None
+        return "it lacks q"
     quaternion = table.stacked(*(f"q[{i}]" for i in (1, 2, 3, 0)))
     known = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < 0.05
     angles = np.full((len(table), 3), np.nan)

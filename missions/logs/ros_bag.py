@@ -98,7 +98,7 @@ def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) 
         if navigation is not None and navigation.kind == ODOMETRY and not (datum or origin):
             raise NavigationError(
                 f"{path}: {navigation.name} counts from an origin that the bag does not "
-                "hold: give --datum LATITUDE LONGITUDE"
+                "hold: give --datum LATITUDE LONGITUDE (of a tank any)"
             )
         joints = [topic for topic in present if topic.kind == JOINTS]
         lost: Counter[str] = Counter()

@@ -212,6 +212,34 @@ def test_a_loss_of_bottom_lock_is_survived_and_seen_in_the_sigmas() -> None:
     assert flight.ending == "complete"
 
 
+def test_without_bottom_lock_the_vehicle_goes_on_by_choice_while_it_knows_where_it_is() -> None:
+    """For 60 s the DVL hears the water alone: USBL and water track bound the sigma."""
+    silent = {"bottom_dropouts_s": [[60.0, 120.0]]}
+    stopped, gone_on, doubtful = (
+        fly(survey(navigation={**silent, **more}))
+        for more in ({}, {"blind_sigma_m": 1.0}, {"blind_sigma_m": 0.1})
+    )
+    assert stopped.ending.startswith("aborted: the DVL did not hear the bottom")
+    assert doubtful.ending == stopped.ending
+    assert stopped.log.time_s[-1] < 130.0
+    assert gone_on.ending == "complete"
+    assert len(gone_on.trigger_s) == plan_of().stations
+    seconds = gone_on.log.time_s
+    blind = (seconds > 63.0) & (seconds < 119.0)
+    assert np.isnan(gone_on.log.altitude_m[blind]).all()
+    # It moves on, at its depth, and its sigma grows to what both say and back.
+    steps = np.diff(gone_on.glass_ned[blind][::20, :2], axis=0)
+    assert 5.0 < np.linalg.norm(steps, axis=1).sum() < 20.0
+    assert np.ptp(gone_on.glass_ned[blind, 2]) < 0.3
+    sigma = gone_on.log.sigma_horizontal_m
+    before, worst = sigma[seconds < 60.0].max(), sigma[blind].max()
+    assert 1.2 * before < worst < 1.0
+    error = np.linalg.norm(
+        gone_on.believed_glass_ned[blind, :2] - gone_on.glass_ned[blind, :2], axis=1
+    )
+    assert 0.2 < np.sqrt(np.mean((error / sigma[blind]) ** 2) / 2.0) < 2.0
+
+
 def test_a_current_too_strong_is_refused_by_the_vehicle() -> None:
     flight = fly(survey(sea={"current_mps": 2.5, "current_towards_deg": 110.0}))
     assert flight.ending.startswith("aborted: ")
@@ -298,6 +326,26 @@ def test_a_thruster_that_fails_on_the_way_is_found_and_flown_without() -> None:
     before = found.truth.time_s < at_s
     whole = fly(survey())
     np.testing.assert_array_equal(found.flown.state[before], whole.flown.state[: before.sum()])
+
+
+def test_a_thruster_that_turns_and_pushes_nothing_is_found_and_flown_without() -> None:
+    at_s = 70.0
+    lost = {"lost_propellers": [["stern", at_s, 0.0]]}
+    found, blind = (
+        fly(survey(vehicle={**lost, "finds_failures": finds})) for finds in (True, False)
+    )
+    (one,) = found.flown.found
+    assert (one.thruster, one.left, one.turns) == ("stern", 0.0, True)
+    assert at_s + 5.0 <= one.time_s <= at_s + 60.0
+    assert found.ending == "complete"
+    assert blind.flown.found == ()
+    assert heading_deg(found, one.time_s + 20.0) < 20.0
+    assert heading_deg(blind, at_s + 20.0) > 2.0 * heading_deg(found, one.time_s + 20.0)
+    # It turns as commanded until it is found, and stands still from then on.
+    stern = found.flown.rps[:, found.flown.thrusters.index("stern")]
+    seconds = found.truth.time_s
+    assert np.abs(stern[(seconds > at_s) & (seconds < one.time_s)]).max() > 5.0
+    assert np.abs(stern[seconds > one.time_s + 5.0]).max() < 1.0
 
 
 def test_nothing_is_found_where_nothing_fails() -> None:

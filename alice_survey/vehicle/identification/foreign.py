@@ -25,6 +25,8 @@ Three = tuple[str, str, str]
 _FLU = np.array([1.0, -1.0, -1.0])
 """Forward-left-up to forward-right-down, and back."""
 _NED_FROM_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_NEUTRAL_US = 1500.0
+"""Pulse at which a thruster that turns both ways stands still."""
 _FLU_FROM_FRD = Rotation.from_matrix(np.diag(_FLU))
 
 
@@ -56,6 +58,12 @@ class ColumnMap(Config):
     """Thruster to column."""
     thrust: dict[str, str] = Field(default_factory=dict)
     """Thruster to column, N."""
+    pulses: dict[str, str] = Field(default_factory=dict)
+    """Thruster to column of its pulses, microseconds; a minus before one that is reversed, whose
+    pulses are mirrored about 1500."""
+    thrust_of_pulse: tuple[tuple[float, float], ...] = ()
+    """Pulse, microseconds, and thrust, N, of a thruster that is not reversed, as its maker measured
+    them; straight in between."""
 
 
 def read_column_map(path: Path) -> ColumnMap:
@@ -69,6 +77,12 @@ def read_column_map(path: Path) -> ColumnMap:
         raise VehicleError(f"{path}: give time, or time_step_s where the rows have no time")
     if found.angles_deg is not None and (found.body, found.world) != ("frd", "ned"):
         raise VehicleError(f"{path}: angles_deg are of frd in ned; give quaternion_xyzw")
+    curve = [pulse for pulse, _ in found.thrust_of_pulse]
+    if bool(found.pulses) != (len(curve) > 1) or sorted(set(curve)) != curve:
+        raise VehicleError(
+            f"{path}: pulses need thrust_of_pulse, two or more pairs of a pulse and a thrust whose "
+            "pulses increase"
+        )
     return found
 
 
@@ -124,7 +138,25 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
         add("X_n Y_n Z_n K_nm M_nm N_nm", many(columns.wrench) * np.tile(flip, 2))
     named |= {f"rpm_{name}": one(column) for name, column in columns.rpm.items()}
     named |= {f"thrust_{name}_n": one(column) for name, column in columns.thrust.items()}
+    for name, column in columns.pulses.items():
+        pulses = one(column.removeprefix("-"))
+        pulses = 2.0 * _NEUTRAL_US - pulses if column.startswith("-") else pulses
+        named[f"thrust_{name}_n"] = _thrust(pulses, columns, f"{path}: column {shown(column)}")
     return log_of_columns(named, str(path))
+
+
+def _thrust(pulses: Array, columns: ColumnMap, source: str) -> Array:
+    """Thrust, (T,) N, at pulses, (T,) microseconds; 0 means that none is sent; NaN stays."""
+    curve = np.array(columns.thrust_of_pulse)
+    sent = np.where(pulses == 0.0, np.nan, pulses)
+    beyond = (sent < curve[0, 0]) | (sent > curve[-1, 0])
+    if beyond.any():
+        raise VehicleError(
+            f"{source} has a pulse of {sent[beyond][0]:g}; thrust_of_pulse knows {curve[0, 0]:g} "
+            f"to {curve[-1, 0]:g}"
+        )
+    thrust: Array = np.interp(sent, *curve.T)
+    return np.where(pulses == 0.0, 0.0, thrust)
 
 
 def _turned(quaternions: Array, columns: ColumnMap, path: Path) -> Array:

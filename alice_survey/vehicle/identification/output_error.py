@@ -18,12 +18,16 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array
 from alice_survey.base.run.progress import step as named_step
-from alice_survey.vehicle.identification.noise import (
-    autocovariance,
-    noise_sigma,
-    score_information,
+from alice_survey.vehicle.identification.covariance import (
+    Stretches,
+    design_effect,
+    in_stretches,
+    jackknife_covariance,
+    stretch_numbers,
 )
+from alice_survey.vehicle.identification.noise import autocovariance, noise_sigma
 from alice_survey.vehicle.identification.parameters import Parameters
+from alice_survey.vehicle.identification.prior import Prior, PriorSigmas, prior_of
 from alice_survey.vehicle.identification.sensitivity import (
     CHANNELS,
     START,
@@ -56,14 +60,14 @@ smaller: a parameter that does less is not seen at all."""
 _NOTICED = 2e-3
 """Change of the sum of squares, in sigmas squared, that ends a fit: a twentieth of a sigma of one
 parameter."""
-_CORRELATED = 3.0
-"""Residuals count as correlated over this many correlation times, at most half a window."""
 _MOST_EVALUATIONS = 60
 """Most evaluations of all windows, in each round."""
 _ROUNDS = 4
 """Most re-estimations of the noise."""
 _SAME = 0.02
 """Relative change of the noise that counts as zero."""
+_SAME_WEIGHT = 0.1
+"""The same of the prior's weight."""
 _LEAST_SIGMA = np.array([1e-6] * CHANNELS)
 """Noise cannot be estimated smaller: m/s, rad/s, rad."""
 _SINGULAR = 1e-12
@@ -88,8 +92,10 @@ class OutputErrorFit:
     values: Array
     """(P,)"""
     covariance: Array
-    """(P, P) with the residuals' correlation in time and across channels, where they have any; zero
-    of parameters at a bound."""
+    """(P, P) with the residuals' correlation in time and across channels, and that of the prior;
+    zero of parameters at a bound."""
+    prior_covariance: Array
+    """(P, P) the part that comes of the start's own error; zero without a prior."""
     white_covariance: Array
     """(P, P) as if the residuals were white: from the Gauss-Newton Hessian alone."""
     at_bound: Mask
@@ -102,6 +108,8 @@ class OutputErrorFit:
     starts: Sequence[Array]
     """(10,) state each window begins with, nu relative to the water."""
     samples: int
+    prior: PriorSigmas | None = None
+    """As it was given."""
 
     @property
     def sigma(self) -> Array:
@@ -123,6 +131,7 @@ def fit_output_error(
     parameters: Parameters,
     *,
     simulation: Simulation | None = None,
+    prior: PriorSigmas | None = None,
 ) -> OutputErrorFit:
     """Fit parameters to windows.
 
@@ -130,6 +139,7 @@ def fit_output_error(
         windows: all with the thrusters of the parameters' vehicle, or all without.
         parameters: what is free, and where it starts.
         simulation: steps and inputs.
+        prior: how near the values are to those they start from; nothing is known if not given.
 
     Raises:
         VehicleError: the simulation does not stay finite at the start, the fit does not settle, or
@@ -139,7 +149,8 @@ def fit_output_error(
     lower, upper = parameters.bounds
     short = [part for window in windows for part in cut(window, _SHORT_S)]
     rough = replace(how, longest_step_s=max(how.longest_step_s, _ROUGH_STEP_S))
-    approach = _FitProblem(short, parameters, rough, _first_sigma(windows), settled=1.0)
+    known = prior_of(parameters, windows, prior)
+    approach = _FitProblem(short, parameters, rough, _first_sigma(windows), known, settled=1.0)
     approach.begin(parameters.start)
     result = least_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
@@ -147,7 +158,7 @@ def fit_output_error(
     )  # fmt: skip
     values = result.x
     approach.estimate_sigma(values)
-    problem = _FitProblem(windows, parameters, how, approach.sigma)
+    problem = _FitProblem(windows, parameters, how, approach.sigma, known)
     rounds = (1e2,) * _ROUNDS + (1.0,)
     settled = False
     for looseness in progress(rounds, "fit", len(rounds)):
@@ -167,9 +178,10 @@ def fit_output_error(
         values = result.x
         if looseness > 1.0:
             settled = problem.estimate_sigma(values) < _SAME
+            settled &= problem.weigh_prior(values) < _SAME_WEIGHT
     held = result.active_mask
     values = np.where(held < 0, lower, np.where(held > 0, upper, values))
-    return problem.result(values, held != 0)
+    return replace(problem.result(values, held != 0), prior=prior)
 
 
 class _FitProblem:
@@ -181,9 +193,11 @@ class _FitProblem:
         parameters: Parameters,
         how: Simulation,
         sigma: Array,
+        prior: Prior | None,
         settled: float = _SETTLED,
     ) -> None:
         self.windows, self.parameters, self.how, self.settled = windows, parameters, how, settled
+        self.prior, self.prior_weight = prior, 1.0
         self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _LEAST_SIGMA)
         self.count = len(parameters.names)
         self.measured = [
@@ -207,7 +221,10 @@ class _FitProblem:
                 "the simulation does not stay finite with the coefficients the fit starts from: "
                 "check signs and units of log and vehicle, or use shorter windows"
             )
-        reach = np.linalg.norm(self.jacobian(values), axis=0) * np.maximum(np.abs(values), 1.0)
+        rows = self.samples + START * len(self.windows)
+        reach = np.linalg.norm(self.jacobian(values)[:rows], axis=0) * np.maximum(
+            np.abs(values), 1.0
+        )
         names = [n for n, r in zip(self.parameters.names, reach, strict=True) if r < _BLIND]
         if names:
             raise VehicleError(f"the logs do not determine {', '.join(names)}: do not free them")
@@ -216,7 +233,8 @@ class _FitProblem:
         """All residuals in sigmas, minus what the starts explain; infinite where there are none."""
         solved = self._solve(values)
         if solved is None:
-            size = sum(int(m.sum()) for m in self.measured) + START * len(self.windows)
+            size = self.samples + START * len(self.windows)
+            size += 0 if self.prior is None else self.count
             return np.full(size, np.inf)
         residuals, slopes, starts, gains = [], [], [], []
         for start, residual, slope in solved:
@@ -228,6 +246,10 @@ class _FitProblem:
             slopes.append(by_parameters - basis @ inner)
             starts.append(start)
             gains.append(np.linalg.solve(triangle, inner))
+        if self.prior is not None:
+            share = np.sqrt(self.prior_weight)
+            residuals.append(share * self.prior.residuals(values))
+            slopes.append(np.diag(share * self.prior.slopes(values)))
         self.trial = (values.copy(), starts, gains, np.concatenate(slopes))
         return np.concatenate(residuals)
 
@@ -256,33 +278,54 @@ class _FitProblem:
         information = table[:, free].T @ table[:, free]
         inverse = _inverse(information, [self.parameters.names[k] for k in free])
         runs, times = self._by_channel(residuals), np.full(CHANNELS, np.nan)
-        sigma, spread = self._channel_sigma(runs), self._freedom(runs)
         for channel, series in enumerate(runs):
             if any(len(run) for run in series):
                 lags = autocovariance(series)
                 times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / lags[0]
-        coloured = inverse
-        longest_s = float(np.nanmax(times))
-        if longest_s > 0:
-            scores = self._scores(residuals[:, None] * table[:, free])
-            correlated_s = min(_CORRELATED * longest_s, 0.5 * self._window_s())
-            blocks = max(self._row_s() * sum(len(run) for run in scores) / correlated_s, 2.0)
-            meat = score_information(scores, round(correlated_s / self._row_s()))
-            # Few stretches that have nothing to do with one another show their own spread badly.
-            meat *= spread * blocks / (blocks - 1.0)
-            coloured = inverse @ (meat + self._prior(table[:, free])) @ inverse
-            # By chance it may come out below that of white noise: this is not used.
-            least = np.sqrt(np.maximum(np.diag(inverse) / np.diag(coloured), 1.0))
-            coloured *= np.outer(least, least)
-        covariance, white = (np.zeros((self.count, self.count)) for _ in range(2))
-        covariance[np.ix_(free, free)] = coloured
-        white[np.ix_(free, free)] = inverse
+        held = self._prior_information(values)[np.ix_(free, free)]
+        scattered = jackknife_covariance(self._stretches(residuals, table[:, free]), held)
+        # By chance it may come out below that of white noise: this is not used.
+        from_logs = inverse @ (information - held) @ inverse
+        if scattered is not None:
+            least = np.sqrt(np.maximum(np.diag(from_logs) / np.diag(scattered), 1.0))
+            from_logs = scattered * np.outer(least, least)
+        # The start is off by its own sigma: a score of weight times that of the prior alone.
+        from_prior = self.prior_weight * inverse @ held @ inverse
+        tables = [np.zeros((self.count, self.count)) for _ in range(3)]
+        for whole, part in zip(tables, (from_logs, from_prior, inverse), strict=True):
+            whole[np.ix_(free, free)] = part
         return OutputErrorFit(
-            parameters=self.parameters, values=values, covariance=covariance,
-            white_covariance=white, at_bound=at_bound, channel_sigma=sigma * self.sigma,
-            correlation_s=times, windows=self.windows, starts=list(self.starts),
-            samples=self.samples,
+            parameters=self.parameters, values=values, covariance=tables[0] + tables[1],
+            prior_covariance=tables[1], white_covariance=tables[2], at_bound=at_bound,
+            channel_sigma=self._channel_sigma(runs) * self.sigma, correlation_s=times,
+            windows=self.windows, starts=list(self.starts), samples=self.samples,
         )  # fmt: skip
+
+    def weigh_prior(self, values: Array) -> float:
+        """Let the prior count as the logs' residuals are correlated; return its relative change."""
+        if self.prior is None:
+            return 0.0
+        stretches = self._stretches(self.residuals(values), self.jacobian(values))
+        new = design_effect(stretches, self._prior_information(values))
+        changed = abs(new / self.prior_weight - 1.0)
+        self.prior_weight = new
+        return changed
+
+    def _prior_information(self, values: Array) -> Array:
+        """(P, P) information of the prior as it counts."""
+        if self.prior is None:
+            return np.zeros((self.count, self.count))
+        return np.diag(self.prior_weight * self.prior.slopes(values) ** 2)
+
+    def _stretches(self, residuals: Array, table: Array) -> Stretches:
+        """Residuals and slopes by stretches of the logs; priors of starts with their window."""
+        numbers = stretch_numbers([window.record.time_s for window in self.windows])
+        rows = [
+            np.concatenate([number[np.nonzero(mask)[0]], np.full(START, number[0])])
+            for number, mask in zip(numbers, self.measured, strict=True)
+        ]
+        number = np.concatenate(rows)
+        return in_stretches(residuals[: len(number)], table[: len(number)], number)
 
     def _solve(self, values: Array) -> list[tuple[Array, Array, Array]] | None:
         """Starts, residuals in sigmas and slopes, by window; None where there are none."""
@@ -357,36 +400,6 @@ class _FitProblem:
                 channels[channel].append(part[place == channel])
             begin += size + START
         return channels
-
-    def _scores(self, table: Array) -> list[Array]:
-        """Sums of a table's rows by row of the log, (T, P) of each window."""
-        sums, begin = [], 0
-        for mask in self.measured:
-            size = int(mask.sum())
-            rows = np.zeros((len(mask), table.shape[1]))
-            np.add.at(rows, np.nonzero(mask)[0], table[begin : begin + size])
-            sums.append(rows)
-            begin += size + START
-        return sums
-
-    def _window_s(self) -> float:
-        """Median duration of the windows."""
-        spans = [w.record.time_s[-1] - w.record.time_s[0] for w in self.windows]
-        return float(np.median(spans))
-
-    def _row_s(self) -> float:
-        """Median time between rows."""
-        steps = np.concatenate([np.diff(window.record.time_s) for window in self.windows])
-        return float(np.median(steps))
-
-    def _prior(self, slopes: Array) -> Array:
-        """Information of the starts' priors."""
-        rows, begin = [], 0
-        for mask in self.measured:
-            begin += int(mask.sum()) + START
-            rows.append(slopes[begin - START : begin])
-        table = np.concatenate(rows)
-        return table.T @ table
 
     def _freedom(self, runs: list[list[Array]]) -> float:
         """Samples over degrees of freedom: parameters and starts fit some of the noise."""

@@ -41,7 +41,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"current": CURRENTS, "trim": TRIMS, "bias": BIASES, "buoyancy": (NET_BUOYANCY,), "gain": GAINS}
 )
 """Short names of several parameters."""
-_QUADRATICS = (QUADRATIC, QUADRATIC_POS, QUADRATIC_NEG)
+QUADRATICS = (QUADRATIC, QUADRATIC_POS, QUADRATIC_NEG)
 _GREATEST: Mapping[int, float] = MappingProxyType({CURRENT: 5.0, TRIM: 1.0})
 
 
@@ -57,7 +57,7 @@ class Parameters:
     @cached_property
     def terms(self) -> Terms:
         """For compiled code."""
-        places = [_place(name) for name in self.names]
+        places = [place_of(name) for name in self.names]
         columns = np.array(places, dtype=np.int64).reshape(-1, 3).T
         return Terms(*(np.ascontiguousarray(column) for column in columns))
 
@@ -75,8 +75,8 @@ class Parameters:
         """
         lower, upper = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for k, name in enumerate(self.names):
-            kind, i, j = _place(name)
-            if kind in (LINEAR, *_QUADRATICS, ADDED_MASS) and i == j:
+            kind, i, j = place_of(name)
+            if kind in (LINEAR, *QUADRATICS, ADDED_MASS) and i == j:
                 upper[k] = 0.0
             elif kind == GAIN:
                 lower[k] = 0.0
@@ -148,7 +148,7 @@ def free_parameters(
         raise VehicleError("no parameter is free: name some, such as --free X_uu,Y_vv,current")
     places: dict[tuple[int, int, int], str] = {}
     for name in flat:
-        kind, i, j = _place(name)
+        kind, i, j = place_of(name)
         place = (kind, min(i, j), max(i, j)) if kind == ADDED_MASS else (kind, i, j)
         if place in places:
             raise VehicleError(f"{places[place]} and {name} are one parameter: free it once")
@@ -173,7 +173,7 @@ def unit_of(name: str) -> str:
     Raises:
         VehicleError: the name is not known.
     """
-    kind, i, j = _place(name)
+    kind, i, j = place_of(name)
     if kind == GAIN:
         return "1"
     if kind in (CURRENT, TRIM, BUOYANCY, BIAS):
@@ -184,11 +184,11 @@ def unit_of(name: str) -> str:
         return ("kg", "kg m", "kg m2")[int(i >= 3) + int(turning)]
     if kind == LIFT:
         return f"{force} s2/m2"
-    power = "2" if kind in _QUADRATICS else ""
+    power = "2" if kind in QUADRATICS else ""
     return f"{force} s{power}" + ("" if turning else f"/m{power}")
 
 
-def _place(name: str) -> tuple[int, int, int]:
+def place_of(name: str) -> tuple[int, int, int]:
     """Kind, row and column of a parameter.
 
     Raises:

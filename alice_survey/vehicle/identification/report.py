@@ -2,30 +2,24 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
-from alice_survey.vehicle.files import (
-    coefficients_from_file,
-    speeds_missing,
-    vehicle_from,
-    write_coefficients,
-)
+from alice_survey.vehicle.files import speeds_missing, write_coefficients
 from alice_survey.vehicle.identification.bollard import (
     ThrustCoefficient,
     fit_pulls,
     read_pulls,
     with_thrust,
 )
-from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
+from alice_survey.vehicle.identification.drawing import draw_motion
+from alice_survey.vehicle.identification.given import given_log, given_values, given_vehicle
 from alice_survey.vehicle.identification.output_error import (
     OutputErrorFit,
     Simulation,
@@ -38,6 +32,7 @@ from alice_survey.vehicle.identification.parameters import (
     free_parameters,
     unit_of,
 )
+from alice_survey.vehicle.identification.prior import PriorSigmas
 from alice_survey.vehicle.identification.two_step import calibrate
 from alice_survey.vehicle.identification.validation import MotionValidation, validate
 from alice_survey.vehicle.identification.windows import (
@@ -46,7 +41,6 @@ from alice_survey.vehicle.identification.windows import (
     make_windows,
     of_windows,
 )
-from alice_survey.vehicle.log import read_vehicle_log
 from alice_survey.vehicle.vehicle import Vehicle
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
@@ -86,6 +80,8 @@ class IdentifyOptions:
     window_s: float | None = None
     """Longest stretch simulated in one go; as long as there are no gaps if not given."""
     hold_input: bool = False
+    prior: PriorSigmas | None = field(default_factory=PriorSigmas)
+    """How far the vehicle may be from where the joint fit starts; anywhere if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +107,7 @@ def identify_report(
     """
     if options.method not in ("joint", "two-step"):
         raise VehicleError(f"method {options.method!r} is not known: joint or two-step")
-    vehicle = _start(options)
+    vehicle = given_vehicle(options.vehicle, options.coefficients)
     if vehicle.fins:
         raise VehicleError(
             f"{vehicle.name} is steered by fins, whose angles no log holds yet: give the file of a "
@@ -131,9 +127,9 @@ def identify_report(
                 f"{'; '.join(missing)}"
             )
     free = options.free or (JOINT_FREE if options.method == "joint" else TWO_STEP_FREE)
-    parameters = free_parameters(used, free, _held(options.held))
+    parameters = free_parameters(used, free, given_values(options.held))
     how = Simulation(hold=options.hold_input)
-    result = _identify(windows, parameters, how, options.method)
+    result = _identify(windows, parameters, how, options)
     validation, started, drift = None, None, None
     if options.validate is not None:
         shorter = _windows(options.validate, vehicle, options, _VALIDATION_WINDOW_S)
@@ -158,47 +154,23 @@ def identify_report(
     return f"{text}\n\nwritten to {out}", data
 
 
-def _start(options: IdentifyOptions) -> Vehicle:
-    known = vehicle_from(options.vehicle)
-    if options.coefficients is None:
-        return known
-    path = Path(options.coefficients)
-    if path.suffix:
-        return known.with_coefficients(coefficients_from_file(path))
-    return vehicle_from(options.vehicle, options.coefficients)
-
-
-def _held(pairs: Sequence[str]) -> dict[str, float]:
-    held = {}
-    for pair in pairs:
-        name, _, value = pair.partition("=")
-        try:
-            held[name.strip()] = float(value)
-        except ValueError:
-            raise VehicleError(f"{pair!r} is not NAME=VALUE") from None
-    return held
-
-
 def _windows(
     path: Path, vehicle: Vehicle, options: IdentifyOptions, window_s: float | None = None
 ) -> list[Window]:
-    if options.columns is not None:
-        log = read_foreign_log(path, read_column_map(options.columns))
-    else:
-        log = read_vehicle_log(path)
+    log = given_log(path, options.columns)
     return make_windows(log, vehicle, window_s=window_s or options.window_s, given=options.given)
 
 
 def _identify(
-    windows: Sequence[Window], parameters: Parameters, how: Simulation, method: str
+    windows: Sequence[Window], parameters: Parameters, how: Simulation, options: IdentifyOptions
 ) -> _Identified:
-    if method == "two-step":
+    if options.method == "two-step":
         found = calibrate(windows, parameters)
         return _Identified(
             parameters=parameters, values=found.values, sigma=found.sigma, fit=None,
             steps=found.step,
         )  # fmt: skip
-    fit = fit_output_error(windows, parameters, simulation=how)
+    fit = fit_output_error(windows, parameters, simulation=how, prior=options.prior)
     return _Identified(parameters=parameters, values=fit.values, sigma=fit.sigma, fit=fit, steps=())
 
 
@@ -329,6 +301,7 @@ def _remarks(result: _Identified) -> list[str]:
     if bound:
         lines.append(f"at a bound, so without sigma: {', '.join(bound)}")
     lines += [f"correlated {value:+.3f}: {a} and {b}" for a, b, value in high_correlations(fit)]
+    lines += _prior_lines(fit)
     sigma = ", ".join(
         f"{name} {value * scale:.3g} {unit}"
         for name, value, scale, unit in zip(
@@ -354,6 +327,23 @@ def _remarks(result: _Identified) -> list[str]:
             "one go: sigmas are too small; simulate shorter stretches (--window)"
         )
     return lines
+
+
+def _prior_lines(fit: OutputErrorFit) -> list[str]:
+    """What the prior was, and where it says more than the logs."""
+    if fit.prior is None:
+        return []
+    lines = [f"prior about the start, relative sigmas: {fit.prior}"]
+    held = held_by_prior(fit)
+    if held:
+        lines.append(f"held by the prior more than by the logs: {', '.join(held)}")
+    return lines
+
+
+def held_by_prior(fit: OutputErrorFit) -> list[str]:
+    """Parameters whose variance comes of the start's error for more than a half."""
+    logs, prior = np.diag(fit.covariance - fit.prior_covariance), np.diag(fit.prior_covariance)
+    return [name for name, more in zip(fit.parameters.names, prior > logs, strict=True) if more]
 
 
 def poorly_determined(names: Sequence[str], values: Array, sigma: Array) -> list[str]:
@@ -488,6 +478,8 @@ def _data(
             name: known(float(value))
             for name, value in zip(CHANNEL_NAMES, fit.channel_sigma, strict=True)
         }
+        data["prior"] = None if fit.prior is None else asdict(fit.prior)
+        data["held_by_prior"] = held_by_prior(fit)
         data["covariance"] = [[float(value) for value in row] for row in fit.covariance]
     if validation is not None:
         data["validation"] = {
@@ -496,85 +488,3 @@ def _data(
             "worse_than_start": _worse(validation, started),
         }
     return data
-
-
-Places = NDArray[np.intp]
-_MEASURED, _MODEL, _CONSTANT = "#95a5a6", "#1b4f72", "#ca6f1e"
-_NAMES = ("u, m/s", "v, m/s", "w, m/s", "p, deg/s", "q, deg/s", "r, deg/s")
-_DRAWN = 8000
-"""Most points of a curve."""
-_LEAST = 0.02
-"""Least height of a strip, m/s; in degrees per second, 100 times that."""
-
-
-@figure_style()
-def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
-    """Draw measured and simulated velocities and rates over time, with the fit of each.
-
-    Args:
-        path: PNG, PDF or SVG.
-        title: title of the plot.
-        found: what to draw.
-    """
-    figure = new_figure(8.5, 13)
-    axes = figure.subplots(3, 2, sharex=True)
-    units = np.array([1.0] * 3 + [180.0 / np.pi] * 3)
-    fits, constant_fits = found.fit_percent, found.constant_fit_percent
-    time_s, gaps = _with_gaps(found.time_s)
-    for k in range(6):
-        strip = axes[k % 3, k // 3]
-        measured, model, constant = (
-            _series(table[:, k] * units[k], gaps)
-            for table in (found.measured, found.simulated, found.constant)
-        )
-        some = slice(None, None, max(len(time_s) // _DRAWN, 1))
-        if np.isfinite(fits[k]):
-            strip.plot(time_s[some], constant[some], color=_CONSTANT, lw=0.8, alpha=0.8)
-        strip.plot(time_s[some], measured[some], ".", color=_MEASURED, ms=2.5)
-        strip.plot(time_s[some], model[some], color=_MODEL, lw=1.1)
-        strip.set_ylabel(_NAMES[k])
-        fit = "follows the log"
-        if np.isfinite(fits[k]):
-            fit = f"fit: model {fits[k]:.0f} %, constant {constant_fits[k]:.0f} %"
-        strip.set_title(fit, fontsize=9)
-        _limit(strip, np.concatenate([measured, model]), _LEAST if k < 3 else 100 * _LEAST)
-    for strip in axes[2]:
-        strip.set_xlabel("time, s")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, weight="bold")
-    handles = [
-        figure.axes[0].plot([], [], ".", color=_MEASURED, label="measured")[0],
-        figure.axes[0].plot([], [], color=_MODEL, label="model")[0],
-        figure.axes[0].plot([], [], color=_CONSTANT, label="constant velocity")[0],
-    ]
-    figure.legend(handles=handles, loc="outside upper right", ncol=3, fontsize=9)
-    save_figure(figure, path, dpi=110)
-
-
-def _with_gaps(time_s: Array) -> tuple[Array, Places]:
-    """Times with one more where curves should break, and the places of those.
-
-    Logs follow one another, each from where the last ended.
-    """
-    steps = np.diff(time_s)
-    time_s = time_s.copy()
-    for place in np.flatnonzero(steps <= 0) + 1:
-        time_s[place:] += time_s[place - 1] - time_s[place]
-    usual = np.median(steps) if len(steps) else 1.0
-    gaps = np.flatnonzero((steps > 10 * usual) | (steps <= 0)) + 1
-    longer: Array = np.insert(time_s, gaps, time_s[gaps])
-    return longer, gaps
-
-
-def _series(values: Array, gaps: Places) -> Array:
-    broken: Array = np.insert(values, gaps, np.nan)
-    return broken
-
-
-def _limit(strip: Axes, values: Array, least: float) -> None:
-    """Limits that include nearly all values: diverging ones leave the strip."""
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return
-    low, high = np.percentile(known, [0.2, 99.8])
-    middle, half = 0.5 * (low + high), max(0.6 * (high - low), least)
-    strip.set_ylim(middle - half, middle + half)

@@ -179,6 +179,17 @@ def run(window: Window, start: Array, physics: Physics, how: Simulation) -> Arra
     Raises:
         VehicleError: the simulation does not stay finite.
     """
+    return simulated(window, start, physics, how)[1]
+
+
+def simulated(
+    window: Window, start: Array, physics: Physics, how: Simulation
+) -> tuple[Array, Array]:
+    """Attitude as quaternions, (T, 4), and motion as of `run`, (T, 6), from a start (10,).
+
+    Raises:
+        VehicleError: the simulation does not stay finite.
+    """
     rows = len(window.record.time_s)
     states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
     nothing = np.zeros(0, np.int64)
@@ -189,13 +200,19 @@ def run(window: Window, start: Array, physics: Physics, how: Simulation) -> Arra
     )  # fmt: skip
     if not np.all(np.isfinite(observed[:, :_MOTIONS])):
         raise VehicleError(
-            f"{window.source}: the simulation does not stay finite: validate on shorter windows"
+            f"{window.source}: the simulation does not stay finite: simulate shorter stretches"
         )
-    return observed[:, :_MOTIONS]
+    return states[:, :4], observed[:, :_MOTIONS]
+
+
+def measured_start(window: Window, physics: Physics) -> Array:
+    """The state (10,) that the first row of a window measured, or the first after it."""
+    filled = _held(window.measured)
+    return _state(window, filled, 0, physics.current_ne, physics.bias)
 
 
 def _state(window: Window, filled: Array, row: int, current_ne: Array, bias: Array) -> Array:
-    """The state (10,) that a row measured."""
+    """The state (10,) that a row measured; its attitude, where unknown, is the window's first."""
     attitude = window.record.attitude[row]
     state = window.start.copy()
     if np.all(np.isfinite(attitude)):

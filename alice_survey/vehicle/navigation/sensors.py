@@ -166,6 +166,8 @@ class Sensors(NamedTuple):
     """(4, 3) unit vectors in the body frame."""
     dropouts_s: Array
     """(K, 2)"""
+    bottom_dropouts_s: Array
+    """(K, 2)"""
     least_cos_tilt: float
     compass_every: int
     pressure_every: int
@@ -191,6 +193,8 @@ class SensorSuite(NamedTuple):
     usbl: UsblSpec = UsblSpec()
     dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
     """Times (from, to) without any echo of the DVL."""
+    bottom_dropouts_s: tuple[tuple[float, float], ...] = ()
+    """Times without an echo of the bottom; the water's is tracked."""
     current_sigma_mps: float = 0.3
     """Sigma of north and of east each: the filter's prior of currents, a Gauss-Markov process."""
     current_correlation_s: float = 3600.0
@@ -224,6 +228,7 @@ class SensorSuite(NamedTuple):
             hull=hull.points_body_m,
             beams=janus_beams(dvl.beam_angle_rad),
             dropouts_s=np.array(self.dvl_dropouts_s, dtype=np.float64).reshape(-1, 2),
+            bottom_dropouts_s=np.array(self.bottom_dropouts_s, dtype=np.float64).reshape(-1, 2),
             least_cos_tilt=math.cos(dvl.most_tilt_rad),
             compass_every=_ticks("compass", compass.rate_hz, tick_s),
             pressure_every=_ticks("pressure sensor", pressure.rate_hz, tick_s),
@@ -246,7 +251,7 @@ class SensorSuite(NamedTuple):
                         f"{f'{kind}.' if kind else ''}{name} is {value:g}: the filter needs more "
                         "than 0"
                     )
-        for start, end in self.dvl_dropouts_s:
+        for start, end in (*self.dvl_dropouts_s, *self.bottom_dropouts_s):
             if not start < end:
                 raise VehicleError(f"a DVL drop-out from {start:g} s to {end:g} s ends too early")
 

@@ -575,8 +575,11 @@ def measure_dvl(
     u, v, w = u + spin0, v + spin1, w + spin2
     speed = math.sqrt(u * u + v * v + w * w)
     sigma = dvl.beam_noise_mps + dvl.beam_noise_per_speed * speed
-    heard, clearance = 0, math.inf
-    for i in range(BEAMS):
+    heard, clearance, bottom = 0, math.inf, True
+    for i in range(sensors.bottom_dropouts_s.shape[0]):
+        silent = sensors.bottom_dropouts_s[i]
+        bottom &= not (silent[0] <= time_s < silent[1])
+    for i in range(BEAMS if bottom else 0):
         b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
         beam_n, beam_e, down = applied(turn, b0, b1, b2)
         reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.most_range_m)

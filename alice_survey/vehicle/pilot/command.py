@@ -33,6 +33,7 @@ from alice_survey.vehicle.pilot.memory import (
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import THRUSTER_LOST
 from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.thrust_watch import NavigatedStretch, ThrustWatch
 from alice_survey.vehicle.pilot.thruster_watch import FoundFailure, ThrusterWatch
 from alice_survey.vehicle.propulsion import Propulsion, speeds_for, thrust_limits
 from alice_survey.vehicle.vehicle import Vehicle
@@ -163,7 +164,9 @@ class Pilot:
             axes=gains.axis_weights,
         )
         self._vehicle, self._without = vehicle, without
-        self._watch = ThrusterWatch(vehicle.thrusters, tick_s)
+        self._sees = ThrusterWatch(vehicle.thrusters, tick_s)
+        # What fins do is not in its model of the forces.
+        self._feels = None if vehicle.fins else ThrustWatch(believed or vehicle, tick_s)
 
     def steer(self, time_s: float, dt_s: float, estimate: Array) -> None:
         """Write the wrench and the allocation of a tick, for an estimate of the navigation."""
@@ -172,17 +175,28 @@ class Pilot:
         )  # fmt: skip
         allocate(self.wrench, estimate, self.allocation)
 
-    def judge(self, end_s: float, command_rps: Array, rps: Array) -> list[FoundFailure]:
+    def judge(
+        self,
+        end_s: float,
+        command_rps: Array,
+        rps: Array,
+        navigated: NavigatedStretch | None = None,
+    ) -> list[FoundFailure]:
         """Look for failures in a stretch of `WATCHED_S`, and go on without what has failed.
 
         Args:
             end_s: time of its end.
             command_rps: (T, n) commanded speeds, tick by tick.
             rps: (T, n) speeds that were turned.
+            navigated: motion, which shows what pushes nothing; speeds alone count without it.
         """
         if self._without is None:
             return []
-        found = self._watch.judge(end_s, command_rps, rps)
+        found = self._sees.judge(end_s, command_rps, rps)
+        if self._feels is not None and navigated is not None:
+            for failure in found:
+                self._feels.known_gone(failure.thruster)
+            found += self._feels.judge(end_s, navigated, rps)
         for failure in found:
             self.known[failure.thruster] = min(failure.left, self.known.get(failure.thruster, 1.0))
         if found:

@@ -17,6 +17,7 @@ from alice_survey.vehicle.pilot.memory import (
     PACE,
     PHASE,
     PITCHED_S,
+    SIGMA_M,
     SINCE_BEST_S,
     UNSAFE_S,
     PilotState,
@@ -76,6 +77,9 @@ class SafetyLimits(NamedTuple):
     no waiting."""
     blind_depth_m: float = math.inf
     """Depth of the dive without bottom lock; by default almost the greatest."""
+    blind_sigma_m: float = 0.0
+    """Without bottom lock the vehicle goes on at its depth while the navigation's horizontal sigma
+    is no greater; 0: it stops, and aborts after `lost_bottom_s`."""
 
 
 @kernel
@@ -86,6 +90,12 @@ def navigates(estimate: Array) -> bool:
         if i != ALTITUDE and i != CLEARANCE:
             total += estimate[i]
     return math.isfinite(total)
+
+
+@kernel
+def _goes_on_blind(limits: SafetyLimits, pilot: PilotState) -> bool:
+    """Whether the vehicle goes on without bottom lock: it knows well enough where it is."""
+    return bool(0.0 <= pilot.memory[SIGMA_M] <= limits.blind_sigma_m and limits.blind_sigma_m > 0.0)
 
 
 @kernel
@@ -100,7 +110,7 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
 
     The pace is 1 where the clearance is at least 1.25 times the least that is allowed and falls to
     0 at the least. Without bottom lock it falls to 0 in 3 s, but not on the dive, on which
-    bottom lock may not have been found yet.
+    bottom lock may not have been found yet, nor where the vehicle is to go on blind.
 
     Args:
         depth_m: wanted, of the origin.
@@ -114,7 +124,10 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
     memory, least = pilot.memory, limits.least_altitude_m
     clear = _clear_m(estimate)
     if not math.isfinite(clear):
-        memory[PACE] = max(0.0, 1.0 - memory[LOST_S] / _STOP_S)
+        if _goes_on_blind(limits, pilot):
+            memory[PACE] = 1.0
+        else:
+            memory[PACE] = max(0.0, 1.0 - memory[LOST_S] / _STOP_S)
         return depth_m
     spare = clear - _KEPT * least
     memory[PACE] = min(max((clear / least - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
@@ -168,7 +181,7 @@ def watch(
         return TOO_STEEP
     if estimate[DEPTH] > limits.most_depth_m:
         return TOO_DEEP
-    if memory[LOST_S] > limits.lost_bottom_s:
+    if memory[LOST_S] > limits.lost_bottom_s and not _goes_on_blind(limits, pilot):
         return NO_BOTTOM
     if memory[SINCE_BEST_S] > limits.stuck_s:
         if phase == DIVE:

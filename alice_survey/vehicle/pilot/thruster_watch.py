@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.propulsion import Thruster
+from alice_survey.vehicle.propulsion import Thruster, turned_speeds
 
 WATCHED_S = 5.0
 """Thrusters are judged over stretches of this length."""
@@ -29,12 +29,14 @@ _LEAST_S = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class FoundFailure:
-    """A thruster that was found not to turn as commanded."""
+    """A thruster that was found not to do as commanded."""
 
     time_s: float
     thruster: str
     left: float
     """Share of its greatest thrust that it has left."""
+    turns: bool = False
+    """Whether it turns as commanded, and gives no thrust."""
 
 
 class ThrusterWatch:
@@ -55,10 +57,11 @@ class ThrusterWatch:
             rps: (T, n) speeds that were turned.
         """
         found = []
+        time_s: Array = self._tick_s * np.arange(len(rps), dtype=np.float64)
         for i, thruster in enumerate(self._thrusters):
             if self._gone[i]:
                 continue
-            asked = self._expected(command_rps[:, i], rps[0, i], thruster)
+            asked = turned_speeds(time_s, command_rps[:, i], thruster, float(rps[0, i]))
             turning = np.abs(asked) > thruster.dead_band_rps + _MARGIN_RPS
             if turning.sum() * self._tick_s < _LEAST_S:
                 continue
@@ -72,15 +75,3 @@ class ThrusterWatch:
                 left = (most / thruster.most_rps) ** 2 if turns else 0.0
                 found.append(FoundFailure(time_s=end_s, thruster=thruster.name, left=left))
         return found
-
-    def _expected(self, command_rps: Array, start_rps: float, thruster: Thruster) -> Array:
-        """(T,) speeds of a sound propeller from a start on."""
-        from scipy.signal import lfilter
-
-        wanted = np.clip(command_rps, -thruster.most_rps, thruster.most_rps)
-        wanted = np.where(np.abs(wanted) < thruster.dead_band_rps, 0.0, wanted)
-        kept = float(np.exp(-self._tick_s / thruster.time_constant_s))
-        # The speed of a tick answers the commands before it.
-        before = np.concatenate([[0.0], wanted[:-1]])
-        expected: Array = lfilter([1.0 - kept], [1.0, -kept], before, zi=[kept * start_rps])[0]
-        return expected

@@ -1,15 +1,19 @@
 import csv
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from alice_survey.vehicle.fleet import vehicle
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from alice_survey.base.errors import NavigationError
+from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
+from alice_survey.vehicle.identification.windows import make_windows
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
@@ -205,6 +209,56 @@ def test_filter_positions_count_from_its_origin(tmp_path: Path) -> None:
     latitude, depth = numbers(tmp_path / "n.csv", "latitude_deg", "depth_m")[0]
     assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
     assert depth == pytest.approx(9.0, abs=1e-6)
+
+
+def test_the_filters_origin_can_be_given(tmp_path: Path) -> None:
+    """Without ORGN it is said that XKF1 needs one, and with --datum it counts from there."""
+    messages = [m for m in dive_messages() if m[0] != "POS"]
+    log = bin_log(tmp_path, messages)
+    with pytest.raises(NavigationError, match=r"XKF1 gives no navigation: .*ORGN.*--datum"):
+        imported(tmp_path, log, topics=("navigation=XKF1",))
+    origin = ("ORGN", BOOT_US, 0, LAT + 1.0, LON, 0.0)
+    for rows in (messages, [origin, *messages]):
+        log = bin_log(tmp_path, rows)
+        options = {"topics": ("navigation=XKF1",), "datum_deg": (LAT, LON)}
+        assert imported(tmp_path, log, **options)["sources"]["position"] == "XKF1"
+        latitude = numbers(tmp_path / "n.csv", "latitude_deg")[0, 0]
+        assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
+
+
+def test_a_tank_log_without_position_reaches_the_identification(tmp_path: Path) -> None:
+    """A .BIN without GPS: attitude, rates, velocities and pulses are what a fit needs."""
+    kept = [m for m in dive_messages(60) if m[0] in ("ATT", "XKF1", "RCOU")]
+    options = ImportOptions(vehicle_log=tmp_path / "v.csv")
+    import_log(bin_log(tmp_path, kept), tmp_path / "n.csv", options)
+    names = ("t1", "t2", "t3", "t4", "t5", "t6", "t7", "t8")
+    pulses = ", ".join(
+        f'{name} = "{"-" if i == 2 else ""}pwm_{i}_us"' for i, name in enumerate(names, 1)
+    )
+    (tmp_path / "map.toml").write_text(
+        'time = "time_s"\nangles_deg = ["roll_deg", "pitch_deg", "heading_deg"]\n'
+        f'velocity = ["u_mps", "v_mps", "w_mps"]\npulses = {{ {pulses} }}\n'
+        "thrust_of_pulse = [[1100, -40], [1475, 0], [1525, 0], [1900, 50]]\n"
+    )
+    log = read_foreign_log(tmp_path / "v.csv", read_column_map(tmp_path / "map.toml"))
+    assert not np.isfinite(log.position_ned[:, :2]).any()
+    # Row i holds 1500 + 10 k + i microseconds for the thruster k, less the time between messages.
+    pulse = 1500.0 + 10.0 * 3 + np.arange(1, 60) - 0.05
+    np.testing.assert_allclose(
+        log.thrust_n["t4"][1:60], np.maximum(pulse - 1525.0, 0.0) / 375.0 * 50.0, atol=1e-3
+    )
+    mirrored = 3000.0 - (pulse - 20.0)
+    np.testing.assert_allclose(
+        log.thrust_n["t2"][1:60], np.minimum(mirrored - 1475.0, 0.0) / 375.0 * 40.0, atol=1e-3
+    )
+    bare = vehicle("alice")
+    eight = replace(
+        bare, thrusters=tuple(replace(bare.thrusters[0], name=name) for name in names)
+    )  # fmt: skip
+    windows = make_windows(log, eight)
+    assert len(windows) == 1
+    assert np.isfinite(windows[0].measured[:, :3]).all()
+    assert np.abs(windows[0].record.wrench).max() > 10.0
 
 
 def test_one_of_several_depth_sensors_must_be_chosen(tmp_path: Path) -> None:

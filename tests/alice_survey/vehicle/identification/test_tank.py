@@ -1,5 +1,6 @@
 """A real BlueROV2 in a tank: frames and step of its logs, each run predicted from the others."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.vehicle.files import vehicle_from_file
 from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
-from alice_survey.vehicle.identification.output_error import Simulation, fit_output_error
+from alice_survey.vehicle.identification.output_error import (
+    OutputErrorFit,
+    Simulation,
+    fit_output_error,
+)
 from alice_survey.vehicle.identification.parameters import free_parameters
+from alice_survey.vehicle.identification.prior import PriorSigmas
 from alice_survey.vehicle.identification.validation import validate
 from alice_survey.vehicle.identification.windows import make_windows
 from alice_survey.vehicle.log import VehicleLog
@@ -73,3 +79,67 @@ def test_each_run_is_predicted_from_the_others(runs: list[VehicleLog], left_out:
     # All in all better than the published coefficients, too.
     published = validate(shorter, parameters, parameters.start, simulation=QUICK)
     assert model.mean() > published.fit_percent[moving].mean() + 10.0
+
+
+MOVING = [0, 1, 2, 5]
+
+
+@pytest.fixture(scope="module", params=[None, PriorSigmas()], ids=["no prior", "prior"])
+def single(
+    runs: list[VehicleLog], request: pytest.FixtureRequest
+) -> tuple[PriorSigmas | None, list[OutputErrorFit]]:
+    """A fit to each run alone."""
+    rov = vehicle_from_file(HERE / "bluerov2.toml")
+    parameters = free_parameters(rov, FREE)
+    fits = [
+        fit_output_error(
+            make_windows(run, rov, window_s=5.0, given=("p", "q")), parameters,
+            simulation=QUICK, prior=request.param,
+        )
+        for run in runs
+    ]  # fmt: skip
+    return request.param, fits
+
+
+@pytest.mark.slow
+def test_unseen_runs_are_not_predicted_worse_than_by_the_start(
+    runs: list[VehicleLog], single: tuple[PriorSigmas | None, list[OutputErrorFit]]
+) -> None:
+    """Each run alone predicts the three others: with the prior never worse than the start does."""
+    prior, fits = single
+    rov = vehicle_from_file(HERE / "bluerov2.toml")
+    gains, model = [], []
+    for k, run in enumerate(runs):
+        windows = make_windows(run, rov, window_s=10.0, given=("p", "q"))
+        start, *others = (
+            validate(
+                windows, fits[0].parameters, values, simulation=QUICK, horizons_s=()
+            ).fit_percent[MOVING]
+            for values in (
+                fits[0].parameters.start,
+                *(fit.values for j, fit in enumerate(fits) if j != k),
+            )
+        )
+        gains += [other - start for other in others]
+        model += others
+    at_bounds = sum(int(fit.at_bound.sum()) for fit in fits)
+    assert 50.0 < np.mean(model) < 60.0
+    if prior is None:
+        assert np.min(gains) < -5.0
+        assert at_bounds >= 2
+    else:
+        assert -1.0 < np.min(gains) < 5.0
+        assert at_bounds == 0
+
+
+@pytest.mark.slow
+def test_fits_to_different_runs_differ_by_their_sigmas(
+    single: tuple[PriorSigmas | None, list[OutputErrorFit]],
+) -> None:
+    """Fits with one prior share its error, which does not set them apart."""
+    scores = []
+    for a, b in itertools.combinations(single[1], 2):
+        variance = sum(np.diag(fit.covariance - fit.prior_covariance) for fit in (a, b))
+        apart = (a.values - b.values) / np.sqrt(variance)
+        scores.append(np.where(a.at_bound | b.at_bound, np.nan, apart))
+    assert 0.7 < np.sqrt(np.nanmean(np.square(scores))) < 1.5

@@ -74,6 +74,17 @@ def test_each_reason_comes_after_its_time(
     assert after == pytest.approx(after_s, abs=2.1 * TICK_S)
 
 
+def test_without_bottom_lock_the_navigation_decides_if_it_may() -> None:
+    blind, limits = calm(altitude_m=math.nan), LIMITS._replace(blind_sigma_m=0.5)
+    for sigma_m, goes_on in ((0.4, True), (0.6, False), (math.nan, False)):
+        pilot = pilot_in(slot.FOLLOW)
+        pilot.memory[slot.SIGMA_M], pilot.memory[slot.LOST_S] = sigma_m, 30.0
+        safety.mind_floor(10.0, blind, limits, pilot)
+        assert pilot.memory[slot.PACE] == (1.0 if goes_on else 0.0)
+        reason = safety.watch(0.0, TICK_S, blind, 1.0, limits, pilot)
+        assert reason == (safety.NONE if goes_on else safety.NO_BOTTOM)
+
+
 def test_a_mission_that_takes_too_long_ends() -> None:
     assert watched(pilot_in(slot.FOLLOW), calm(), 1.0, time_s=5000.1)[0] == safety.TOO_LONG
 
