@@ -13,6 +13,7 @@ from missions.exports.mavlink import Item, mission_items
 from missions.exports.mount import CameraMount, mount_of
 from missions.exports.options import Options, line_tolerance_m
 from missions.exports.waypoints import Waypoint, waypoints
+from missions.values.mission import Mission
 from missions.values.plan_file import Plan
 
 
@@ -78,6 +79,9 @@ class ExportFormat:
     read_by: str
     """Programs that read it, in words."""
     files: tuple[ExportFile, ...]
+    read: Callable[[str], Mission | None] | None = None
+    """Reads a mission from the text of a file, as the vehicle does; None where the text is of
+    another format. A `ValueError` says what is wrong with it."""
 
     def write(self, folder: Path, export: Export) -> dict[Path, str]:
         """Write all files.
