@@ -53,6 +53,7 @@ from alice_survey.vehicle.pilot.memory import (
     PilotState,
     new_pilot,
 )
+from alice_survey.vehicle.pilot.mission import NO_MISSION, Mission
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import THRUSTER_LOST, TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
@@ -177,6 +178,7 @@ def _fly_ticks(
     sensors: Sensors,
     navigation: NavigationState,
     path: Path,
+    mission: Mission,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
@@ -197,7 +199,7 @@ def _fly_ticks(
             time_s, tick, TICK_S, world.before, world.now, world.water, floor, sensors,
             navigation, rng, world.estimate,
         )  # fmt: skip
-        steer(time_s, TICK_S, world.estimate, path, guidance, gains, pilot, world.wrench)
+        steer(time_s, TICK_S, world.estimate, path, mission, guidance, gains, pilot, world.wrench)
         touched = _touches(world.now, sensors, floor)
         if touched:
             pilot.report[PHASE], pilot.report[REASON] = ABORT, TOUCHED
@@ -263,6 +265,8 @@ class Setup:
     floor: FloorGrid
     current: Current
     disturbance: Disturbance
+    mission: Mission = NO_MISSION
+    """What is flown instead of the path, by the law of another vehicle's software."""
     exact_allocation: bool = True
     health: Mapping[str, float] = field(default_factory=dict)
     """Share of its greatest speed squared left in a thruster: 0 failed; intact if not named."""
@@ -409,7 +413,7 @@ def _chunks(
         rows = _new_rows(end - first, n)
         flown = _fly_ticks(
             first, plant, sea, setup.floor, setup.sensors, navigation, setup.path,
-            guidance, gains, pilot, allocation, world, scratch, rng, sea_rng, rows,
+            setup.mission, guidance, gains, pilot, allocation, world, scratch, rng, sea_rng, rows,
         )  # fmt: skip
         yield TickRows(*(part[:flown] for part in rows))
         if flown < len(rows.state) or pilot.report[REASON] == TOUCHED:

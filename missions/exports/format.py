@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_calib.rig import Rig
+from missions.exports.follower import end_tolerance_m
 from missions.exports.geometry import lat_lon
 from missions.exports.mavlink import Item, mission_items
 from missions.exports.mount import CameraMount, mount_of
@@ -44,6 +45,13 @@ class Export:
     def tolerance_m(self) -> float:
         """How far off a line's ends the vehicle may be."""
         return line_tolerance_m(self.plan, self.rig)
+
+    @cached_property
+    def cola2_tolerance_m(self) -> float:
+        """The same for COLA2, which circles an end that it misses, in the expected current."""
+        follower, speed_mps = self.options.follower, self.plan.speed_mps
+        needed_m = 0.0 if follower is None else end_tolerance_m(follower, speed_mps)
+        return max(self.tolerance_m, needed_m)
 
     @cached_property
     def home_lat_lon_deg(self) -> tuple[float, float]:

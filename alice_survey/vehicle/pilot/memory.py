@@ -27,8 +27,8 @@ DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
     SETTLED_S, BEST, SINCE_BEST_S, RETURNS, LOST_S, LOW_S, PITCHED_S,
     UNSAFE_S, PACE, STANDING, REF, REF_SPEED, WAITED_S,
     PLACE_SUM_N, PLACE_SUM_E, RAMP, RAMP_SPEED, ROLL_SUM, PITCH_SUM,
-    MEAN_N, MEAN_E, NEAR_S,
-) = range(30)  # fmt: skip
+    MEAN_N, MEAN_E, NEAR_S, STEP_S, FROM_N, FROM_E, TIMEOUT_S, KEEPS, HELD_S, TRACK_PACE,
+) = range(37)  # fmt: skip
 """Places in the memory: the depth, m, that the origin's depth and the altitude add up to, smoothed,
 its slope, m/s, and whether there is one; integrals of the inner loops as speeds, that of sway as a
 vector in NED; the time that depth, or place and heading, are kept; the watchdog's best value and
@@ -39,8 +39,10 @@ heading that turns on the spot (standing.py), how far these have got, m or rad, 
 long it waits at the leg's end, s; the integral, as a speed, of keeping that place by surge, a
 vector in NED; the place or heading, and its speed, that thrusters without lag would be at; the
 integrals of roll and pitch, as accelerations; how far the followed point is from its goal on the
-mean of some time, m, and how long that is little, s."""
-MEMORY = 30
+mean of some time, m, and how long that is little, s; of a mission's step (mission.py) the time
+since it began, where its way starts, how long it may take, 1 while it keeps its end, for how long,
+and how fast the time of its moving target runs."""
+MEMORY = 37
 
 (
     REF_SURGE, REF_SWAY, REF_HEAVE, REF_YAW, ACC_SURGE, ACC_SWAY, ACC_HEAVE, ACC_YAW,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
 
+from missions.exports.cola2_way import Cola2Step, cola2_steps
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.options import Options
 from missions.exports.waypoints import Waypoint
@@ -31,19 +32,18 @@ _HEAVES: tuple[Heave, ...] = ("depth", "altitude", "both")
 
 
 def write_cola2(path: Path, export: Export, dive: int) -> None:
-    """Write a dive as a mission of version 2.0: sections along lines, gotos, parks for turns."""
-    points, tolerance_m = export.dives[dive], export.tolerance_m
+    """Write a dive as a mission of version 2.0: sections along lines, gotos, parks for sways."""
     root = Element("mission")
     child(root, "version", "2.0")
-    for index, point in enumerate(points):
+    for planned in cola2_steps(export, dive):
         step = child(root, "mission_step")
-        if point.kind in ("turn", "sway"):
-            _park(step, point)
-        elif point.kind in ("line", "run-in"):
-            _section(step, points[index - 1], point, tolerance_m)
+        if planned.end.kind == "sway":
+            _park(step, planned.end)
+        elif planned.is_section:
+            _section(step, planned)
         else:
-            _goto(step, point, way_tolerance_m(export))
-        add_actions(step, point, export.options)
+            _goto(step, planned.end, planned.tolerance_m)
+        add_actions(step, planned.end, export.options)
     write_xml(path, root, comment(export))
 
 
@@ -58,7 +58,8 @@ def _goto(step: Element, point: Waypoint, tolerance_m: float) -> None:
     child(manoeuvre, "no_altitude_goes_up", _bool(mode == _ALTITUDE))
 
 
-def _section(step: Element, start: Waypoint, end: Waypoint, tolerance_m: float) -> None:
+def _section(step: Element, planned: Cola2Step) -> None:
+    start, end = planned.start, planned.end
     manoeuvre = child(step, "maneuver", type="section")
     child(manoeuvre, "initial_latitude", degrees(start.latitude_deg))
     child(manoeuvre, "initial_longitude", degrees(start.longitude_deg))
@@ -66,12 +67,12 @@ def _section(step: Element, start: Waypoint, end: Waypoint, tolerance_m: float) 
     _final(manoeuvre, end)
     child(manoeuvre, "heave_mode", _ALTITUDE)
     child(manoeuvre, "surge_velocity", metres(end.speed_mps))
-    child(manoeuvre, "tolerance_xy", metres(tolerance_m))
+    child(manoeuvre, "tolerance_xy", metres(planned.tolerance_m))
     child(manoeuvre, "no_altitude_goes_up", _bool(True))
 
 
 def _park(step: Element, point: Waypoint) -> None:
-    """Hold place and heading; used to turn on the spot and to step sideways."""
+    """Hold place and heading; used to step sideways."""
     manoeuvre = child(step, "maneuver", type="park")
     _final(manoeuvre, point)
     child(manoeuvre, "final_yaw", f"{math.remainder(point.heading_rad, 2 * math.pi):.6f}")
@@ -98,18 +99,14 @@ def add_actions(step: Element, point: Waypoint, options: Options) -> None:
     child(action, "action_id", name)
 
 
-def way_tolerance_m(export: Export) -> float:
-    """Tolerance between lines: as far as the run-in lets the vehicle settle again."""
-    plan = export.plan
-    return max(export.tolerance_m, min(plan.run_in_m, plan.line_spacing_m / 2))
-
-
 def comment(export: Export) -> str:
     """What the places of a mission are of, for people who read the file."""
-    plan, tolerance_m = export.plan, export.tolerance_m
+    plan = export.plan
     return (
-        f"{plan.name}: {export.mount.about} Tolerance at the ends of lines {tolerance_m:.3f} m: "
-        f"half of what lines {plan.line_spacing_m:.3f} m apart see twice, or half a step."
+        f"{plan.name}: {export.mount.about} Tolerance at the ends of lines "
+        f"{export.cola2_tolerance_m:.3f} m: half of what lines {plan.line_spacing_m:.3f} m apart "
+        "see twice, or half a step, or what this software needs so as not to circle an end. Lines "
+        "go on past their last picture by as much, where they may."
     )
 
 

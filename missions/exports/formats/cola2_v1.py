@@ -4,13 +4,13 @@ import math
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+from missions.exports.cola2_way import cola2_steps
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.formats.cola2 import (
     add_actions,
     camera_switches,
     comment,
     manoeuvre_of,
-    way_tolerance_m,
 )
 from missions.exports.waypoints import Waypoint
 from missions.exports.xml_text import (
@@ -27,30 +27,26 @@ from missions.values.mission import Mission, MissionStep
 
 def write_cola2_v1(path: Path, export: Export, dive: int) -> None:
     """Write a dive as a mission of version 1, which knows no yaw: parks only wait."""
-    points, tolerance_m = export.dives[dive], export.tolerance_m
     root = Element("mission")
-    for index, point in enumerate(points):
-        step = child(root, "mission_step")
-        if point.kind in ("turn", "sway"):
+    for planned in cola2_steps(export, dive):
+        step, point = child(root, "mission_step"), planned.end
+        if point.kind == "sway":
             manoeuvre = child(step, "maneuver", type="park")
             _position(manoeuvre, "position", point)
             child(manoeuvre, "speed", metres(point.speed_mps))
             child(manoeuvre, "time", f"{point.hold_s:.1f}")
-            within_m = tolerance_m
-        elif point.kind in ("line", "run-in"):
+        elif planned.is_section:
             manoeuvre = child(step, "maneuver", type="section")
-            _position(manoeuvre, "initial_position", points[index - 1])
+            _position(manoeuvre, "initial_position", planned.start)
             _position(manoeuvre, "final_position", point)
             child(manoeuvre, "speed", metres(point.speed_mps))
-            within_m = tolerance_m
         else:
             manoeuvre = child(step, "maneuver", type="waypoint")
             _position(manoeuvre, "position", point)
             child(manoeuvre, "speed", metres(point.speed_mps))
-            within_m = way_tolerance_m(export)
         box = child(manoeuvre, "tolerance")
         for axis in "xyz":
-            child(box, axis, metres(within_m))
+            child(box, axis, metres(planned.tolerance_m))
         add_actions(step, point, export.options)
     write_xml(path, root, comment(export))
 
