@@ -103,8 +103,9 @@ def _cola2(export: Export) -> list[str]:
     expected = (
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
         f"to {outlook.offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
-        f"{outlook.allowed_m:.2f} m; then {share(outlook.share_at_overlap, 2)} of the area is seen "
-        "at the requested overlap"
+        f"{outlook.allowed_m:.2f} m, and gusts {follower.wander_m:.2f} m rms; "
+        f"{share(outlook.share_at_overlap)} of the area is expected to be seen at the requested "
+        "overlap"
     )
     if outlook.offset_m > outlook.allowed_m:
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
@@ -112,7 +113,11 @@ def _cola2(export: Export) -> list[str]:
             f"{expected}: lay lines along the current (line_heading_deg = {towards_deg:.0f}), wait "
             "for less of it, or fly another autopilot's mission"
         )
-    return [*lines, f"{expected[0].upper()}{expected[1:]}."]
+    return [
+        *lines,
+        f"{expected[0].upper()}{expected[1:]}. To see it flown: alice-survey fly --mission FILE. "
+        "What helps: lines along the current, closer lines (plan.track_error_m), a longer run-in.",
+    ]
 
 
 def _ardusub(export: Export) -> list[str]:

@@ -8,6 +8,7 @@ one stops its surge. So
 - turns on the spot are left to the step that follows; they need no thrusters sideways;
 - the step that leads to a line ends beyond it by the tolerance, less the turning circle, so that it
   is done where the vehicle has just the room to turn onto the line;
+- a run-in begins as far before its line as the vehicle needs to come onto it, where there is room;
 - of the chords that stand for an arc those are left out that lie nearer to the one before than
   twice their tolerance, except the last before a line.
 """
@@ -21,8 +22,8 @@ import shapely
 from shapely.geometry import LineString, Point
 
 from alice_survey.base.frames import Array
-from missions.exports.follower import circle_m
 from missions.exports.format import Export
+from missions.exports.options import LEAST_TOLERANCE_M
 from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
@@ -56,25 +57,28 @@ def cola2_steps(export: Export, dive: int) -> list[Cola2Step]:
 
 
 def _steps(export: Export, points: tuple[Waypoint, ...]) -> Iterator[Cola2Step]:
-    sections_m, ways_m = export.cola2_tolerance_m, way_tolerance_m(export)
-    before = points[0]
-    for i, point in enumerate(points):
-        following = points[i + 1] if i + 1 < len(points) else None
-        start = points[max(i - 1, 0)]
-        if point.kind == "turn" and point.camera is None:
-            continue
+    exact_m, ways_m = export.cola2_tolerance_m, way_tolerance_m(export)
+    before = start = points[0]
+    for i, planned in enumerate(points):
+        point, following = planned, points[i + 1] if i + 1 < len(points) else None
         leads_in = following is not None and following.kind in ("line", "run-in", "turn")
         near = math.dist(point.vehicle_ne_m, before.vehicle_ne_m) < 2.0 * ways_m
-        if near and point.kind == "way" and point.camera is None and not leads_in:
+        idle = point.camera is None
+        if idle and (point.kind == "turn" or (near and point.kind == "way" and not leads_in)):
+            if following is not None and following.kind == "run-in":
+                point = _set_back(export, point, following)
+            start = point
             continue
-        came_from, before = before, point
-        exact = leads_in or point.kind in ("line", "run-in", "turn")
-        tolerance_m = sections_m if exact else ways_m
+        tolerance_m = exact_m if leads_in or point.kind in ("line", "run-in", "turn") else ways_m
+        end = point
         if point.kind == "line" and point.camera == "off":
-            point = _gone_on(export.plan, point, tolerance_m)
-        elif leads_in and point.kind == "way":
-            point = _led_beyond(export, came_from, point, tolerance_m)
-        yield Cola2Step(start=start, end=point, tolerance_m=tolerance_m)
+            end = _gone_on(export.plan, point, tolerance_m)
+        elif leads_in and idle and point.kind == "way":
+            if following is not None and following.kind == "run-in":
+                point = _set_back(export, point, following)
+            end = _led_beyond(export, before, point, tolerance_m)
+        yield Cola2Step(start=start, end=end, tolerance_m=tolerance_m)
+        before = start = point
 
 
 def way_tolerance_m(export: Export) -> float:
@@ -87,24 +91,52 @@ def _gone_on(plan: Plan, point: Waypoint, by_m: float) -> Waypoint:
     """The end of a line, moved on along its course as far as the glass may go."""
     line = plan.lines[point.line]
     ahead = np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
-    end = np.array(line.end_ne_m)
-    way = LineString([end, end + by_m * ahead]).intersection(plan.area.allowed.buffer(_TOUCH_M))
-    parts = [part for part in shapely.get_parts(way) if part.distance(Point(end)) <= _TOUCH_M]
-    room_m = min(by_m, max((float(part.length) for part in parts), default=0.0))
-    return _moved(plan, point, room_m * ahead)
+    return _moved(plan, point, _room_m(plan, np.array(line.end_ne_m), by_m * ahead) * ahead)
+
+
+def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
+    """The place where a run-in begins, moved back along it as far as the vehicle may turn there.
+
+    Coming onto it as far off as its tolerance, COLA2 needs the way delta ln(tolerance / allowed)
+    until it is no farther off than its pictures may be.
+
+    Args:
+        export: the plan.
+        point: where the run-in is planned to begin.
+        start: where the line begins.
+    """
+    follower, plan = export.options.follower, export.plan
+    if follower is None or not math.isfinite(follower.delta_m):
+        return point
+    allowed_m = max(0.5 * (plan.footprint_m[0] - plan.line_spacing_m), LEAST_TOLERANCE_M)
+    wanted_m = follower.delta_m * math.log(max(export.cola2_tolerance_m / allowed_m, 1.0))
+    line = plan.lines[start.line]
+    back = -np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
+    reach_m = max(wanted_m, plan.run_in_m) + follower.circle_m
+    room_m = _room_m(plan, np.array(line.start_ne_m), reach_m * back) - follower.circle_m
+    by_m = room_m - math.dist(point.vehicle_ne_m, start.vehicle_ne_m)
+    return _moved(plan, point, max(by_m, 0.0) * back)
+
+
+def _room_m(plan: Plan, place_ne: Array, way_ne: Array) -> float:
+    """How far of a way from a place the glass may go."""
+    way = LineString([place_ne, place_ne + way_ne])
+    inside = shapely.get_parts(way.intersection(plan.area.allowed.buffer(_TOUCH_M)))
+    parts = [part for part in inside if part.distance(Point(place_ne)) <= _TOUCH_M]
+    return min(way.length, max((float(part.length) for part in parts), default=0.0))
 
 
 def _led_beyond(
     export: Export, came_from: Waypoint, point: Waypoint, tolerance_m: float
 ) -> Waypoint:
     """A way-point before a line, moved on along the way to it."""
-    follower, plan = export.options.follower, export.plan
+    follower = export.options.follower
     way = np.subtract(point.vehicle_ne_m, came_from.vehicle_ne_m)
     length_m = float(np.hypot(*way))
     if follower is None or length_m < _TOUCH_M:
         return point
-    by_m = max(0.0, tolerance_m - circle_m(follower, plan.speed_mps))
-    return _moved(plan, point, by_m / length_m * way)
+    by_m = max(0.0, tolerance_m - follower.circle_m)
+    return _moved(export.plan, point, by_m / length_m * way)
 
 
 def _moved(plan: Plan, point: Waypoint, by_ne: Array) -> Waypoint:

@@ -13,17 +13,16 @@ import numpy as np
 
 from alice_survey.base.config import SeaConfig, VehicleConfig
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.pilot.cola2 import steady_drift
-from alice_survey.vehicle.pilot.gains import FASTEST, SWAY, YAW, Gains, gains_for
-from alice_survey.vehicle.pilot.settings import shortest_look_ahead_m
+from alice_survey.vehicle.pilot.cola2 import circling_m, steady_drift, yaw_rad_s
+from alice_survey.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
+from alice_survey.vehicle.pilot.settings import los_loop, shortest_look_ahead_m
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.route.energy import craft_of
 from missions.values.line import Line
 from missions.values.plan_file import Plan
 
-_TURN_SHARE = 0.5
-"""Share of the greatest yaw rate that following a point needs to keep the vehicle on it: the rest
-is for the lag of the loop (inferred)."""
+_ROUNDS = 40
+"""Of an iteration that halves its error in each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +34,12 @@ class Follower:
     """Whether it has thrusters that push it sideways."""
     delta_m: float
     """COLA2's look-ahead: the shortest that is damped well at the plan's speed."""
+    circle_m: float
+    """Radius at which COLA2 would circle an end with a smaller tolerance."""
     turn_rad_s: float
-    """Greatest yaw rate."""
+    """Yaw rate at a heading error of one radian."""
+    wander_m: float
+    """How far gusts push COLA2 off a line without a current, rms."""
     current_ne_mps: tuple[float, float]
     """The expected current, towards north and east."""
 
@@ -65,11 +68,14 @@ def follower_of(vehicle: VehicleConfig, sea: SeaConfig, speed_mps: float) -> Fol
     craft = craft_of(vehicle)
     gains = gains_for(craft, speed_mps)
     towards = math.radians(sea.current_towards_deg)
+    delta_m = cola2_delta_m(gains, speed_mps)
     return Follower(
         name=craft.name,
         sways=sways(gains),
-        delta_m=cola2_delta_m(gains, speed_mps),
-        turn_rad_s=float(gains.axes[YAW, FASTEST]),
+        delta_m=delta_m,
+        wander_m=wander_m(gains, speed_mps, delta_m, sea.gust_n[1], sea.gust_correlation_s),
+        circle_m=circling_m(gains, speed_mps),
+        turn_rad_s=yaw_rad_s(gains, 1.0),
         current_ne_mps=(
             sea.current_mps * math.cos(towards),
             sea.current_mps * math.sin(towards),
@@ -90,6 +96,46 @@ def cola2_delta_m(gains: Gains, speed_mps: float) -> float:
     return math.ceil(10.0 * shortest_look_ahead_m(gains, speed_mps, 0.0) - 1e-6) / 10.0
 
 
+def wander_m(
+    gains: Gains, speed_mps: float, delta_m: float, gust_n: float, correlation_s: float
+) -> float:
+    """How far gusts from the side push COLA2 off a straight, rms, m; NaN where it weaves.
+
+    The variance of the path loop, driven by a Gauss-Markov force, by Lyapunov's equation. Quadratic
+    damping counts as the linear one with the least mean square difference for normal velocities, of
+    slope sqrt(8 / pi) sigma (T. K. Caughey, Equivalent linearization techniques, J. Acoust. Soc.
+    Am. 35, 1963), found by iteration.
+
+    Args:
+        gains: of the vehicle.
+        speed_mps: along the straight.
+        delta_m: COLA2's look-ahead.
+        gust_n: sigma of the force.
+        correlation_s: of the force.
+    """
+    from scipy.linalg import solve_continuous_lyapunov
+
+    if gust_n == 0.0:
+        return 0.0
+    if not math.isfinite(delta_m):
+        return math.nan
+    body, sigma = gains.body, np.full(2, 0.1 * speed_mps)
+    pushed = np.linalg.inv(body.mass[np.ix_([1, 5], [1, 5])])[:, 0]
+    noise = np.zeros((6, 6))
+    noise[5, 5] = 2.0 * gust_n**2 / correlation_s
+    variance = noise
+    for _ in range(_ROUNDS):
+        linear = body.linear.copy()
+        linear[[1, 5], [1, 5]] += math.sqrt(8.0 / math.pi) * body.quadratic[[1, 5], [1, 5]] * sigma
+        loop = np.zeros((6, 6))
+        damped = gains._replace(body=body._replace(linear=linear))
+        loop[:5, :5] = los_loop(damped, speed_mps, 0.0, delta_m)
+        loop[2:4, 5], loop[5, 5] = pushed, -1.0 / correlation_s
+        variance = solve_continuous_lyapunov(loop, -noise)
+        sigma = 0.5 * (sigma + np.sqrt(np.maximum(np.diag(variance)[2:4], 0.0)))
+    return float(np.sqrt(variance[0, 0])) if variance[0, 0] >= 0.0 else math.nan
+
+
 def line_offset_m(
     follower: Follower, heading_rad: float, speed_mps: float, lever_m: float
 ) -> float:
@@ -108,48 +154,52 @@ def line_offset_m(
     return math.copysign(steady_drift(across, speed_mps) * (follower.delta_m - lever_m), across)
 
 
-def circle_m(follower: Follower, speed_mps: float) -> float:
-    """Radius of the tightest circle at a speed: ends that are nearer abeam are not reached."""
-    return speed_mps / follower.turn_rad_s
-
-
-def end_tolerance_m(follower: Follower, speed_mps: float) -> float:
+def end_tolerance_m(follower: Follower) -> float:
     """Least tolerance at which COLA2 does not circle the end of a step in the expected current.
 
-    It heads for an end however near that is, and slows down only by the share of a heading error
-    beyond 0.3 rad: it circles an end within its turning circle for ever. In a current the bearing
-    of an end at a distance x turns at current / x besides.
+    In a current the bearing of an end at a distance x turns at current / x besides, which the
+    vehicle follows at a heading error of a radian at most.
     """
-    drift_m = follower.current_mps / (_TURN_SHARE * follower.turn_rad_s)
-    return circle_m(follower, speed_mps) + drift_m
+    return follower.circle_m + follower.current_mps / follower.turn_rad_s
 
 
 def predicted_stations(plan: Plan, follower: Follower, lever_m: float) -> Stations:
     """Where COLA2 will take the pictures of a plan in the expected current.
 
     It comes onto a line's run-in without an offset and is pushed towards the steady one over a
-    length of `delta`.
+    length of `delta`; gusts come on top, in one draw, with the same length of correlation.
 
     Args:
         plan: what is exported.
         follower: vehicle and current.
         lever_m: how far the glass is ahead of the reference point.
     """
-    stations = stations_of_plan(plan)
+    stations, rng = stations_of_plan(plan), np.random.default_rng(0)
     glass, attitude = stations.glass_ne.copy(), stations.attitude_rad.copy()
     for index, line in enumerate(plan.lines):
         rows = stations.line == index
-        glass[rows] += _pushed_ne(plan, line, follower, lever_m)
+        off_m = _pushed_m(plan, line, follower, lever_m) + _gusts_m(line, follower, rng)
+        starboard = [-math.sin(line.heading_rad), math.cos(line.heading_rad)]
+        glass[rows] += off_m[:, None] * np.array(starboard)
         across = follower.across_mps(line.heading_rad)
         drift = math.asin(steady_drift(across, plan.speed_mps))
         attitude[rows, 2] -= math.copysign(drift, across)
     return replace(stations, glass_ne=glass, attitude_rad=attitude)
 
 
-def _pushed_ne(plan: Plan, line: Line, follower: Follower, lever_m: float) -> Array:
-    heading = line.heading_rad
+def _pushed_m(plan: Plan, line: Line, follower: Follower, lever_m: float) -> Array:
     along_m = plan.run_in_m + np.linspace(0.0, line.length_m, line.stations)
-    off_m = line_offset_m(follower, heading, plan.speed_mps, lever_m)
-    off_m = off_m * -np.expm1(-along_m / follower.delta_m)
-    pushed: Array = off_m[:, None] * np.array([-math.sin(heading), math.cos(heading)])
+    off_m = line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m)
+    pushed: Array = off_m * -np.expm1(-along_m / follower.delta_m)
     return pushed
+
+
+def _gusts_m(line: Line, follower: Follower, rng: np.random.Generator) -> Array:
+    step_m = line.length_m / max(line.stations - 1, 1)
+    kept = math.exp(-step_m / follower.delta_m)
+    drawn = rng.standard_normal(line.stations)
+    off = np.empty(line.stations)
+    off[0] = drawn[0]
+    for i in range(1, line.stations):
+        off[i] = kept * off[i - 1] + math.sqrt(1.0 - kept * kept) * drawn[i]
+    return np.asarray(follower.wander_m * off)

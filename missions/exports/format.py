@@ -49,9 +49,8 @@ class Export:
     @cached_property
     def cola2_tolerance_m(self) -> float:
         """The same for COLA2, which circles an end that it misses, in the expected current."""
-        follower, speed_mps = self.options.follower, self.plan.speed_mps
-        needed_m = 0.0 if follower is None else end_tolerance_m(follower, speed_mps)
-        return max(self.tolerance_m, needed_m)
+        follower = self.options.follower
+        return max(self.tolerance_m, 0.0 if follower is None else end_tolerance_m(follower))
 
     @cached_property
     def home_lat_lon_deg(self) -> tuple[float, float]:

@@ -19,11 +19,14 @@ parameters, which have the names `~section/...` and `~anchor/...`.
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.gains import SURGE, WEIGHT, Gains
+from alice_survey.vehicle.pilot.gains import FASTEST, PLACE, RATE, SURGE, WEIGHT, YAW, Gains
 from alice_survey.vehicle.pilot.memory import PilotState
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.settings import Guidance
@@ -52,6 +55,8 @@ _YAW_FREE_RAD, _YAW_STOP_RAD = 0.3, 1.3
 """Heading error up to which the surge is whole, and from which on it is 0 (section.cpp)."""
 _STOPS, _STRAIGHT = 0.8, 0.4
 """Shares of the tolerance within which a section stops the surge, and keeps the heading."""
+_FASTEST_SLIP = 3.0
+"""Times the speed of a mission that a hull surely does not slip sideways at."""
 _ANCHOR_RAD = 0.5
 """Heading error beyond which an anchored vehicle does not surge."""
 
@@ -102,6 +107,52 @@ def steady_drift(current_mps: float, speed_mps: float) -> float:
     """
     ratio = abs(current_mps) / speed_mps
     return 2.0 * ratio / (math.sqrt(1.0 + 4.0 * ratio * ratio) + 1.0)
+
+
+def circling_m(gains: Gains, speed_mps: float) -> float:
+    """Radius at which a section's law circles its end for ever, if its tolerance is less.
+
+    On a circle the end is abeam: the heading error a and the drift angle b of the hull, which slips
+    outwards, make up a right angle. The surge is the share of the speed that a leaves, the yaw rate
+    what the heading loop answers to a, and the slip is where the water's sideways forces balance.
+
+    Args:
+        gains: of the vehicle.
+        speed_mps: that the mission states.
+    """
+    low, high = 0.0, _YAW_STOP_RAD
+    while high - low > 1e-6:
+        middle = 0.5 * (low + high)
+        surge, sway, _ = _circling(gains, speed_mps, middle)
+        if middle + math.atan2(abs(sway), surge) > 0.5 * math.pi:
+            high = middle
+        else:
+            low = middle
+    surge, sway, turn = _circling(gains, speed_mps, low)
+    return math.hypot(surge, sway) / turn
+
+
+def yaw_rad_s(gains: Gains, error_rad: float) -> float:
+    """Rate at which a vehicle turns at a heading error."""
+    row = gains.axes[YAW]
+    return float(min(row[PLACE] / row[RATE] * error_rad, row[FASTEST]))
+
+
+def _circling(gains: Gains, speed_mps: float, error_rad: float) -> tuple[float, float, float]:
+    """Surge, steady sway and yaw rate of a section's law at a heading error."""
+    share = (_YAW_STOP_RAD - error_rad) / (_YAW_STOP_RAD - _YAW_FREE_RAD)
+    surge, turn = speed_mps * min(max(share, 0.0), 1.0), yaw_rad_s(gains, error_rad)
+    low, high = -_FASTEST_SLIP * speed_mps, 0.0
+    while high - low > 1e-6 * speed_mps:
+        middle = 0.5 * (low + high)
+        motion, force = np.array([surge, middle, 0.0, 0.0, 0.0, turn]), np.zeros(6)
+        add_damping(gains.body, motion, force)
+        add_coriolis(gains.body, motion, force)
+        if force[1] > 0.0:
+            low = middle
+        else:
+            high = middle
+    return surge, 0.5 * (low + high), turn
 
 
 @kernel
