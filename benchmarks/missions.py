@@ -43,7 +43,7 @@ FORMATS = {
     "qgc-survey": "survey_dive1.plan",
 }
 _COLA2 = ("cola2", "cola2-v1")
-_SPARE = 0.02
+_SPARE = 0.03
 """How much less than expected may be seen: navigation and chance."""
 
 

@@ -3,11 +3,11 @@
 COLA2 ends a step only near its end and turns on the spot by itself: a heading far off the wanted
 one stops its surge. So
 
-- a line goes on past its end by the tolerance, as far as the allowed area lets it: the step may end
-  early and still take the line's last picture, and the vehicle does not circle the end;
+- a line goes on past its end by the tolerance and a picture's step, as far as the allowed area lets
+  it: the step may end early and still take the line's last picture;
 - turns on the spot are left to the step that follows; they need no thrusters sideways;
-- the step that leads to a line ends beyond it by the tolerance, less the turning circle, so that it
-  is done where the vehicle has just the room to turn onto the line;
+- the step that leads to a line ends beyond it by the tolerance, less the way that the vehicle goes
+  on while it turns, so that it is done where there is just that way left to the line;
 - a run-in begins as far before its line as the vehicle needs to come onto it, where there is room;
 - of the chords that stand for an arc those are left out that lie nearer to the one before than
   twice their tolerance, except the last before a line.
@@ -15,17 +15,13 @@ one stops its surge. So
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import shapely
-from shapely.geometry import LineString, Point
 
-from alice_survey.base.frames import Array
 from missions.exports.format import Export
 from missions.exports.options import LEAST_TOLERANCE_M
-from missions.exports.waypoints import Waypoint
-from missions.values.plan_file import Plan
+from missions.exports.waypoints import Waypoint, gone_on, moved, room_m
 
 _TOUCH_M = 1e-6
 
@@ -72,7 +68,7 @@ def _steps(export: Export, points: tuple[Waypoint, ...]) -> Iterator[Cola2Step]:
         tolerance_m = exact_m if leads_in or point.kind in ("line", "run-in", "turn") else ways_m
         end = point
         if point.kind == "line" and point.camera == "off":
-            end = _gone_on(export.plan, point, tolerance_m)
+            end = gone_on(export.plan, point, tolerance_m)
         elif leads_in and idle and point.kind == "way":
             if following is not None and following.kind == "run-in":
                 point = _set_back(export, point, following)
@@ -85,13 +81,6 @@ def way_tolerance_m(export: Export) -> float:
     """Tolerance between lines: as far as the run-in lets the vehicle settle again."""
     plan = export.plan
     return max(export.cola2_tolerance_m, min(plan.run_in_m, plan.line_spacing_m / 2))
-
-
-def _gone_on(plan: Plan, point: Waypoint, by_m: float) -> Waypoint:
-    """The end of a line, moved on along its course as far as the glass may go."""
-    line = plan.lines[point.line]
-    ahead = np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
-    return _moved(plan, point, _room_m(plan, np.array(line.end_ne_m), by_m * ahead) * ahead)
 
 
 def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
@@ -113,17 +102,9 @@ def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
     line = plan.lines[start.line]
     back = -np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
     reach_m = max(wanted_m, plan.run_in_m) + follower.circle_m
-    room_m = _room_m(plan, np.array(line.start_ne_m), reach_m * back) - follower.circle_m
-    by_m = room_m - math.dist(point.vehicle_ne_m, start.vehicle_ne_m)
-    return _moved(plan, point, max(by_m, 0.0) * back)
-
-
-def _room_m(plan: Plan, place_ne: Array, way_ne: Array) -> float:
-    """How far of a way from a place the glass may go."""
-    way = LineString([place_ne, place_ne + way_ne])
-    inside = shapely.get_parts(way.intersection(plan.area.allowed.buffer(_TOUCH_M)))
-    parts = [part for part in inside if part.distance(Point(place_ne)) <= _TOUCH_M]
-    return min(way.length, max((float(part.length) for part in parts), default=0.0))
+    free_m = room_m(plan, np.array(line.start_ne_m), reach_m * back) - follower.circle_m
+    by_m = free_m - math.dist(point.vehicle_ne_m, start.vehicle_ne_m)
+    return moved(plan, point, max(by_m, 0.0) * back)
 
 
 def _led_beyond(
@@ -135,17 +116,5 @@ def _led_beyond(
     length_m = float(np.hypot(*way))
     if follower is None or length_m < _TOUCH_M:
         return point
-    by_m = max(0.0, tolerance_m - follower.circle_m)
-    return _moved(export.plan, point, by_m / length_m * way)
-
-
-def _moved(plan: Plan, point: Waypoint, by_ne: Array) -> Waypoint:
-    vehicle_ne = np.array(point.vehicle_ne_m) + by_ne
-    place = np.array([[*vehicle_ne, point.depth_m]])
-    ((latitude, longitude, _),) = plan.datum.geodetic_from_ned(place)
-    return replace(
-        point,
-        vehicle_ne_m=(float(vehicle_ne[0]), float(vehicle_ne[1])),
-        latitude_deg=float(latitude),
-        longitude_deg=float(longitude),
-    )
+    by_m = max(tolerance_m - follower.turn_in_m, -length_m)
+    return moved(export.plan, point, by_m / length_m * way)

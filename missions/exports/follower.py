@@ -13,7 +13,7 @@ import numpy as np
 
 from alice_survey.base.config import SeaConfig, VehicleConfig
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.pilot.cola2 import circling_m, steady_drift, yaw_rad_s
+from alice_survey.vehicle.pilot.cola2 import circling_m, steady_drift, turn_in_m, yaw_rad_s
 from alice_survey.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
 from alice_survey.vehicle.pilot.settings import los_loop, shortest_look_ahead_m
 from missions.coverage.stations import Stations, stations_of_plan
@@ -23,6 +23,8 @@ from missions.values.plan_file import Plan
 
 _ROUNDS = 40
 """Of an iteration that halves its error in each."""
+_LEAST_SLIP = 0.05
+"""Share of the speed that a hull slips and yaws at in calm water, at the least (inferred)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +38,14 @@ class Follower:
     """COLA2's look-ahead: the shortest that is damped well at the plan's speed."""
     circle_m: float
     """Radius at which COLA2 would circle an end with a smaller tolerance."""
+    turn_in_m: float
+    """How far it goes on while COLA2 turns it onto a line that it comes to at a right angle."""
     turn_rad_s: float
     """Yaw rate at a heading error of one radian."""
     wander_m: float
     """How far gusts push COLA2 off a line without a current, rms."""
+    mode_per_s: complex
+    """The slowest mode in which it comes onto a line."""
     current_ne_mps: tuple[float, float]
     """The expected current, towards north and east."""
 
@@ -69,12 +75,16 @@ def follower_of(vehicle: VehicleConfig, sea: SeaConfig, speed_mps: float) -> Fol
     gains = gains_for(craft, speed_mps)
     towards = math.radians(sea.current_towards_deg)
     delta_m = cola2_delta_m(gains, speed_mps)
+    gust_n, correlation_s = sea.gust_n[1], sea.gust_correlation_s
+    wander_m, mode_per_s = path_loop(gains, speed_mps, delta_m, gust_n, correlation_s)
     return Follower(
         name=craft.name,
         sways=sways(gains),
         delta_m=delta_m,
-        wander_m=wander_m(gains, speed_mps, delta_m, sea.gust_n[1], sea.gust_correlation_s),
+        wander_m=wander_m,
+        mode_per_s=mode_per_s,
         circle_m=circling_m(gains, speed_mps),
+        turn_in_m=turn_in_m(gains, speed_mps),
         turn_rad_s=yaw_rad_s(gains, 1.0),
         current_ne_mps=(
             sea.current_mps * math.cos(towards),
@@ -96,15 +106,15 @@ def cola2_delta_m(gains: Gains, speed_mps: float) -> float:
     return math.ceil(10.0 * shortest_look_ahead_m(gains, speed_mps, 0.0) - 1e-6) / 10.0
 
 
-def wander_m(
+def path_loop(
     gains: Gains, speed_mps: float, delta_m: float, gust_n: float, correlation_s: float
-) -> float:
-    """How far gusts from the side push COLA2 off a straight, rms, m; NaN where it weaves.
+) -> tuple[float, complex]:
+    """How COLA2's loop about a straight answers to gusts, and how it comes onto it.
 
-    The variance of the path loop, driven by a Gauss-Markov force, by Lyapunov's equation. Quadratic
-    damping counts as the linear one with the least mean square difference for normal velocities, of
-    slope sqrt(8 / pi) sigma (T. K. Caughey, Equivalent linearization techniques, J. Acoust. Soc.
-    Am. 35, 1963), found by iteration.
+    The variance of the loop, driven by a Gauss-Markov force from the side, by Lyapunov's equation.
+    Quadratic damping counts as the linear one with the least mean square difference for normal
+    velocities, of slope sqrt(8 / pi) sigma (T. K. Caughey, Equivalent linearization techniques, J.
+    Acoust. Soc. Am. 35, 1963), found by iteration.
 
     Args:
         gains: of the vehicle.
@@ -112,28 +122,33 @@ def wander_m(
         delta_m: COLA2's look-ahead.
         gust_n: sigma of the force.
         correlation_s: of the force.
+
+    Returns:
+        How far off gusts push it, rms, m, and the slowest mode, 1/s; NaN where it weaves.
     """
     from scipy.linalg import solve_continuous_lyapunov
 
-    if gust_n == 0.0:
-        return 0.0
     if not math.isfinite(delta_m):
-        return math.nan
-    body, sigma = gains.body, np.full(2, 0.1 * speed_mps)
-    pushed = np.linalg.inv(body.mass[np.ix_([1, 5], [1, 5])])[:, 0]
+        return math.nan, complex(math.nan, math.nan)
+    body, sigma = gains.body, np.full(2, _LEAST_SLIP * speed_mps)
     noise = np.zeros((6, 6))
     noise[5, 5] = 2.0 * gust_n**2 / correlation_s
-    variance = noise
+    loop, variance = np.zeros((6, 6)), noise
+    loop[2:4, 5] = np.linalg.inv(body.mass[np.ix_([1, 5], [1, 5])])[:, 0]
+    loop[5, 5] = -1.0 / correlation_s
     for _ in range(_ROUNDS):
         linear = body.linear.copy()
         linear[[1, 5], [1, 5]] += math.sqrt(8.0 / math.pi) * body.quadratic[[1, 5], [1, 5]] * sigma
-        loop = np.zeros((6, 6))
         damped = gains._replace(body=body._replace(linear=linear))
         loop[:5, :5] = los_loop(damped, speed_mps, 0.0, delta_m)
-        loop[2:4, 5], loop[5, 5] = pushed, -1.0 / correlation_s
         variance = solve_continuous_lyapunov(loop, -noise)
-        sigma = 0.5 * (sigma + np.sqrt(np.maximum(np.diag(variance)[2:4], 0.0)))
-    return float(np.sqrt(variance[0, 0])) if variance[0, 0] >= 0.0 else math.nan
+        now = np.sqrt(np.maximum(np.diag(variance)[2:4], 0.0))
+        sigma = np.maximum(0.5 * (sigma + now), _LEAST_SLIP * speed_mps)
+    modes = np.linalg.eigvals(loop[:5, :5])
+    slowest = complex(modes[np.argmax(modes.real)])
+    if slowest.real >= 0.0:
+        return math.nan, slowest
+    return float(math.sqrt(max(variance[0, 0], 0.0))), slowest
 
 
 def line_offset_m(
@@ -166,8 +181,9 @@ def end_tolerance_m(follower: Follower) -> float:
 def predicted_stations(plan: Plan, follower: Follower, lever_m: float) -> Stations:
     """Where COLA2 will take the pictures of a plan in the expected current.
 
-    It comes onto a line's run-in without an offset and is pushed towards the steady one over a
-    length of `delta`; gusts come on top, in one draw, with the same length of correlation.
+    A vehicle that needs more room to turn than there is between lines comes onto them too far, on
+    alternate sides, and swings in by its slowest mode. A current pushes it towards the steady
+    offset over a length of `delta`. Gusts come on top, in one draw, correlated over that length.
 
     Args:
         plan: what is exported.
@@ -179,6 +195,7 @@ def predicted_stations(plan: Plan, follower: Follower, lever_m: float) -> Statio
     for index, line in enumerate(plan.lines):
         rows = stations.line == index
         off_m = _pushed_m(plan, line, follower, lever_m) + _gusts_m(line, follower, rng)
+        off_m += (-1) ** index * _swing_m(plan, line, follower)
         starboard = [-math.sin(line.heading_rad), math.cos(line.heading_rad)]
         glass[rows] += off_m[:, None] * np.array(starboard)
         across = follower.across_mps(line.heading_rad)
@@ -192,6 +209,12 @@ def _pushed_m(plan: Plan, line: Line, follower: Follower, lever_m: float) -> Arr
     off_m = line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m)
     pushed: Array = off_m * -np.expm1(-along_m / follower.delta_m)
     return pushed
+
+
+def _swing_m(plan: Plan, line: Line, follower: Follower) -> Array:
+    too_far_m = max(0.0, follower.circle_m + follower.turn_in_m - plan.line_spacing_m)
+    took_s = (plan.run_in_m + np.linspace(0.0, line.length_m, line.stations)) / plan.speed_mps
+    return np.asarray(too_far_m * np.exp(follower.mode_per_s * took_s).real)
 
 
 def _gusts_m(line: Line, follower: Follower, rng: np.random.Generator) -> Array:

@@ -13,7 +13,7 @@ from missions.exports.geometry import lat_lon
 from missions.exports.mavlink import Item, mission_items
 from missions.exports.mount import CameraMount, mount_of
 from missions.exports.options import Options, line_tolerance_m
-from missions.exports.waypoints import Waypoint, waypoints
+from missions.exports.waypoints import Waypoint, gone_on, waypoints
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan
 
@@ -63,8 +63,14 @@ class Export:
 
     def items(self, dive: int) -> list[Item]:
         """A dive as MAVLink mission items."""
+        points = [
+            gone_on(self.plan, point, self.tolerance_m)
+            if point.kind == "line" and point.camera == "off"
+            else point
+            for point in self.dives[dive]
+        ]
         rate_rad_s = self.options.turn_rate_rad_s
-        return mission_items(self.plan, self.dives[dive], self.tolerance_m, rate_rad_s)
+        return mission_items(self.plan, points, self.tolerance_m, rate_rad_s)
 
 
 @dataclass(frozen=True, kw_only=True)

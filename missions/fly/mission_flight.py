@@ -284,7 +284,8 @@ def _every(places_ne: Array, step_m: float) -> list[int]:
 def overshot(known: MissionOfPlan, flight: Flight) -> list[float]:
     """How far past the end of its way the vehicle went on each line, by its own estimate, m.
 
-    Zero where the step was done before its end was passed.
+    Zero where the step was done before its end was passed. ArduSub comes to rest at an end, about
+    which it may swing within its radius: only what is beyond counts.
     """
     report = flight.flown.report
     ends, starts = (
@@ -297,7 +298,10 @@ def overshot(known: MissionOfPlan, flight: Flight) -> list[float]:
             continue
         rows = report[:, LEG] == i
         start = starts[i] if np.isfinite(starts[i]).all() else ends[i - 1]
-        along = report[rows, ALONG] - math.dist(start, ends[i])
+        swing_m = (
+            known.mission.steps[i].tolerance_m if known.mission.autopilot == "ardusub" else 0.0
+        )
+        along = report[rows, ALONG] - math.dist(start, ends[i]) - swing_m
         beyond.append(max(0.0, float(along.max(initial=-math.inf))))
     return beyond
 

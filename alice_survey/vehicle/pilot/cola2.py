@@ -132,6 +132,22 @@ def circling_m(gains: Gains, speed_mps: float) -> float:
     return math.hypot(surge, sway) / turn
 
 
+def turn_in_m(gains: Gains, speed_mps: float) -> float:
+    """How far a vehicle goes on along its course while a section turns it by a right angle.
+
+    The integral of the speed that a heading error leaves, times its sine, over the rate at which
+    the error goes; the hull's slip is left out.
+
+    Args:
+        gains: of the vehicle.
+        speed_mps: that the mission states.
+    """
+    errors = np.linspace(1e-6, 0.5 * math.pi, 1000)
+    shares = np.clip((_YAW_STOP_RAD - errors) / (_YAW_STOP_RAD - _YAW_FREE_RAD), 0.0, 1.0)
+    rates = np.array([yaw_rad_s(gains, float(error)) for error in errors])
+    return float(np.trapezoid(speed_mps * shares * np.sin(errors) / rates, errors))
+
+
 def yaw_rad_s(gains: Gains, error_rad: float) -> float:
     """Rate at which a vehicle turns at a heading error."""
     row = gains.axes[YAW]

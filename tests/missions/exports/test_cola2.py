@@ -72,8 +72,9 @@ def test_the_glass_flies_every_line(plan: Plan, rig: Rig) -> None:
             np.testing.assert_allclose(
                 place(plan, step, "initial") + arm, wanted.start_ne_m, atol=MM
             )
-            # It goes on past its last picture by its tolerance: the allowed area is 3 m wider.
-            past = float(step.values["tolerance_xy"]) * turned((1.0, 0.0), wanted.heading_rad)
+            # It goes on by its tolerance and a step: the allowed area is 3 m wider.
+            past_m = float(step.values["tolerance_xy"]) + plan.station_spacing_m
+            past = past_m * turned((1.0, 0.0), wanted.heading_rad)
             np.testing.assert_allclose(place(plan, step) + arm, wanted.end_ne_m + past, atol=MM)
             depth = plan.seafloor_depth_m - plan.altitude_m - glass[2]
             assert step.values["final_depth"] == pytest.approx(depth, abs=MM)
@@ -117,7 +118,8 @@ def test_gotos_are_not_done_where_the_one_before_is(plan: Plan) -> None:
 
 
 FOLLOWER = Follower(
-    name="hull", sways=True, delta_m=3.0, circle_m=0.4, turn_rad_s=0.5, wander_m=0.1,
+    name="hull", sways=True, delta_m=3.0, circle_m=0.4, turn_in_m=0.3, turn_rad_s=0.5, wander_m=0.1,
+    mode_per_s=-0.03 + 0.1j,
     current_ne_mps=(0.03, 0.04),
 )  # fmt: skip
 
@@ -139,7 +141,7 @@ def test_in_a_current_steps_end_outside_of_the_turning_circle(tmp_path: Path) ->
         assert length_m > 2 * plan.run_in_m
         on_m = math.dist(place(plan, step, "initial"), place(plan, step))
         line_m = min(line.length_m for line in plan.lines[:3])
-        assert on_m == pytest.approx(line_m + least_m, abs=MM)
+        assert on_m == pytest.approx(line_m + least_m + plan.station_spacing_m, abs=MM)
         heading = math.atan2(*(place(plan, step) - place(plan, step, "initial"))[::-1])
         arm = turned((0.55, -0.05), heading)
         allowed = plan.area.allowed.buffer(1e-6)
