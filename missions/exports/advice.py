@@ -28,6 +28,9 @@ class Cola2Outlook:
     """Half of what neighbouring pictures overlap: two lines so far off, apart, just meet."""
     share_at_overlap: float
     """Share of the area that will be seen as requested."""
+    at_most: bool
+    """Whether turns, which are not predicted, will leave less of it: the current is more than half
+    as fast as the vehicle."""
 
 
 def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:
@@ -64,6 +67,7 @@ def cola2_outlook(plan: Plan, rig: Rig, follower: Follower, lever_m: float) -> C
         offset_m=max(offsets, default=0.0),
         allowed_m=0.5 * (plan.footprint_m[0] - plan.line_spacing_m),
         share_at_overlap=seen.share_at_overlap,
+        at_most=follower.current_mps > 0.5 * plan.speed_mps,
     )
 
 
@@ -104,10 +108,10 @@ def _cola2(export: Export) -> list[str]:
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
         f"to {outlook.offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
         f"{outlook.allowed_m:.2f} m, and gusts {follower.wander_m:.2f} m rms; "
-        f"{share(outlook.share_at_overlap)} of the area is expected to be seen at the requested "
-        "overlap"
+        f"{'at most ' if outlook.at_most else ''}{share(outlook.share_at_overlap)} of the area is "
+        "expected to be seen at the requested overlap"
     )
-    if outlook.offset_m > outlook.allowed_m:
+    if outlook.offset_m > outlook.allowed_m or outlook.at_most:
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
         warn(
             f"{expected}: lay lines along the current (line_heading_deg = {towards_deg:.0f}), wait "
