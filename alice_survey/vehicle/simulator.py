@@ -53,7 +53,7 @@ from alice_survey.vehicle.pilot.memory import (
     PilotState,
     new_pilot,
 )
-from alice_survey.vehicle.pilot.mission import NO_MISSION, Mission
+from alice_survey.vehicle.pilot.mission import NO_MISSION, PilotMission
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import THRUSTER_LOST, TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
@@ -178,7 +178,7 @@ def _fly_ticks(
     sensors: Sensors,
     navigation: NavigationState,
     path: Path,
-    mission: Mission,
+    mission: PilotMission,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
@@ -265,7 +265,7 @@ class Setup:
     floor: FloorGrid
     current: Current
     disturbance: Disturbance
-    mission: Mission = NO_MISSION
+    mission: PilotMission = NO_MISSION
     """What is flown instead of the path, by the law of another vehicle's software."""
     exact_allocation: bool = True
     health: Mapping[str, float] = field(default_factory=dict)

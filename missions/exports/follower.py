@@ -133,7 +133,8 @@ def path_loop(
     body, sigma = gains.body, np.full(2, _LEAST_SLIP * speed_mps)
     noise = np.zeros((6, 6))
     noise[5, 5] = 2.0 * gust_n**2 / correlation_s
-    loop, variance = np.zeros((6, 6)), noise
+    loop = np.zeros((6, 6))
+    variance: Array = noise
     loop[2:4, 5] = np.linalg.inv(body.mass[np.ix_([1, 5], [1, 5])])[:, 0]
     loop[5, 5] = -1.0 / correlation_s
     for _ in range(_ROUNDS):
@@ -141,7 +142,7 @@ def path_loop(
         linear[[1, 5], [1, 5]] += math.sqrt(8.0 / math.pi) * body.quadratic[[1, 5], [1, 5]] * sigma
         damped = gains._replace(body=body._replace(linear=linear))
         loop[:5, :5] = los_loop(damped, speed_mps, 0.0, delta_m)
-        variance = solve_continuous_lyapunov(loop, -noise)
+        variance = np.asarray(solve_continuous_lyapunov(loop, -noise), np.float64)
         now = np.sqrt(np.maximum(np.diag(variance)[2:4], 0.0))
         sigma = np.maximum(0.5 * (sigma + now), _LEAST_SLIP * speed_mps)
     modes = np.linalg.eigvals(loop[:5, :5])

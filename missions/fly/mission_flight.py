@@ -171,7 +171,7 @@ def _sways(vehicle: VehicleConfig, speed_mps: float) -> bool:
 
 def pilot_mission(
     known: MissionOfPlan, vehicle: VehicleConfig, mount: CameraMount
-) -> pilot.Mission:
+) -> pilot.PilotMission:
     """A mission for the simulator's pilot.
 
     Args:

@@ -31,7 +31,7 @@ from alice_survey.vehicle.navigation.sensors import (
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.pilot.gains import Gains, gains_for
 from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
-from alice_survey.vehicle.pilot.mission import NO_LAW, NO_MISSION, Mission
+from alice_survey.vehicle.pilot.mission import NO_LAW, NO_MISSION, PilotMission
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
 from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
 from alice_survey.vehicle.sea import (
@@ -152,7 +152,7 @@ def mission_setup(
     floor: FloorGrid,
     longest_s: float,
     rng: np.random.Generator,
-    mission: Mission = NO_MISSION,
+    mission: PilotMission = NO_MISSION,
 ) -> Setup:
     """Vehicle, path, pilot, instruments and sea of a survey.
 

@@ -184,7 +184,7 @@ def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Array) -
     speed = max(min(step[SPEED], settings[_MAX_SURGE]), 1e-3)
     heave = abs(heave_m) if step[BY_DEPTH] > 0.0 else 0.0
     heave += _DVL_RANGE_M if step[BY_ALTITUDE] > 0.0 else 0.0
-    return 2.0 * max(math.sqrt(2.0) * distance_m / speed, heave / _HEAVE_MPS) + _SPARE_S
+    return float(2.0 * max(math.sqrt(2.0) * distance_m / speed, heave / _HEAVE_MPS) + _SPARE_S)
 
 
 @kernel

@@ -35,7 +35,7 @@ from alice_survey.vehicle.pilot.memory import (
 from alice_survey.vehicle.pilot.mission import (
     COLA2,
     NO_LAW,
-    Mission,
+    PilotMission,
     fly_mission,
     mission_progress_m,
 )
@@ -91,7 +91,7 @@ def steer(
     dt_s: float,
     estimate: Array,
     path: Path,
-    mission: Mission,
+    mission: PilotMission,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,

@@ -50,7 +50,7 @@ _STEP_M = 1000.0
 """Progress of a step that is done, above the length of any."""
 
 
-class Mission(NamedTuple):
+class PilotMission(NamedTuple):
     """Steps and the law that they are flown by; compiled code takes the arrays as they are."""
 
     law: int
@@ -61,11 +61,11 @@ class Mission(NamedTuple):
 
 
 _SETTINGS = max(COLA2_SETTINGS, ARDUSUB_SETTINGS)
-NO_MISSION = Mission(NO_LAW, np.zeros((0, COLUMNS)), np.zeros(_SETTINGS))
+NO_MISSION = PilotMission(NO_LAW, np.zeros((0, COLUMNS)), np.zeros(_SETTINGS))
 """The path is followed by our own guidance."""
 
 
-def mission_of(law: int, steps: Array, settings: Sequence[float]) -> Mission:
+def mission_of(law: int, steps: Array, settings: Sequence[float]) -> PilotMission:
     """A mission.
 
     Args:
@@ -75,11 +75,11 @@ def mission_of(law: int, steps: Array, settings: Sequence[float]) -> Mission:
     """
     padded = np.zeros(_SETTINGS)
     padded[: len(settings)] = settings
-    return Mission(law, np.ascontiguousarray(steps, np.float64), padded)
+    return PilotMission(law, np.ascontiguousarray(steps, np.float64), padded)
 
 
 @kernel
-def mission_progress_m(estimate: Array, mission: Mission, pilot: PilotState) -> float:
+def mission_progress_m(estimate: Array, mission: PilotMission, pilot: PilotState) -> float:
     """Quantity that grows while a mission gets on: steps done, and the way left of this one."""
     leg = int(pilot.report[slot.LEG])
     step, point = mission.steps[leg], pilot.point
@@ -93,7 +93,7 @@ def fly_mission(
     dt_s: float,
     estimate: Array,
     path: Path,
-    mission: Mission,
+    mission: PilotMission,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
@@ -165,7 +165,7 @@ def _begin(
     leg: int,
     target_m: float,
     estimate: Array,
-    mission: Mission,
+    mission: PilotMission,
     guidance: Guidance,
     pilot: PilotState,
 ) -> None:
