@@ -274,14 +274,22 @@ def _plan_summary(folder: Path) -> Summary:
 def _fly_summary(folder: Path) -> Summary:
     flight = records.FlightRecord.read(folder / "flight.json")
     line = flight.on_lines
+    mission = flight.mission
+    how = flight.controller if mission is None else f"{mission.file} as {mission.follower} flies it"
+    promised = (
+        ""
+        if mission is None
+        else f" (the plan's certificate: {share(mission.planned.share_at_overlap)}; "
+        f"{mission.line_ends_overshot} of {mission.line_ends} line ends overshot)"
+    )
     text = (
-        f"{flight.vehicle} with {flight.controller}: {flight.ending}, {flight.stations} of "
+        f"{flight.vehicle} with {how}: {flight.ending}, {flight.stations} of "
         f"{flight.stations_planned} stations in {flight.duration_s / 60:.0f} min; on lines "
         f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
         f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
         f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
-        f"{share(flight.coverage.share_at_overlap)} of the area covered as requested, "
+        f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "
         f"{share(flight.coverage.every_camera_share)} seen by every camera; "
         f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
     )
@@ -485,7 +493,7 @@ STAGES: tuple[StageSpec, ...] = (
             "water": without("water", "n_water_sigma"),
             "plan": "plan",
             "sea": "sea",
-            "vehicle": without("vehicle", "dive"),
+            "vehicle": without("vehicle", "dive", "mission_file", "follower", "cola2_delta_m"),
             "datum_given": "area.datum_given",
             "strobes": only("imaging", "strobe_lumens", "strobe_beam_deg", "strobes_body_m"),
         },
@@ -518,7 +526,7 @@ STAGES: tuple[StageSpec, ...] = (
         needs=("plan",),
         settings={
             "seed": "seed",
-            "vehicle": without("vehicle", "coefficients_file"),
+            "vehicle": without("vehicle", "coefficients_file", "mission_file"),
             "sea": without("sea", "current_file"),
             "navigation": "navigation",
             "seafloor": "seafloor",
@@ -527,7 +535,12 @@ STAGES: tuple[StageSpec, ...] = (
             "position_body_m": "camera.position_body_m",
             "dvl_position_body_m": "camera.dvl_position_body_m",
         },
-        setting_files=("sea.current_file", "vehicle.coefficients_file", "vehicle.file"),
+        setting_files=(
+            "sea.current_file",
+            "vehicle.coefficients_file",
+            "vehicle.file",
+            "vehicle.mission_file",
+        ),
         inputs=lambda workspace: [workspace / "plan" / "plan.json"],
         summary=_fly_summary,
         simulated=True,

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from filelock import FileLock, Timeout
 
@@ -36,6 +36,10 @@ class FlightChanges:
     one that turns on, either @SECONDS."""
     dive: int | None = None
     """Number of the dive to fly, from 1."""
+    mission: Path | None = None
+    """Mission file to fly instead of the plan's route."""
+    follower: Literal["cola2", "ardusub"] | None = None
+    """Autopilot by whose law it is flown."""
 
     def applied(self, config: SurveyConfig) -> SurveyConfig:
         """The survey with these changes.
@@ -54,6 +58,7 @@ class FlightChanges:
             name=self.vehicle, controller=self.controller,
             thruster_health=health.at_start, failures=health.later,
             lost_propellers=health.propellers, dive=self.dive,
+            mission_file=self.mission, follower=self.follower,
         )  # fmt: skip
 
 

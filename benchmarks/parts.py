@@ -136,6 +136,7 @@ PARTS = (
         packages=("coverage_path_planner", "opencoverage"),
     ),
     Part(name="vehicle", module="vehicle"),
+    Part(name="missions", module="missions"),
     Part(name="features", module="features", arguments=_features, needs=_need_features),
     Part(name="refraction", module="refraction"),
     Part(name="bend", module="bend", arguments=lambda _, work: ("--work", str(work))),

@@ -38,7 +38,7 @@ def test_every_benchmark_that_hands_figures_over_is_a_part() -> None:
     assert found == MODULES
     assert {"camera", "planner", "vehicle", "features", "refraction", "bend", "bend_power",
             "block_size", "cluster", "scale", "many_pictures", "refine_gpu", "precision",
-            "reconstruct", "mosaic", "harbour", "facade", "turbid", "colour",
+            "reconstruct", "missions", "mosaic", "harbour", "facade", "turbid", "colour",
             "real_pictures"} == {*MODULES}  # fmt: skip
 
 

@@ -289,6 +289,12 @@ class VehicleConfig(Config):
     battery_reserve: float = Field(0.2, ge=0, lt=1)
     hotel_w: float = Field(60.0, ge=0, le=5000)
     dive: int | None = Field(None, ge=1)
+    mission_file: Path | None = Field(None, exclude_if=lambda path: path is None)
+    """A mission that is flown instead of the plan, as an autopilot follows it."""
+    follower: Literal["cola2", "ardusub"] | None = Field(None, exclude_if=lambda f: f is None)
+    """That autopilot; the one that the file is for where it is not set."""
+    cola2_delta_m: float | None = Field(None, gt=0, le=100, exclude_if=lambda d: d is None)
+    """COLA2's look-ahead, `section/delta`; as `about.txt` of the exports says where not set."""
 
     @property
     def file(self) -> Path | None:
@@ -490,7 +496,7 @@ def load_config(path: str | Path) -> SurveyConfig:
 
 _FILES = (
     ("area", "file"), ("area", "no_go_file"), ("area", "allowed_file"), ("area", "bathymetry_file"),
-    ("sea", "current_file"), ("vehicle", "coefficients_file"),
+    ("sea", "current_file"), ("vehicle", "coefficients_file"), ("vehicle", "mission_file"),
 )  # fmt: skip
 
 

@@ -65,6 +65,18 @@ class Covered(JsonRecord):
     share_at_overlap: float
 
 
+class MissionFlown(JsonRecord):
+    """A mission file that was flown instead of the plan's route."""
+
+    file: str
+    follower: str
+    """Autopilot by whose law it was flown."""
+    line_ends: int
+    line_ends_overshot: int
+    planned: Covered
+    """What the plan's certificate promises of its lines."""
+
+
 class FlightRecord(JsonRecord):
     """`flight/flight.json`."""
 
@@ -82,6 +94,7 @@ class FlightRecord(JsonRecord):
     energy_wh: dict[str, float]
     """Energy by thruster."""
     coverage: Covered
+    mission: MissionFlown | None = None
 
 
 class CalibrationRecord(JsonRecord):

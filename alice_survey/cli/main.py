@@ -170,6 +170,7 @@ def fov(
         "fly -w reef --fail stern@600",
         "fly -w reef --fail stern:propeller@600",
         "fly -w reef --dive 2",
+        "fly -w reef --mission reef/plan/exports/mission_dive1.xml --current 0.1@90",
     )
 )
 def fly(
@@ -193,9 +194,20 @@ def fly(
     dive: Annotated[
         int | None, typer.Option(min=1, help="Fly this dive of the plan; all when not given.")
     ] = None,
+    mission: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Fly this exported mission of the plan (COLA2, QGC WPL, QGroundControl).",
+        ),
+    ] = None,
+    follower: Annotated[
+        Literal["cola2", "ardusub"] | None,
+        typer.Option(help="Autopilot that flies the mission; the file's own when not given."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fly the plan.
+    """Fly the plan, or a mission that was exported from it.
 
     The simulated vehicle with its controller, sensors and navigation filter, in a current. Writes
     the true track, the trigger times, the navigation log, the vehicle's log, and plots.
@@ -203,8 +215,9 @@ def fly(
     from alice_survey.survey import FlightChanges, run
 
     changes = FlightChanges(
-        vehicle=vehicle, controller=controller, current=current, failed=fail, dive=dive
-    )
+        vehicle=vehicle, controller=controller, current=current, failed=fail, dive=dive,
+        mission=mission, follower=follower,
+    )  # fmt: skip
     print_result(*run(["fly"], workspace, survey, flight=changes), as_json)
 
 

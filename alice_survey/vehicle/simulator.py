@@ -33,6 +33,7 @@ from alice_survey.vehicle.pilot.memory import (
     SIGMA_M,
     PilotState,
 )
+from alice_survey.vehicle.pilot.mission import NO_MISSION, PilotMission
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
@@ -76,6 +77,7 @@ def _fly_ticks(
     sensors: Sensors,
     navigation: NavigationState,
     path: Path,
+    mission: PilotMission,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
@@ -95,7 +97,9 @@ def _fly_ticks(
         sense(tick, sea, floor, sensors, navigation, world, rng)
         spread = max(navigation.covariance[0, 0], navigation.covariance[1, 1])
         pilot.memory[SIGMA_M] = math.sqrt(max(spread, 0.0))
-        steer(tick * TICK_S, TICK_S, world.estimate, path, guidance, gains, pilot, wrench)
+        steer(
+            tick * TICK_S, TICK_S, world.estimate, path, mission, guidance, gains, pilot, wrench
+        )  # fmt: skip
         touched = touches(world.now, sensors, floor)
         if touched:
             pilot.report[PHASE], pilot.report[REASON] = ABORT, TOUCHED
@@ -135,6 +139,8 @@ class Setup:
     floor: FloorGrid
     current: Current
     disturbance: Disturbance
+    mission: PilotMission = NO_MISSION
+    """What is flown instead of the path, by the law of another vehicle's software."""
     exact_allocation: bool = True
     health: Mapping[str, float] = field(default_factory=dict)
     """Share of its greatest speed squared left in a thruster: 0 failed; intact if not named."""
@@ -285,8 +291,8 @@ def _chunks(
         rows = _new_rows(end - first, thrusters, setup.vehicle.actuators)
         flown = _fly_ticks(
             first, afloat.plant, afloat.sea, afloat.floor, afloat.sensors, afloat.navigation,
-            pilot.path, pilot.guidance, pilot.gains, pilot.state, pilot.wrench, pilot.allocation,
-            afloat.world, afloat.scratch, rng, sea_rng, rows,
+            pilot.path, setup.mission, pilot.guidance, pilot.gains, pilot.state, pilot.wrench,
+            pilot.allocation, afloat.world, afloat.scratch, rng, sea_rng, rows,
         )  # fmt: skip
         yield TickRows(*(part[:flown] for part in rows))
         if flown < len(rows.state) or pilot.state.report[REASON] == TOUCHED:

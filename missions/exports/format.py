@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from camera_calib.rig import Rig
+from missions.exports.follower import end_tolerance_m
 from missions.exports.geometry import lat_lon
 from missions.exports.mavlink import Item, mission_items
 from missions.exports.mount import CameraMount, mount_of
 from missions.exports.options import Options, line_tolerance_m
-from missions.exports.waypoints import Waypoint, waypoints
+from missions.exports.waypoints import Waypoint, gone_on, waypoints
+from missions.values.mission import Mission
 from missions.values.plan_file import Plan
 
 
@@ -45,6 +47,12 @@ class Export:
         return line_tolerance_m(self.plan, self.rig)
 
     @cached_property
+    def cola2_tolerance_m(self) -> float:
+        """The same for COLA2, which circles an end that it misses, in the expected current."""
+        follower = self.options.follower
+        return max(self.tolerance_m, 0.0 if follower is None else end_tolerance_m(follower))
+
+    @cached_property
     def home_lat_lon_deg(self) -> tuple[float, float]:
         """Where the reference point is when the glass is at home, headed as the first dive is."""
         first = self.plan.dives[0].route.legs[0]
@@ -55,8 +63,14 @@ class Export:
 
     def items(self, dive: int) -> list[Item]:
         """A dive as MAVLink mission items."""
+        points = [
+            gone_on(self.plan, point, self.tolerance_m)
+            if point.kind == "line" and point.camera == "off"
+            else point
+            for point in self.dives[dive]
+        ]
         rate_rad_s = self.options.turn_rate_rad_s
-        return mission_items(self.plan, self.dives[dive], self.tolerance_m, rate_rad_s)
+        return mission_items(self.plan, points, self.tolerance_m, rate_rad_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +92,9 @@ class ExportFormat:
     read_by: str
     """Programs that read it, in words."""
     files: tuple[ExportFile, ...]
+    read: Callable[[str], Mission | None] | None = None
+    """Reads a mission from the text of a file, as the vehicle does; None where the text is of
+    another format. A `ValueError` says what is wrong with it."""
 
     def write(self, folder: Path, export: Export) -> dict[Path, str]:
         """Write all files.

@@ -7,9 +7,11 @@ and CONDITION_ commands) is done on leaving the way-point before it.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from missions.exports.waypoints import Waypoint
+from missions.values.mission import Mission, MissionStep
 from missions.values.plan_file import Plan
 
 FRAME_GLOBAL, FRAME_MISSION, FRAME_ABOVE_HOME, FRAME_ABOVE_TERRAIN = 0, 2, 3, 10
@@ -19,6 +21,8 @@ _DESCENT_ALTITUDES = 2.0
 """The way down is by depth, since from the surface an altimeter may see no floor: down to this many
 times the altitude of the lines above the sea floor as charted, so that a chart in error by less
 than the altitude does no harm. On from there by altitude."""
+
+_PARAMS = 7
 
 _FROM_REST = ("turn", "sway", "surface")
 """What begins where the vehicle has stopped."""
@@ -111,4 +115,82 @@ def _command(command: int, *params: float) -> Item:
     p = [round(float(value), 6) for value in params] + [0.0] * (7 - len(params))
     return Item(
         command=command, frame=FRAME_MISSION, params=(p[0], p[1], p[2], p[3], p[4], p[5], p[6])
+    )
+
+
+def item_of(command: Any, frame: Any, params: Sequence[Any], where: str) -> Item:
+    """An item from the cells of a file.
+
+    Raises:
+        ValueError: it is not one.
+    """
+    try:
+        numbers = [float(value) for value in params]
+        code, in_frame = int(command), int(frame)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{where} holds a value that is not a number") from None
+    if len(numbers) != _PARAMS or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{where} does not have {_PARAMS} finite parameters")
+    a, b, c, d, e, f, g = numbers
+    return Item(command=code, frame=in_frame, params=(a, b, c, d, e, f, g))
+
+
+def mission_of(items: Sequence[Item]) -> Mission:
+    """Items as ArduSub flies them.
+
+    `CONDITION_YAW` counts only as the second command after a way-point (see `_items`).
+
+    Raises:
+        ValueError: a command or a frame is not one that ArduSub flies, or a way-point comes before
+            any speed.
+    """
+    steps: list[MissionStep] = []
+    speed_mps = heading_rad = math.nan
+    since = 0
+    for number, item in enumerate(items, start=1):
+        first = item.params[0]
+        if item.command == NAV_WAYPOINT:
+            steps.append(_step_of(item, number, speed_mps, heading_rad))
+            heading_rad, since = math.nan, 0
+            continue
+        since += 1
+        if item.command == DO_CHANGE_SPEED:
+            speed_mps = item.params[1]
+        elif item.command == CONDITION_YAW:
+            heading_rad = math.radians(first) if since > 1 else math.nan
+        elif item.command == DO_SET_CAM_TRIGG_DIST and steps:
+            camera: Any = "on" if first > 0.0 else "off"
+            steps[-1] = replace(
+                steps[-1], camera=camera, picture_step_m=first if first > 0.0 else math.nan
+            )
+        else:
+            raise ValueError(
+                f"item {number} is the command {item.command}, which is not flown here: "
+                f"{NAV_WAYPOINT}, {CONDITION_YAW}, {DO_CHANGE_SPEED} and, after a way-point, "
+                f"{DO_SET_CAM_TRIGG_DIST} are"
+            )
+    return Mission(autopilot="ardusub", steps=tuple(steps))
+
+
+def _step_of(item: Item, number: int, speed_mps: float, heading_rad: float) -> MissionStep:
+    by_altitude = item.frame == FRAME_ABOVE_TERRAIN
+    if not by_altitude and item.frame != FRAME_ABOVE_HOME:
+        raise ValueError(
+            f"item {number} is in the frame {item.frame}; ArduSub flies {FRAME_ABOVE_HOME} (above "
+            f"home) and {FRAME_ABOVE_TERRAIN} (above the terrain)"
+        )
+    if not math.isfinite(speed_mps):
+        raise ValueError(f"item {number} is a way-point before any speed (DO_CHANGE_SPEED)")
+    hold_s, radius_m, _, _, latitude_deg, longitude_deg, up_m = item.params
+    return MissionStep(
+        manoeuvre="goto",
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        heave="altitude" if by_altitude else "depth",
+        depth_m=math.nan if by_altitude else -up_m,
+        altitude_m=up_m if by_altitude else math.nan,
+        speed_mps=speed_mps,
+        tolerance_m=radius_m,
+        hold_s=hold_s,
+        heading_rad=heading_rad,
     )

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
-from alice_survey.base.config import CameraConfig, PlanConfig
+from alice_survey.base.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
 from alice_survey.base.errors import PlanError
 from alice_survey.vehicle.limits import SPOT_RAD_S, spot_rate_rad_s
 from camera_calib.rig import Rig
+from missions.exports.follower import Follower, follower_of
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
 
@@ -27,18 +28,27 @@ class Options:
     camera_off: str = "camera_trigger/disable"
     turn_rate_rad_s: float = SPOT_RAD_S
     """Rate of turns on the spot, which way-points wait for."""
+    follower: Follower | None = None
+    """The vehicle and its sea; None where they are not known."""
 
     def __post_init__(self) -> None:
         if not self.camera_on or not self.camera_off:
             raise PlanError("name the services that switch pictures on and off")
 
 
-def options_of(camera: CameraConfig, plan: PlanConfig) -> Options:
-    """The options that a survey's settings give."""
+def options_of(
+    camera: CameraConfig,
+    plan: PlanConfig,
+    vehicle: VehicleConfig | None = None,
+    sea: SeaConfig | None = None,
+) -> Options:
+    """The options that a survey's settings give; without vehicle and sea there is no follower."""
+    follower = None if vehicle is None or sea is None else follower_of(vehicle, sea, plan.speed_mps)
     return Options(
         altimeter_body_m=camera.dvl_position_body_m,
         pixel_um=camera.pixel_um,
         turn_rate_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
+        follower=follower,
     )
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import shapely
+from shapely.geometry import LineString, Point
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
@@ -24,6 +26,7 @@ DEPTH_STEP_M = 0.05
 """A line's depth is given wherever straight lines between way-points would miss it by more."""
 _STRAIGHT_RAD = 1e-6
 _TINY_M = 1e-6
+_TOUCH_M = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,3 +284,40 @@ def _depths(plan: Plan) -> list[Array] | None:
             f"{len(wanted)} lines with {sum(wanted)} stations: plan again"
         )
     return depths
+
+
+def gone_on(plan: Plan, point: Waypoint, tolerance_m: float) -> Waypoint:
+    """The end of a line, moved on along its course so that the last picture is surely taken.
+
+    A vehicle may be done with it as much early as its tolerance, and up to a step after a picture.
+
+    Args:
+        plan: whose line it is; the glass stays in its allowed area.
+        point: the end.
+        tolerance_m: how near it is done.
+    """
+    line = plan.lines[point.line]
+    ahead = np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
+    by_m = tolerance_m + plan.station_spacing_m
+    return moved(plan, point, room_m(plan, np.array(line.end_ne_m), by_m * ahead) * ahead)
+
+
+def room_m(plan: Plan, place_ne: Array, way_ne: Array) -> float:
+    """How far of a way from a place the glass may go."""
+    way = LineString([place_ne, place_ne + way_ne])
+    inside = shapely.get_parts(way.intersection(plan.area.allowed.buffer(_TOUCH_M)))
+    parts = [part for part in inside if part.distance(Point(place_ne)) <= _TOUCH_M]
+    return min(way.length, max((float(part.length) for part in parts), default=0.0))
+
+
+def moved(plan: Plan, point: Waypoint, by_ne: Array) -> Waypoint:
+    """A way-point of the reference point at another place."""
+    vehicle_ne = np.array(point.vehicle_ne_m) + by_ne
+    place = np.array([[*vehicle_ne, point.depth_m]])
+    ((latitude, longitude, _),) = plan.datum.geodetic_from_ned(place)
+    return replace(
+        point,
+        vehicle_ne_m=(float(vehicle_ne[0]), float(vehicle_ne[1])),
+        latitude_deg=float(latitude),
+        longitude_deg=float(longitude),
+    )

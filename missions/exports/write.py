@@ -10,6 +10,7 @@ from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import PlanError
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
+from missions.exports.advice import advice
 from missions.exports.format import Export
 from missions.exports.options import Options, line_tolerance_m, options_of
 from missions.exports.registry import format_named, format_names
@@ -42,7 +43,8 @@ def write_exports(
     Raises:
         PlanError: a format is not known, or the plan's depths do not fit its lines.
     """
-    chosen = [format_named(name) for name in (format_names() if formats is None else formats)]
+    names = format_names() if formats is None else list(formats)
+    chosen = [format_named(name) for name in names]
     export = Export(plan=plan, rig=rig, options=options or Options())
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[Path, str] = {}
@@ -50,7 +52,7 @@ def write_exports(
         files |= each.write(folder, export)
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
-    _write_about(about, export, files)
+    _write_about(about, export, files, advice(export, names))
     return files
 
 
@@ -81,7 +83,7 @@ def export_report(
     plan = read_plan(path)
     survey = _config_of_plan(path)
     rig = design_rig(survey.camera, survey.water)
-    options = options_of(survey.camera, survey.plan)
+    options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
     options = replace(
         options,
         camera_on=options.camera_on if camera_on is None else camera_on,
@@ -110,8 +112,10 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def _write_about(path: Path, export: Export, files: Mapping[Path, str]) -> None:
-    """What the files are, and of which point of the vehicle."""
+def _write_about(
+    path: Path, export: Export, files: Mapping[Path, str], advice: Sequence[str]
+) -> None:
+    """What the files are, of which point of the vehicle, and what to set on it."""
     plan, options = export.plan, export.options
     text = [
         f"{plan.name}: plan of {counted(len(plan.lines), 'line')}, "
@@ -120,9 +124,11 @@ def _write_about(path: Path, export: Export, files: Mapping[Path, str]) -> None:
         f"Missions (.xml, .plan, .waypoints): {export.mount.about}",
         "Maps and tables (.kml, .gpx, .geojson, .csv): places are of the left port's glass; "
         "waypoints.csv has both.",
-        f"Tolerance at the ends of lines: {export.tolerance_m:.3f} m.",
+        f"Tolerance at the ends of lines: {export.tolerance_m:.3f} m; for COLA2 "
+        f"{export.cola2_tolerance_m:.3f} m.",
         f"COLA2 actions: {options.camera_on} starts pictures, {options.camera_off} stops "
         "them: name them as your vehicle does.",
+        *advice,
         "",
         *(f"{file.name}: {about}" for file, about in files.items() if file != path),
     ]
@@ -131,7 +137,7 @@ def _write_about(path: Path, export: Export, files: Mapping[Path, str]) -> None:
 
 
 def _config_of_plan(path: Path) -> SurveyConfig:
-    """Camera, water and limits that a plan was made with."""
+    """Camera, water, limits, vehicle and sea that a plan was made with."""
     stage = read_stage(path.parent)
     settings = {} if stage is None else stage.settings
     if "camera" not in settings or "water" not in settings:
@@ -140,6 +146,7 @@ def _config_of_plan(path: Path) -> SurveyConfig:
             "vehicle is not known: give the survey's settings too"
         )
     known = {key: settings[key] for key in ("camera", "water")}
-    if isinstance(settings.get("plan"), dict):
-        known["plan"] = settings["plan"]
+    for key in ("plan", "vehicle", "sea"):
+        if isinstance(settings.get(key), dict):
+            known[key] = settings[key]
     return parse_config(known, str(path.parent))

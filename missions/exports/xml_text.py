@@ -1,5 +1,6 @@
 """XML as text: escaped, indented, the same every time."""
 
+import math
 import re
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -53,3 +54,41 @@ def metres(value: float) -> str:
 def _in_comment(text: str) -> str:
     """Two hyphens end a comment: part them."""
     return re.sub("-(?=-|$)", "- ", clean(text))
+
+
+def root_of(text: str) -> ET.Element | None:
+    """The root of a document; None where the text is no XML, or declares entities."""
+    if "<!DOCTYPE" in text or not text.lstrip("\ufeff \t\r\n").startswith("<"):
+        return None
+    try:
+        return ET.fromstring(text.lstrip("\ufeff"))  # noqa: S314  no entities
+    except ET.ParseError:
+        return None
+
+
+def value_of(parent: ET.Element, tag: str) -> str:
+    """Text of a child.
+
+    Raises:
+        ValueError: there is none.
+    """
+    found = parent.find(tag)
+    if found is None or not (found.text or "").strip():
+        raise ValueError(f"<{parent.tag}> lacks <{tag}>")
+    return str(found.text).strip()
+
+
+def number_of(parent: ET.Element, tag: str) -> float:
+    """A child's finite number.
+
+    Raises:
+        ValueError: there is none.
+    """
+    text = value_of(parent, tag)
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"<{tag}> is {text[:40]!r}, not a number")
+    return number

@@ -18,6 +18,7 @@ from camera_calib.rig import design_rig
 from missions.fly.flight_plots import draw_flight, draw_vehicle
 from missions.fly.flight_records import bag_record, believed_log, flight_summary, true_log
 from missions.fly.flight_route import one_dive, stations_of_dives
+from missions.fly.mission_flight import mission_of_settings, mission_summary, simulate_mission
 from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
 from missions.logs.bag import write_bag
 from missions.values.flight import Flight, rms
@@ -43,11 +44,14 @@ def run_fly(workspace: Path, folder: Path, executor: Executor, *, survey: Survey
 def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]:
     """Write the files of a flight, and say after each step what is done."""
     plan = one_dive(read_plan(plan_path), survey.vehicle.dive)
-    planned = stations_of_dives(plan)
     floor = true_floor(plan, survey)
     yield "sea floor"
-    flight = simulate_plan(plan, flight_settings(survey), floor, flight_noise(survey.seed))
-    _check_pictures(flight, planned, "swell" if survey.sea.swell_m > 0.0 else "current")
+    settings = flight_settings(survey)
+    fly = simulate_plan if survey.vehicle.mission_file is None else simulate_mission
+    flight = fly(plan, settings, floor, flight_noise(survey.seed))
+    _check_pictures(
+        flight, stations_of_dives(flight.plan), "swell" if survey.sea.swell_m > 0.0 else "current"
+    )
     yield "flight"
     write_track(folder / "truth" / "track.csv", flight.truth)
     write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
@@ -58,7 +62,10 @@ def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]
     write_bag(folder / "bag", bag_record(flight))
     yield "logs"
     rig = design_rig(survey.camera, survey.water)
-    FlightRecord.save(folder / "flight.json", flight_summary(flight, survey.vehicle, rig))
+    summary = flight_summary(flight, survey.vehicle, rig)
+    if survey.vehicle.mission_file is not None:
+        summary["mission"] = mission_summary(mission_of_settings(plan, settings), flight, rig)
+    FlightRecord.save(folder / "flight.json", summary)
     draw_flight(folder / "track.png", flight)
     draw_vehicle(folder / "vehicle.png", flight)
     yield "plots"

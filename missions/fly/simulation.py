@@ -1,7 +1,7 @@
 """A plan, flown by the simulated vehicle over a sea floor."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -32,6 +32,7 @@ from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.pilot.command import Without
 from alice_survey.vehicle.pilot.gains import Gains, gains_for
 from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
+from alice_survey.vehicle.pilot.mission import NO_LAW, NO_MISSION, PilotMission
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
 from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
@@ -131,9 +132,8 @@ def simulate_plan(
     """
     longest_s = longest_mission_s(plan)
     setup = mission_setup(plan, settings, floor, longest_s, rng)
-    ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
     flown = simulate(
-        setup, rng, longest_s=longest_s + ascent_s, label=label, expected_s=plan.duration_s
+        setup, rng, longest_s=longest_s + ascent_s(plan), label=label, expected_s=plan.duration_s
     )
     return flight_of(plan, settings.camera.position_body_m, setup, flown)
 
@@ -141,6 +141,11 @@ def simulate_plan(
 def longest_mission_s(plan: Plan) -> float:
     """After how long a mission is aborted."""
     return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
+
+
+def ascent_s(plan: Plan) -> float:
+    """How long a vehicle may take to the surface."""
+    return plan.seafloor_depth_m / _CLIMB_MPS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,13 +163,16 @@ class Piloting:
     """How to go on once failures are found; not looked for if None."""
 
 
-def piloting_of(plan: Plan, settings: FlightSettings, longest_s: float) -> Piloting:
+def piloting_of(
+    plan: Plan, settings: FlightSettings, longest_s: float, mission: PilotMission = NO_MISSION
+) -> Piloting:
     """Vehicle, path, gains and guidance of a survey.
 
     Args:
         plan: what to fly.
         settings: vehicle and cameras.
         longest_s: after which the vehicle gives up.
+        mission: of way-points of the vehicle's reference point, flown instead of the plan's route.
 
     Raises:
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
@@ -179,7 +187,7 @@ def piloting_of(plan: Plan, settings: FlightSettings, longest_s: float) -> Pilot
         )
     path = path_of(plan)
     turns = turns_on_the_spot(path)
-    if turns and settings.vehicle.controller == "los":
+    if turns and mission.law == NO_LAW and settings.vehicle.controller == "los":
         warn(
             f"{craft.name} cannot push itself sideways under the controller los: in each of the "
             f"{turns} turns on the spot it swings off its place and drifts with the current; "
@@ -187,6 +195,8 @@ def piloting_of(plan: Plan, settings: FlightSettings, longest_s: float) -> Pilot
         )
     # A floor is followed down to two altitudes below the planned one.
     deepest_m = plan.seafloor_depth_m + plan.altitude_m
+    reference = (0.0, 0.0, 0.0)
+    followed_body_m = settings.camera.position_body_m if mission.law == NO_LAW else reference
 
     def piloted(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
         gains = gains_for(craft.weakened(left), plan.speed_mps)
@@ -195,7 +205,7 @@ def piloting_of(plan: Plan, settings: FlightSettings, longest_s: float) -> Pilot
             path,
             settings.vehicle.controller,
             most_depth_m=deepest_m,
-            point_body_m=settings.camera.position_body_m,
+            point_body_m=followed_body_m,
             spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
             limits=SafetyLimits(
                 0.5 * plan.altitude_m,
@@ -229,6 +239,7 @@ def mission_setup(
     floor: FloorGrid,
     longest_s: float,
     rng: np.random.Generator,
+    mission: PilotMission = NO_MISSION,
 ) -> Setup:
     """Vehicle, path, pilot, instruments and sea of a survey.
 
@@ -238,8 +249,9 @@ def mission_setup(
         floor: the true sea floor.
         longest_s: after which the vehicle gives up.
         rng: for what is drawn once a mission.
+        mission: of way-points of the vehicle's reference point, flown instead of the plan's route.
     """
-    flies = piloting_of(plan, settings, longest_s)
+    flies = piloting_of(plan, settings, longest_s, mission)
     craft, path = flies.vehicle, flies.path
     gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
@@ -250,6 +262,7 @@ def mission_setup(
         path=path,
         guidance=flies.guidance,
         gains=flies.gains,
+        mission=mission,
         sensors=sensors_of(settings.navigation, settings.camera).pack(craft.hull),
         floor=floor,
         current=current_of(settings.sea, plan.seafloor_depth_m, longest_s, rng),
@@ -346,8 +359,16 @@ def floor_grid(floor: SeaFloor) -> FloorGrid:
     return FloorGrid(float(rows[0]), float(columns[0]), _FLOOR_SPACING_M, depth)
 
 
+PictureTimes = Callable[[Plan, Array, Array, Array], tuple[Array, tuple[int, ...]]]
+"""From plan, times, lines and believed places of the glass to times and lines of pictures."""
+
+
 def flight_of(
-    plan: Plan, glass_body_m: tuple[float, float, float], setup: Setup, flown: Flown
+    plan: Plan,
+    glass_body_m: tuple[float, float, float],
+    setup: Setup,
+    flown: Flown,
+    pictures: PictureTimes = trigger_times,
 ) -> Flight:
     """What a mission's rows mean for its plan.
 
@@ -356,6 +377,7 @@ def flight_of(
         glass_body_m: where the left port's glass sits on the vehicle.
         setup: of the mission.
         flown: its rows.
+        pictures: when they are taken.
     """
     glass_body = np.array(glass_body_m)
     truth = Trajectory(
@@ -368,7 +390,7 @@ def flight_of(
     believed = log.position_ned + rotation_from_attitude(*log.attitude_rad.T).apply(glass_body)
     following = flown.report[:, PHASE] == FOLLOW
     line = np.where(following, flown.report[:, LINE], -1.0)
-    trigger_s, trigger_line = trigger_times(plan, flown.time_s, line, believed[:, :2])
+    trigger_s, trigger_line = pictures(plan, flown.time_s, line, believed[:, :2])
     reason = int(flown.report[-1, REASON])
     if reason != NONE:
         ending = f"aborted: {REASONS[reason]}"

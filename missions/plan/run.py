@@ -32,7 +32,7 @@ def run_plan(workspace: Path, folder: Path, executor: Executor, *, survey: Surve
     """
     rig = design_rig(survey.camera, survey.water)
     planned = plan_survey(survey, rig)
-    options = options_of(survey.camera, survey.plan)
+    options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
     write_planned(folder, planned, rig, options, survey.sea)
 
 

@@ -6,7 +6,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from alice_survey.base.config import SurveyConfig, parse_config
-from alice_survey.base.errors import VehicleError, WorkspaceError
+from alice_survey.base.errors import PlanError, VehicleError, WorkspaceError
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.frames import interpolate_poses
 from alice_survey.base.trajectory import read_columns, read_track
@@ -171,3 +171,32 @@ def test_a_current_given_on_the_command_line_replaces_a_measured_one() -> None:
     assert changed.sea.current_file is None
     assert changed.sea.current_mps == 0.1
     assert FlightChanges(vehicle="alice").applied(measured).sea.current_file is not None
+
+
+def test_an_exported_mission_is_flown_next_to_its_certificate(
+    workspace: Path, tmp_path: Path
+) -> None:
+    spec("plan").make(tmp_path, survey(), SERIAL)
+    (tmp_path / "survey.toml").write_text(
+        "[area]\nlength_m = 3.0\nwidth_m = 2.5\nseafloor_depth_m = 6.0\n[seafloor]\ngrid_m = 0.05\n"
+    )
+    file = tmp_path / "plan" / "exports" / "mission_dive1.plan"
+    text, data = run(["fly"], tmp_path, None, flight=FlightChanges(mission=file))
+    found = data["fly"]
+    mission = json.loads((tmp_path / "flight" / "flight.json").read_text())["mission"]
+
+    assert "mission_dive1.plan as ardusub flies it" in text
+    assert mission == found["mission"]
+    assert mission["planned"]["share_at_overlap"] == pytest.approx(
+        read_plan(tmp_path / "plan" / "plan.json").coverage
+    )
+    assert mission["line_ends"] == len(read_plan(tmp_path / "plan" / "plan.json").lines)
+    assert 0.9 < found["coverage"]["share_at_overlap"] <= 1.0
+    assert {path.name for path in (tmp_path / "flight").iterdir()} >= {"triggers.csv", "bag"}
+    # Another file is another flight; one that holds no mission is refused in a line.
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(PlanError, match="no mission") as caught:
+        run(["fly"], tmp_path, None, flight=FlightChanges(mission=tmp_path / "notes.txt"))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(VehicleError, match="cola2 does not read"):
+        run(["fly"], tmp_path, None, flight=FlightChanges(mission=file, follower="cola2"))

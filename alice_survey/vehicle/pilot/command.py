@@ -30,6 +30,7 @@ from alice_survey.vehicle.pilot.memory import (
     PilotState,
     new_pilot,
 )
+from alice_survey.vehicle.pilot.mission import NO_MISSION
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import THRUSTER_LOST
 from alice_survey.vehicle.pilot.settings import Guidance
@@ -171,7 +172,8 @@ class Pilot:
     def steer(self, time_s: float, dt_s: float, estimate: Array) -> None:
         """Write the wrench and the allocation of a tick, for an estimate of the navigation."""
         steer(
-            time_s, dt_s, estimate, self.path, self.guidance, self.gains, self.state, self.wrench
+            time_s, dt_s, estimate, self.path, NO_MISSION, self.guidance, self.gains, self.state,
+            self.wrench,
         )  # fmt: skip
         allocate(self.wrench, estimate, self.allocation)
 

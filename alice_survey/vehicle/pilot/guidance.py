@@ -7,6 +7,8 @@ for a sway speed that takes the cross-track error away; far off the path it turn
 is near. Position, cross-track error and altitude are those of the followed point, by default the
 left port's glass, for which plans are made.
 
+A mission in the form of another vehicle's software is flown by its law instead (mission.py).
+
 A mission's phases (memory.py): DIVE to the altitude, as near to the start as the thrusters can
 stay; APPROACH to the start of a straight way in, however far the current has carried the vehicle;
 FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an ascent with a reason
@@ -34,6 +36,13 @@ from alice_survey.vehicle.pilot.memory import (
     DONE,
     FOLLOW,
     PilotState,
+)
+from alice_survey.vehicle.pilot.mission import (
+    COLA2,
+    NO_LAW,
+    PilotMission,
+    fly_mission,
+    mission_progress_m,
 )
 from alice_survey.vehicle.pilot.path import Path, advance, place_at
 from alice_survey.vehicle.pilot.safety import (
@@ -87,6 +96,7 @@ def steer(
     dt_s: float,
     estimate: Array,
     path: Path,
+    mission: PilotMission,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
@@ -98,7 +108,8 @@ def steer(
         time_s: since the start of the mission.
         dt_s: the tick.
         estimate: (14,) of the navigation, see estimate_vector.py.
-        path: to follow.
+        path: to follow, unless there is a mission.
+        mission: steps to fly by the law of another vehicle's software; `NO_MISSION` for none.
         guidance: settings.
         gains: gains of the inner loops.
         pilot: memory and report, written.
@@ -122,14 +133,19 @@ def steer(
 
     write_point(estimate, guidance, pilot)
     hear_floor(estimate, dt_s, guidance, pilot)
-    reason = watch(
-        time_s, dt_s, estimate, _progress_m(estimate, path, guidance, pilot), guidance.limits, pilot
-    )
+    if mission.law == NO_LAW:
+        progress = _progress_m(estimate, path, guidance, pilot)
+    else:
+        progress = mission_progress_m(estimate, mission, pilot)
+    reason = watch(time_s, dt_s, estimate, progress, guidance.limits, pilot)
     if reason != NONE:
         _abort(reason, estimate, pilot)
 
     phase = report[slot.PHASE]
-    if phase == FOLLOW:
+    if mission.law != NO_LAW and (phase == FOLLOW or phase == DIVE):  # noqa: SIM109  as below
+        if fly_mission(dt_s, estimate, path, mission, guidance, gains, pilot):
+            _enter(pilot, ASCEND)
+    elif phase == FOLLOW:
         _on_path(dt_s, estimate, path, guidance, gains, pilot)
     elif phase == DIVE or phase == APPROACH:  # noqa: SIM109  a tuple is slower here
         _on_the_way(dt_s, estimate, path, guidance, gains, pilot)
@@ -152,7 +168,7 @@ def steer(
                 report[slot.PHASE] = DONE
     write_wrench(gains, pilot, wrench)
     hold_level(estimate, dt_s, gains, pilot, wrench)
-    if guidance.sway == 0.0:
+    if guidance.sway == 0.0 or (mission.law == COLA2 and pilot.memory[slot.KEEPS] == 0.0):
         wrench[1] = 0.0
 
 

@@ -28,7 +28,8 @@ DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
     UNSAFE_S, PACE, STANDING, REF, REF_SPEED, WAITED_S,
     PLACE_SUM_N, PLACE_SUM_E, RAMP, RAMP_SPEED, ROLL_SUM, PITCH_SUM,
     MEAN_N, MEAN_E, NEAR_S, LEAN_N, LEAN_E, SIGMA_M,
-) = range(33)  # fmt: skip
+    STEP_S, FROM_N, FROM_E, TIMEOUT_S, KEEPS, HELD_S, TRACK_PACE,
+) = range(40)  # fmt: skip
 """Places in the memory: the depth, m, that the origin's depth and the altitude add up to, smoothed,
 its slope, m/s, and whether there is one; integrals of the inner loops as speeds, that of sway as a
 vector in NED, that of heave as an angle where the vehicle dives by its pitch; the time that depth,
@@ -41,8 +42,10 @@ s; the integral, as a speed, of keeping that place by surge, a vector in NED; th
 and its speed, that thrusters without lag would be at; the integrals of roll and pitch, as
 accelerations; how far the followed point is from its goal on the mean of some time, m, and how long
 that is little, s; the integral of the cross-track error of a vehicle that fins steer, as an angle,
-a vector in NED; the greater standard deviation of the navigation's north and east, m."""
-MEMORY = 33
+a vector in NED; the greater standard deviation of the navigation's north and east, m;
+of a mission's step (mission.py) the time since it began, where its way starts, how long it may
+take, 1 while it keeps its end, for how long, and how fast the time of its moving target runs."""
+MEMORY = 40
 
 (
     REF_SURGE, REF_SWAY, REF_HEAVE, REF_YAW, ACC_SURGE, ACC_SWAY, ACC_HEAVE, ACC_YAW,

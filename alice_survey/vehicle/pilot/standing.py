@@ -242,7 +242,7 @@ def stand(
     error = head_for(
         wanted.heading_rad, wanted.turn_rad_s, wanted.quicken_rad_s2, estimate, dt_s, gains, pilot
     )
-    ahead, abeam = _keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
+    ahead, abeam = keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
 
     by_sway = guidance.sway > 0.0
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
@@ -266,7 +266,7 @@ def stand(
 
 
 @kernel
-def _keep_place(
+def keep_place(
     wanted: StopReference,
     dt_s: float,
     estimate: Array,

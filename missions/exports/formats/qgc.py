@@ -3,7 +3,8 @@
 Keys and versions: QGroundControl's developer guide, "Plan File Format".
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ from missions.exports.mavlink import (
     FRAME_ABOVE_TERRAIN,
     NAV_WAYPOINT,
     Item,
+    item_of,
+    mission_of,
 )
 from missions.exports.mount import CameraMount
 from missions.exports.waypoints import Waypoint
+from missions.values.mission import Mission
 from missions.values.plan_file import Plan
 
 _ARDUPILOT, _SUBMARINE = 3, 12
@@ -128,6 +132,40 @@ def corners(plan: Plan, polygon: Polygon) -> list[list[float]]:
     return [[round(float(lat), 10), round(float(lon), 10)] for lat, lon in rows]
 
 
+def read_qgc(text: str) -> Mission | None:
+    """Read the mission of a plan: single items, and those that survey items hold."""
+    try:
+        data = json.loads(text.lstrip("\ufeff"))
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(data, dict) or data.get("fileType") != "Plan":
+        return None
+    mission = data.get("mission")
+    items = mission.get("items") if isinstance(mission, dict) else None
+    if not isinstance(items, list):
+        raise ValueError("the plan has no list of mission items")  # noqa: TRY004  a file's
+    return mission_of(list(_read_items(items)))
+
+
+def _read_items(items: list[Any]) -> Iterator[Item]:
+    for number, item in enumerate(items, start=1):
+        where = f"mission item {number}"
+        if not isinstance(item, dict):
+            raise ValueError(f"{where} is no object")  # noqa: TRY004  a file's
+        style = item.get("TransectStyleComplexItem")
+        if item.get("type") == "ComplexItem" and isinstance(style, dict):
+            held = style.get("Items")
+            if not isinstance(held, list):
+                raise ValueError(f"{where} holds no items: save it with QGroundControl 4 or later")
+            yield from _read_items(held)
+        elif item.get("type") == "SimpleItem" and isinstance(item.get("params"), list):
+            # null stands for a parameter that is not given.
+            params = [0.0 if value is None else value for value in item["params"]]
+            yield item_of(item.get("command"), item.get("frame"), params, where)
+        else:
+            raise ValueError(f"{where} is of the type {str(item.get('type'))[:40]!r}")
+
+
 FORMAT = ExportFormat(
     read_by="QGroundControl, MAVSDK: mission, fence",
     files=(
@@ -137,4 +175,5 @@ FORMAT = ExportFormat(
             write=write_qgc,
         ),
     ),
+    read=read_qgc,
 )

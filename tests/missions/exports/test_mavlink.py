@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from shapely.geometry import Point, Polygon
 
 from camera_calib.rig import Rig
+from missions.exports.options import line_tolerance_m
 from missions.exports.write import write_exports
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan
@@ -68,7 +69,10 @@ def check_lines(
                 wanted = plan.lines[number]
                 arm = turned((glass[0], glass[1]), wanted.heading_rad)
                 np.testing.assert_allclose(before + arm, wanted.start_ne_m, atol=atol)
-                np.testing.assert_allclose(place + arm, wanted.end_ne_m, atol=atol)
+                # It goes on by its radius and a step: the allowed area is 3 m wider.
+                past_m = line_tolerance_m(plan, rig) + plan.station_spacing_m
+                past = past_m * turned((1.0, 0.0), wanted.heading_rad)
+                np.testing.assert_allclose(place + arm, wanted.end_ne_m + past, atol=atol)
                 assert item["frame"] == 10
                 altitude = plan.altitude_m + glass[2] - 0.11
                 assert item["z"] == pytest.approx(altitude, abs=MM)

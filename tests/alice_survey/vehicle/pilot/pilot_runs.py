@@ -23,6 +23,7 @@ from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.vehicle.pilot.mission import NO_MISSION
 from alice_survey.vehicle.pilot.path import Path, path_from_legs
 from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
 from alice_survey.vehicle.sea import Current, constant_current, current_at
@@ -75,7 +76,7 @@ def _fly(
         time_s = (first + k) * 0.05
         current_at(current, time_s, state[2], water)
         estimate_truth(state, water, guidance.point_body_m, floor, estimate)
-        steer(time_s, 0.05, estimate, path, guidance, gains, pilot, wrench)
+        steer(time_s, 0.05, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
         rows[k, 0] = time_s
         for i in range(14):
             rows[k, 1 + i] = estimate[i]

@@ -22,6 +22,7 @@ from alice_survey.vehicle.pilot.linear import (
     damping_ratio,
 )
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.vehicle.pilot.mission import NO_MISSION
 from alice_survey.vehicle.pilot.path import Path, place_at
 from alice_survey.vehicle.pilot.settings import (
     CONTROL_LENGTH_M,
@@ -88,7 +89,7 @@ def test_a_tick_asks_for_what_its_twin_asks(
     pilot = pilot_on(path, along_m=place[0])
     expected, cross = oracle.follow_demand(estimate, path, guidance, gains, place[0])
     assume(abs(abs(cross) - guidance.near_m) > 1e-9)
-    steer(0.0, TICK_S, estimate, path, guidance, gains, pilot, wrench)
+    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
     accelerations = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(accelerations, expected, atol=1e-9)
     assert pilot.report[slot.CROSS] == pytest.approx(cross, abs=1e-9)
@@ -110,7 +111,17 @@ def test_north_is_nothing_special(motion: Array, cross_m: float, turn: float) ->
         estimate[0] = n * math.cos(angle) - e * math.sin(angle)
         estimate[1] = n * math.sin(angle) + e * math.cos(angle)
         estimate[vector.HEADING] += angle
-        steer(0.0, TICK_S, estimate, path, guidance, gains, pilot_on(path, 0, 10.0), wrench)
+        steer(
+            0.0,
+            TICK_S,
+            estimate,
+            path,
+            NO_MISSION,
+            guidance,
+            gains,
+            pilot_on(path, 0, 10.0),
+            wrench,
+        )
         wrenches.append(wrench)
     np.testing.assert_allclose(wrenches[1], wrenches[0], atol=1e-8)
     np.testing.assert_allclose(wrenches[2], wrenches[0], atol=1e-8)
@@ -122,7 +133,7 @@ def test_a_vehicle_to_starboard_is_taken_to_port(controller: str, axis: int) -> 
     gains, guidance = guide(path, "alice", controller)
     wrench = np.zeros(6)
     estimate = estimate_of(np.zeros(12), 0.2)
-    steer(0.0, TICK_S, estimate, path, guidance, gains, pilot_on(path, 0, 10.0), wrench)
+    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot_on(path, 0, 10.0), wrench)
     assert wrench[axis] < -0.5
 
 
@@ -139,7 +150,7 @@ def test_turns_begin_before_the_arc_and_end_after_it(at: float) -> None:
     estimate[1] = e - lever[0] * math.sin(heading) - lever[1] * math.cos(heading)
     estimate[[vector.HEADING, vector.U, vector.DEPTH]] = heading, 0.2, 13.0
     pilot, wrench = pilot_on(path, leg, along), np.zeros(6)
-    steer(0.0, TICK_S, estimate, path, guidance, gains, pilot, wrench)
+    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
     assert pilot.report[slot.CROSS] == pytest.approx(0.0, abs=1e-12)
     # Simpson's rule across the kink of the heading.
     expected = oracle.mean_heading(path, at, guidance.smooth_m)

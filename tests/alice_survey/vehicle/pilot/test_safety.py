@@ -12,6 +12,7 @@ from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot import safety
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.vehicle.pilot.mission import NO_MISSION
 from alice_survey.vehicle.pilot.safety import REASONS, SafetyLimits
 from tests.alice_survey.vehicle.pilot.pilot_runs import Flight, launch, straight
 
@@ -130,7 +131,17 @@ def test_every_reason_has_words() -> None:
 
 def _steered(flight: Flight, estimate: Array) -> Array:
     wrench = np.full(6, math.nan)
-    steer(10.0, TICK_S, estimate, flight.path, flight.guidance, flight.gains, flight.pilot, wrench)
+    steer(
+        10.0,
+        TICK_S,
+        estimate,
+        flight.path,
+        NO_MISSION,
+        flight.guidance,
+        flight.gains,
+        flight.pilot,
+        wrench,
+    )
     return wrench
 
 

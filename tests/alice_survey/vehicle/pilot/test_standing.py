@@ -16,6 +16,7 @@ from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import new_pilot
+from alice_survey.vehicle.pilot.mission import NO_MISSION
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.settings import (
     Guidance,
@@ -133,7 +134,7 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
         estimate, guidance, gains, path.speed_mps, place, moves, quickens, turning
     )
     wrench = np.zeros(6)
-    steer(0.0, TICK_S, estimate, path, guidance, gains, pilot, wrench)
+    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
     found = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, pilot.demand), atol=1e-9)
@@ -239,7 +240,7 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     estimate[[vector.ALTITUDE, vector.CLEARANCE]] = 2.0
     left = None
     for tick in range(600):
-        steer(tick * TICK_S, TICK_S, estimate, path, guidance, gains, pilot, wrench)
+        steer(tick * TICK_S, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
         if pilot.report[slot.LEG] == 2.0:
             left = tick * TICK_S
             break

@@ -1,0 +1,146 @@
+"""What to set on a vehicle so that it flies an exported mission, and what to expect of it."""
+
+import math
+from dataclasses import dataclass
+
+from alice_survey.base.errors import warn
+from alice_survey.kit.words import share
+from alice_survey.vehicle.pilot.ardusub import LEAST_RADIUS_M, LEAST_SPEED_MPS
+from alice_survey.vehicle.pilot.cola2 import Cola2Settings
+from camera_calib.rig import Rig
+from missions.coverage.certificate import certificate
+from missions.coverage.stations import plan_pattern
+from missions.exports.follower import Follower, line_offset_m, predicted_stations
+from missions.exports.format import Export
+from missions.values.plan_file import Plan
+
+COLA2_TOLERANCE_Z_M = 0.3
+"""A step down is done this near to its depth; COLA2's own 1 m begins a line a metre too high."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cola2Outlook:
+    """How COLA2 will fly a plan in the expected current."""
+
+    offset_m: float
+    """Greatest steady offset of the glass from lines of the pattern."""
+    allowed_m: float
+    """Half of what neighbouring pictures overlap: two lines so far off, apart, just meet."""
+    share_at_overlap: float
+    """Share of the area that will be seen as requested."""
+    at_most: bool
+    """Whether turns, which are not predicted, will leave less of it: the current is more than half
+    as fast as the vehicle."""
+
+
+def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:
+    """The pilot's parameters that exported missions count on.
+
+    Speed is the same all along a line: pictures are taken at a constant interval.
+    """
+    return Cola2Settings(
+        delta_m=delta_m,
+        tolerance_z_m=COLA2_TOLERANCE_Z_M,
+        max_surge_mps=max(Cola2Settings().max_surge_mps, speed_mps),
+        min_surge_mps=max(Cola2Settings().min_surge_mps, speed_mps),
+    )
+
+
+def cola2_outlook(plan: Plan, rig: Rig, follower: Follower, lever_m: float) -> Cola2Outlook:
+    """What is to be expected of COLA2.
+
+    Args:
+        plan: what is exported.
+        rig: its cameras.
+        follower: vehicle and current.
+        lever_m: how far the glass is ahead of the vehicle's reference point.
+    """
+    offsets = [
+        abs(line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m))
+        for line in plan.lines
+        if line.kind in ("survey", "fill")
+    ]
+    seen = certificate(
+        plan.area, rig, predicted_stations(plan, follower, lever_m), plan_pattern(plan, rig)
+    )
+    return Cola2Outlook(
+        offset_m=max(offsets, default=0.0),
+        allowed_m=0.5 * (plan.footprint_m[0] - plan.line_spacing_m),
+        share_at_overlap=seen.share_at_overlap,
+        at_most=follower.current_mps > 0.5 * plan.speed_mps,
+    )
+
+
+def advice(export: Export, formats: list[str]) -> list[str]:
+    """Lines for people who load missions: parameters to set, and what is to be expected.
+
+    Warns where COLA2 cannot hold the plan's lines in the expected current.
+
+    Args:
+        export: the plan.
+        formats: names of those that are written.
+    """
+    lines = []
+    if any(name.startswith("cola2") for name in formats):
+        lines += _cola2(export)
+    if any(name in ("wpl", "qgc", "qgc-survey") for name in formats):
+        lines += _ardusub(export)
+    return lines
+
+
+def _cola2(export: Export) -> list[str]:
+    plan, follower = export.plan, export.options.follower
+    if follower is None:
+        return []
+    if not math.isfinite(follower.delta_m):
+        return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
+    own, given = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
+    lines = [
+        f"COLA2, parameters of the pilot: section/delta {own.delta_m:.1f} m (the shortest that "
+        f"{follower.name} follows without weaving at {plan.speed_mps:g} m/s; the longer, the "
+        f"farther a current pushes it off; the default is {given.delta_m:g}), section/tolerance_z "
+        f"{own.tolerance_z_m:g} m ({given.tolerance_z_m:g}), section/min_surge_velocity "
+        f"{own.min_surge_mps:g} m/s and section/max_surge_velocity {own.max_surge_mps:g} m/s, so "
+        "that lines are flown at one speed."
+    ]
+    outlook = cola2_outlook(plan, export.rig, follower, export.mount.glass_body_m[0])
+    expected = (
+        f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
+        f"to {outlook.offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
+        f"{outlook.allowed_m:.2f} m, and gusts {follower.wander_m:.2f} m rms; "
+        f"{'at most ' if outlook.at_most else ''}{share(outlook.share_at_overlap)} of the area is "
+        "expected to be seen at the requested overlap"
+    )
+    if outlook.offset_m > outlook.allowed_m or outlook.at_most:
+        towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
+        warn(
+            f"{expected}: lay lines along the current (line_heading_deg = {towards_deg:.0f}), wait "
+            "for less of it, or fly another autopilot's mission"
+        )
+    return [
+        *lines,
+        f"{expected[0].upper()}{expected[1:]}. To see it flown: alice-survey fly --mission FILE. "
+        "What helps: lines along the current, closer lines (plan.track_error_m), a longer run-in.",
+    ]
+
+
+def _ardusub(export: Export) -> list[str]:
+    plan, follower = export.plan, export.options.follower
+    radius_cm = math.ceil(100.0 * max(export.tolerance_m, LEAST_RADIUS_M))
+    speed_cms = 100.0 * plan.speed_mps
+    lines = [
+        f"ArduSub 4.5 parameters: WPNAV_SPEED {speed_cms:.0f} cm/s, WPNAV_RADIUS {radius_cm} cm "
+        "(files' radii are ignored), WP_YAW_BEHAVIOR 4 (the default: along the track) or 1, "
+        "WPNAV_RFND_USE 1. It comes to rest at every way-point."
+    ]
+    if plan.speed_mps < LEAST_SPEED_MPS:
+        lines.append(
+            f"ArduSub takes no speed below {LEAST_SPEED_MPS:g} m/s: it flies faster than the "
+            f"plan's {plan.speed_mps:g} m/s, with more blur: plan at {LEAST_SPEED_MPS:g} m/s."
+        )
+    if follower is not None and not follower.sways:
+        lines.append(
+            f"ArduSub holds on to its track sideways, which {follower.name} has no thrusters for: "
+            "do not fly these files with it."
+        )
+    return lines
