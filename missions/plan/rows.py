@@ -58,7 +58,7 @@ def plan_rows(
 
 
 def _line_rows(plan: Plan, sweep: Sweep | None) -> Sequence[Setting]:
-    counts = dict.fromkeys(("survey", "cross", "closing", "fill"), 0)
+    counts = dict.fromkeys(("survey", "cross", "closing", "fill", "tie"), 0)
     for line in plan.lines:
         counts[line.kind] += 1
     kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
