@@ -19,7 +19,15 @@ import numpy as np
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes
-from benchmarks.planner_peers import MARGIN_M, PATTERN, PLANNERS, Measured, measured, own_plan
+from benchmarks.planner_peers import (
+    MARGIN_M,
+    PATTERN,
+    PLANNERS,
+    SAME_SHARE,
+    Measured,
+    measured,
+    own_plan,
+)
 from missions.lines.hops import comparable
 from missions.lines.lay import laid
 from missions.lines.rows import Site
@@ -33,12 +41,15 @@ _ANGLE_ROWS = 30
 _ANGLES = 3600
 _QUICK_ANGLE_ROWS, _QUICK_ANGLES = 12, 600
 _COVERED = 0.999
-_SAME_SHARE = 1e-4
-"""Shares this close are one: two of the meter's points."""
 _ANGLE_GOAL = 1.005
 _N_LOG_N = 1.15
 """Exponent of n log n between 100 and 10,000 rows is 1.15: log(200) / log(100)."""
-_GOALS_S = {("L, two holes", 300): 0.020}
+_GOALS_S = {
+    ("L, two holes", 300): 0.020,
+    ("harbour, 56 piles", 100): 0.5,
+    ("marina, 44 piles", 100): 0.5,
+    ("quay, 24 piles", 100): 0.3,
+}
 _LARGEST_S = (10_000, 1.0)
 _HEAD = (
     "| area | rows | planner | time, ms | path, m | turns | covered | outside, m | in holes, m "
@@ -162,7 +173,7 @@ def _as_good(peer: Measured, own: Measured) -> bool:
 
     Lines that end where their own middle meets the edge are shorter, and leave its corners unseen.
     """
-    return peer.covered >= own.covered - _SAME_SHARE and peer.outside_m + peer.holes_m == 0
+    return peer.covered >= own.covered - SAME_SHARE and peer.outside_m + peer.holes_m == 0
 
 
 def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:

@@ -1,17 +1,22 @@
-"""Areas to plan: a quad, two L-shapes, a star, a coast, and harbours; each some rows wide."""
+"""Areas to plan: a quad, two L-shapes, a star, a coast, harbours, a chart; each some rows wide."""
 
 import math
+from pathlib import Path
 
 import numpy as np
+import rasterio
+import rasterio.features
 import shapely
 import shapely.affinity
-from shapely.geometry import MultiPolygon, Point, Polygon, box
+from shapely.geometry import MultiPoint, MultiPolygon, Point, Polygon, box
 
 from alice_survey.base.frames import Array, Datum
 from missions.values.area import Area, multipolygon
 
 _COAST_SEED = 5
 _COAST_CORNERS = 500
+CHART = Path(__file__).parents[2] / "shared/data/bathymetry/JD211_public_Release_1-4_UTM.bag"
+"""A real survey's grid, which is not part of the project; left out where it is missing."""
 _PILE = 0.006
 """Radius of a pile: 0.6 m in a harbour 100 m wide."""
 
@@ -30,8 +35,53 @@ def shapes() -> dict[str, Polygon]:
         f"coast, {_COAST_CORNERS} corners": _coast(),
         "harbour, 28 piles": harbour(4, 7),
         "harbour, 56 piles": harbour(7, 8),
+        "marina, 44 piles": marina(4, 11),
+        "quay, 24 piles": quay(24),
     }
+    if CHART.is_file():
+        named["chart, 17 gaps"] = chart(CHART)
     return {name: _one_wide(shape) for name, shape in named.items()}
+
+
+def marina(jetties: int, piles: int) -> Polygon:
+    """A basin into which jetties lead, each on a row of piles.
+
+    Args:
+        jetties: side by side, from the same quay.
+        piles: under each.
+    """
+    basin = Polygon([(0, 0), (1, 0.05), (0.95, 0.8), (0.05, 0.75)])
+    rows = [
+        Point(0.12 + 0.6 * pile / (piles - 1), 0.12 + 0.52 * jetty / (jetties - 1)).buffer(_PILE, 6)
+        for jetty in range(jetties)
+        for pile in range(piles)
+    ]
+    return Polygon(basin.difference(shapely.union_all(rows)))
+
+
+def quay(piles: int) -> Polygon:
+    """A strip along a wall that stands on piles, two and two.
+
+    Args:
+        piles: an even number, askew to the lines.
+    """
+    strip = shapely.affinity.rotate(box(0, 0, 1, 0.3), 17.0)
+    pairs = [
+        Point(0.06 + 0.88 * (pile // 2) / (piles // 2 - 1), 0.06 + 0.035 * (pile % 2))
+        for pile in range(piles)
+    ]
+    turned = shapely.affinity.rotate(MultiPoint(pairs), 17.0, origin=(0.5, 0.15))
+    return Polygon(strip.difference(turned.buffer(_PILE, 6)))
+
+
+def chart(raster: Path) -> Polygon:
+    """What a real survey has charted: the largest piece of a raster, with the holes it left."""
+    with rasterio.open(raster) as file:
+        depth = file.read(1)
+        known = (depth != file.nodata) & np.isfinite(depth)
+    pieces = rasterio.features.shapes(known.astype(np.uint8), mask=known)
+    largest = max((shapely.geometry.shape(piece) for piece, _ in pieces), key=lambda p: p.area)
+    return Polygon(largest.simplify(1.0))
 
 
 def harbour(rows: int, columns: int) -> Polygon:

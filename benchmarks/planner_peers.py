@@ -34,6 +34,10 @@ _SPEED_MPS = 0.2
 _TURN_RADIUS_M = 0.5
 _RUN_IN_M = 0.5
 _POINTS = 20_000
+SAME_SHARE = 1e-4
+"""Shares this close are one: two of the meter's points."""
+CLOSER = tuple(np.arange(1.0, 0.49, -0.05).round(2).tolist())
+"""Spacings, m, at which a peer may come to see as much."""
 _ALL = 10**12
 _Result = TypeVar("_Result")
 
@@ -106,14 +110,14 @@ def own_lines(area: Area, ways: Ways) -> list[Line]:
     )
 
 
-def coverage_path_plan(area: Area, repeats: int) -> Way:
+def coverage_path_plan(area: Area, repeats: int, spacing_m: float = PATTERN.spacing_m) -> Way:
     """coverage-path-planner: lines only, the first one half a spacing from the border."""
     polygon = area.survey.geoms[0]
 
     def work() -> Array:
         # Planning changes what it is given: a second run with the same settings lays no lines.
         settings = coverage_path_planner.PathSettings()
-        settings.pattern, settings.offset, settings.angle = "lines", PATTERN.spacing_m, HEADING_RAD
+        settings.pattern, settings.offset, settings.angle = "lines", spacing_m, HEADING_RAD
         settings.distanceToBorder = 0.0  # its first line is half a spacing further in
         settings.borderLaps = settings.exclusionsBorderLaps = 0
         settings.mowArea = True
@@ -127,6 +131,19 @@ def coverage_path_plan(area: Area, repeats: int) -> Way:
 
     seconds, path = _timed(work, repeats)
     return Way(seconds=seconds, seen=_lines_of(path), path=path)
+
+
+def equal_coverage_plan(area: Area, repeats: int) -> Way:
+    """coverage-path-planner with its lines as much closer as it takes to see what ours see.
+
+    The widest of `CLOSER` that does, or else the closest.
+    """
+    wanted = covered_share(area, own_plan(area, 0).seen) - SAME_SHARE
+    for spacing_m in CLOSER:
+        way = coverage_path_plan(area, 0, spacing_m)
+        if covered_share(area, way.seen) >= wanted:
+            break
+    return coverage_path_plan(area, repeats, spacing_m)
 
 
 def opencoverage_plan(area: Area, repeats: int) -> Way:
@@ -146,7 +163,7 @@ def opencoverage_plan(area: Area, repeats: int) -> Way:
             camera=camera,
             pattern="back_forth",
             lateral_overlap=0.0,
-            reached_forward_overlap=0.0,
+            forward_overlap=0.0,
             target="altitude",
             target_value=10.0,
         ),
@@ -159,6 +176,7 @@ def opencoverage_plan(area: Area, repeats: int) -> Way:
 PLANNERS: dict[str, Callable[[Area, int], Way]] = {
     "alice-survey": own_plan,
     "coverage-path-planner": coverage_path_plan,
+    "coverage-path-planner, as covered": equal_coverage_plan,
     "opencoverage": opencoverage_plan,
 }
 

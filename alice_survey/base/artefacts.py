@@ -311,6 +311,8 @@ def _files(inputs: Sequence[Path]) -> Iterator[Path]:
             yield from (p for p in inside if p.name != STAGE_FILE)
         elif path.is_file():
             yield path
+        elif path.exists():
+            raise WorkspaceError(f"{path} is neither a file nor a folder (a pipe?): replace it")
         else:
             raise WorkspaceError(f"{path}: no such file or folder")
 

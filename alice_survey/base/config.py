@@ -244,6 +244,7 @@ class PlanConfig(Config):
     run_in_m: float = Field(0.5, ge=0.1, le=20)
     home_ne_m: tuple[float, float] | None = None
     split_dives: bool = True
+    tie_dives: bool = Field(True, exclude_if=bool)
     dive_s: float | None = Field(None, gt=0, le=1e6)
 
     @property

@@ -22,6 +22,7 @@ from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.qgc_plan import read_qgc_plan
 from missions.areas.raw import RawShapes, from_geometries
 from missions.areas.safe import (
+    check_file,
     check_kml,
     check_start,
     read_bytes,
@@ -173,7 +174,10 @@ def _layers(path: Path, suffix: str) -> list[_Layer]:
         return _linked_layers([path], "GPKG")
     if suffix == ".shp":
         check_start(path, b"\x00\x00\x27\x0a", "shapefile")
-        return _linked_layers([path, *sides_of(path)], "ESRI Shapefile")
+        sides = sides_of(path)
+        for side in sides:
+            check_file(side, may_be_empty=True)
+        return _linked_layers([path, *sides], "ESRI Shapefile")
     data = read_geojson(path)
     _check_places(path.name, data)
     layers = _linked_layers([path], "GeoJSON")

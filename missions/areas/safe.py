@@ -39,8 +39,8 @@ def read_bytes(path: Path) -> bytes:
         raise PlanError(f"area: {path}: cannot be read: {error.strerror}") from None
 
 
-def check_file(path: Path) -> None:
-    """Refuse what is not a file of bounded size.
+def check_file(path: Path, *, may_be_empty: bool = False) -> None:
+    """Refuse what is not a file of bounded size: pipes, for example, would be waited on for ever.
 
     Raises:
         PlanError: with the size and the limit.
@@ -55,7 +55,7 @@ def check_file(path: Path) -> None:
             f"area: {path}: {size / 1e6:.0f} MB; at most {LARGEST_BYTES / 1e6:.0f} MB: cut out the "
             "part to survey"
         )
-    if size == 0:
+    if size == 0 and not may_be_empty:
         raise PlanError(f"area: {path}: it is empty")
 
 

@@ -4,19 +4,21 @@ And of two strobes next to a camera: light that the water throws back, and the s
 
 Each strobe sends `I(angle) = I_0 cos(angle)` within its cone, `I_0 = P / (pi sin^2(half cone))`.
 A level floor of reflectance rho (Lambert) at the distances d from a strobe and s along the pixel's
-ray gets `E = sum I cos(in) / d^2 exp(-c d)` and sends back `L = rho E / pi exp(-c s)`. On the way
-to the sensor L falls by `T_port / n^2`; it gives the irradiance `pi L T_lens / (4 N^2) cos^4`.
+ray gets `E = sum I cos(in) / d^2 exp(-k d)` and sends back `L = rho E / pi exp(-m s)`; of the
+scattering b, k = c - LIT_SHARE b and m = c - SEEN_SHARE b leave out what is scattered forward
+(`missions.exposure.forward_light`). Light that counts as detail is `L = rho E / pi exp(-c s)`. On
+the way to the sensor L falls by `T_port / n^2`; it gives the irradiance `pi L T_lens / (4 N^2)
+cos^4`.
 
-Assumed: no daylight; the LEDs' spectrum is Planck's at their colour temperature between 400 and
-700 nm (an LED has a blue peak and a gap at 480 nm instead; its lumens are the same); each channel
-takes a third of that range, with the water of its middle, and has the whole quantum efficiency;
-sand as in the simulator. The simulator (`alice_survey.seafloor`) computes the same by ray, with a
-soft edge of the cone and an even spectrum: tests compare the two.
+Assumed: no daylight; each channel takes 100 nm of the LEDs' spectrum (`missions.exposure.lamp`),
+with the water of its middle, and has the whole quantum efficiency; sand as in the simulator. The
+simulator (`alice_survey.seafloor`) computes by ray, with a soft edge of the cone, an even spectrum
+and all scattered light lost but for the veil: its pictures have the light of `c` both ways, and
+lack the blur of what is scattered on the way from the floor. Tests compare the two on these terms.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -24,12 +26,12 @@ from alice_survey.base.config import CameraConfig, ImagingConfig
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from camera_calib.water import WAVELENGTH_NM, WaterOptics, phase_per_sr
+from missions.exposure.forward_light import LIT_SHARE, SEEN_SHARE, share_within
+from missions.exposure.lamp import LAMP, Spectrum, watts_per_lumen
 from missions.exposure.settings_table import Setting, settings_of
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
 """Red, green and blue of bare sand, as `alice_survey.seafloor.texture.SAND_ALBEDO`."""
-STROBE_KELVIN = 4000.0
-"""Gutnik et al. 2021, section III.B."""
 PORT_TRANSMITTANCE = 0.955
 """Fresnel at square incidence: 0.4 % from water to glass, 4.3 % from glass to air."""
 LENS_TRANSMITTANCE = 0.9
@@ -40,20 +42,19 @@ MIDDLE_GREY = 0.2
 LEAST_SNR = 5.0
 """Below it detail of a pixel is lost in noise (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
 
-Spectrum = Literal["planck", "even"]
-
-_PLANCK_J_S, _LIGHT_M_S, _BOLTZMANN_J_K = 6.62607015e-34, 299_792_458.0, 1.380649e-23
-_LUMENS_PER_WATT = 683.0
-_BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
-"""Bands of red, green and blue."""
+_PLANCK_J_S, _LIGHT_M_S = 6.62607015e-34, 299_792_458.0
 _GRID = (13, 11)
 _STEPS = 400
 """Pieces of a ray of which scattered light is summed."""
 _SOURCE = (
-    "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water); LEDs as a "
-    f"Planck radiator of {STROBE_KELVIN:g} K; sand; lens transmission 0.9 (inferred)"
+    "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water), light that is "
+    f"scattered forward kept; {LAMP}; sand; lens transmission 0.9 (inferred)"
 )
-_SCATTER_SOURCE = "missions.exposure.light: single scattering, Henyey-Greenstein 0.924 (Petzold)"
+_FORWARD_SOURCE = "missions.exposure.forward_light: Henyey-Greenstein 0.924 (Petzold)"
+_SCATTER_SOURCE = (
+    "missions.exposure.light: quasi-single scattering (Gordon 1973), Henyey-Greenstein 0.924 "
+    "(Petzold)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,10 +69,14 @@ class LightBudget:
     """Median of the mean of the channels over the frame."""
     brightest_e: float
     """Most electrons of any channel anywhere in the frame."""
+    sharp_share: tuple[float, float, float]
+    """Share of the electrons at the middle that came from the floor unscattered, and are detail."""
     snr_centre: tuple[float, float, float]
-    """Signal over shot and read noise."""
+    """Detail over shot noise, of all light from the floor, and read noise."""
     snr_median: float
     snr_corner: tuple[float, float, float]
+    needed_light: float
+    """Times the light with which the median pixel reaches `LEAST_SNR`; infinite in the dark."""
     full_share: float
     """Brightest over full well."""
     gain_db: float
@@ -83,34 +88,21 @@ class LightBudget:
     """Exposure at which it does, with this f-number."""
 
 
-def watts_per_lumen(spectrum: Spectrum, kelvin: float = STROBE_KELVIN) -> Array:
-    """Radiant watts in red, green and blue for one lumen, (3,).
-
-    Lumens are `683 integral(P V)`, with the CIE photopic curve as V = 1.019 exp(-285.4 (um -
-    0.559)^2), which holds its integral to 0.1 %.
-
-    Args:
-        spectrum: Planck's between 400 and 700 nm, or even there.
-        kelvin: colour temperature of Planck's.
-    """
-    nm = np.linspace(400.0, 700.0, 601)
-    metres = nm * 1e-9
-    power = np.ones_like(nm)
-    if spectrum == "planck":
-        energy = _PLANCK_J_S * _LIGHT_M_S / (metres * _BOLTZMANN_J_K * kelvin)
-        power = metres**-5 / np.expm1(energy)
-        power /= power.max()
-    photopic = 1.019 * np.exp(-285.4 * (nm * 1e-3 - 0.559) ** 2)
-    lumens = _LUMENS_PER_WATT * np.trapezoid(power * photopic, nm)
-    bands = [(nm >= low) & (nm <= high) for low, high in _BANDS_NM]
-    return np.array([np.trapezoid(power[band], nm[band]) / lumens for band in bands])
-
-
 def cone_intensity(cos_angle: Array, half_beam_rad: float) -> Array:
     """Intensity over radiant power, 1/sr: Lambert's cosine within a cone."""
     inside = np.where(cos_angle >= math.cos(half_beam_rad), cos_angle, 0.0)
     share: Array = inside / (math.pi * math.sin(half_beam_rad) ** 2)
     return share
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FloorRadiance:
+    """Radiance in water that the floor sends to pixels (...), W / (m^2 sr), by channel."""
+
+    total: Array
+    """(..., 3) with what the water scatters on the way from neighbours of the pixel's spot."""
+    sharp: Array
+    """(..., 3) within the pixel's own cone."""
 
 
 def floor_radiance(
@@ -119,9 +111,11 @@ def floor_radiance(
     water: WaterOptics,
     altitude_m: float,
     pixels: Array,
-    spectrum: Spectrum = "planck",
-) -> Array:
-    """Radiance in water that level sand sends to the reference camera, W / (m^2 sr).
+    spectrum: Spectrum = "led",
+) -> FloorRadiance:
+    """Light that level sand sends to the reference camera.
+
+    Without the lens's fall-off and the water's own light.
 
     Args:
         rig: with its place on the vehicle.
@@ -130,9 +124,6 @@ def floor_radiance(
         altitude_m: of the outer glass.
         pixels: (..., 2).
         spectrum: of the strobes.
-
-    Returns:
-        (..., 3) red, green and blue, without the lens's fall-off and the water's own light.
     """
     camera = rig.cameras[rig.reference]
     floor_z = float(camera.front_cam[2]) + altitude_m
@@ -149,10 +140,22 @@ def floor_radiance(
         cos_beam = away @ down / distance
         # The floor is level: light meets it at the angle at which it leaves the strobe.
         falls = cone_intensity(cos_beam, half_beam) * cos_beam / distance**2
-        loss = np.exp(-(distance + path)[..., None] * water.attenuation_per_m)
+        loss = np.exp(-distance[..., None] * weakened_per_m(water, LIT_SHARE))
         irradiance += falls[..., None] * power * loss
-    radiance: Array = FLOOR_REFLECTANCE / math.pi * irradiance
-    return radiance
+    sent = FLOOR_REFLECTANCE / math.pi * irradiance
+    # A circle as large as the pixel, in water.
+    cone_rad = 1.0 / (math.sqrt(math.pi) * camera.fx_px * camera.n_water)
+    sharp = weakened_per_m(water, share_within(cone_rad))
+    return FloorRadiance(
+        total=sent * np.exp(-path[..., None] * weakened_per_m(water, SEEN_SHARE)),
+        sharp=sent * np.exp(-path[..., None] * sharp),
+    )
+
+
+def weakened_per_m(water: WaterOptics, kept: float) -> Array:
+    """Attenuation (3,) of light of which a share of what is scattered counts as kept."""
+    weakened: Array = water.absorption_per_m + (1.0 - kept) * water.scattering_per_m
+    return weakened
 
 
 def electrons_per_radiance(limits: CameraConfig, n_water: float, exposure_s: float) -> Array:
@@ -197,20 +200,25 @@ def light_budget(
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
     gather = electrons_per_radiance(limits, camera.n_water, exposure_s)
     radiance = floor_radiance(rig, imaging, water, altitude_m, pixels)
-    electrons = radiance * lens_falloff(rig, pixels)[..., None] * gather
-    corners = electrons[[0, 0, -1, -1], [0, -1, 0, -1]]
-    corner = corners[np.argmin(corners.mean(axis=1))]
-    centre = electrons[_GRID[1] // 2, _GRID[0] // 2]
-    median, brightest = float(np.median(electrons.mean(axis=-1))), float(electrons.max())
+    gather = gather * lens_falloff(rig, pixels)[..., None]
+    electrons, sharp = radiance.total * gather, radiance.sharp * gather
+    means = electrons.mean(axis=-1)
+    darkest = min(((0, 0), (0, -1), (-1, 0), (-1, -1)), key=lambda at: float(means[at]))
+    centre = (_GRID[1] // 2, _GRID[0] // 2)
+    median, brightest = float(np.median(means)), float(electrons.max())
+    median_share = float(np.median(sharp.mean(axis=-1))) / max(median, 1e-30)
+    noise_e = limits.read_noise_e
     half = 0.5 * limits.full_well_e
     return LightBudget(
-        centre_e=_triple(centre),
-        corner_e=_triple(corner),
+        centre_e=_triple(electrons[centre]),
+        corner_e=_triple(electrons[darkest]),
         median_e=median,
         brightest_e=brightest,
-        snr_centre=_triple(signal_to_noise(centre, limits.read_noise_e)),
-        snr_median=float(signal_to_noise(np.array(median), limits.read_noise_e)),
-        snr_corner=_triple(signal_to_noise(corner, limits.read_noise_e)),
+        sharp_share=_triple(sharp[centre] / np.maximum(electrons[centre], 1e-30)),
+        snr_centre=_triple(signal_to_noise(electrons[centre], noise_e, sharp[centre])),
+        snr_median=float(signal_to_noise(np.array(median), noise_e, median_share * median)),
+        snr_corner=_triple(signal_to_noise(electrons[darkest], noise_e, sharp[darkest])),
+        needed_light=_needed_light(median, median_share, noise_e),
         full_share=brightest / limits.full_well_e,
         gain_db=20.0 * math.log10(MIDDLE_GREY * limits.full_well_e / max(median, 1e-9)),
         half_full_f_number=limits.f_number * math.sqrt(brightest / half),
@@ -218,9 +226,9 @@ def light_budget(
     )
 
 
-def signal_to_noise(electrons: Array, read_noise_e: float) -> Array:
-    """Mean over standard deviation: Poisson's shot noise and the read noise."""
-    ratio: Array = electrons / np.sqrt(electrons + read_noise_e**2)
+def signal_to_noise(electrons: Array, read_noise_e: float, sharp: Array | float) -> Array:
+    """Detail over noise: sharp electrons over the shot noise of all and the read noise."""
+    ratio: Array = sharp / np.sqrt(electrons + read_noise_e**2)
     return ratio
 
 
@@ -231,9 +239,16 @@ def too_dark(budget: LightBudget) -> str:
     return f"too dark, signal to noise {budget.snr_median:.1f} of {LEAST_SNR:g}"
 
 
-def light_for_snr_e(snr: float, read_noise_e: float) -> float:
-    """Electrons that have a signal to noise: the inverse of `signal_to_noise`."""
-    return (snr**2 + math.sqrt(snr**4 + 4.0 * snr**2 * read_noise_e**2)) / 2.0
+def light_for_snr_e(snr: float, read_noise_e: float, sharp_share: float) -> float:
+    """Electrons that have a signal to noise, if a share of them is sharp: see `signal_to_noise`."""
+    level = snr / sharp_share
+    return (level**2 + math.sqrt(level**4 + 4.0 * level**2 * read_noise_e**2)) / 2.0
+
+
+def _needed_light(median_e: float, sharp_share: float, read_noise_e: float) -> float:
+    if not min(median_e, sharp_share) > 0.0:
+        return math.inf
+    return light_for_snr_e(LEAST_SNR, read_noise_e, sharp_share) / median_e
 
 
 def _triple(values: Array) -> tuple[float, float, float]:
@@ -259,7 +274,10 @@ def light_rows(
          f"fills {budget.full_share:.1%} of the well of {limits.full_well_e:g} e"),
         ("electrons, corner", budget.corner_e, "e", "the same, with cos^4", _SOURCE, "lens, beam",
          ""),
-        ("signal to noise", budget.snr_centre, "", "S / sqrt(S + read^2)",
+        ("sharp light, centre", budget.sharp_share, "%", "exp(-(m' - m) s)", _FORWARD_SOURCE,
+         "water", "share of these electrons that is detail: the water scatters the rest by a few "
+         "degrees on its way from the floor, which blurs"),
+        ("signal to noise", budget.snr_centre, "", "sharp S / sqrt(S + read^2)",
          "Poisson shot noise and read noise", "electrons",
          f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "
          + " / ".join(f"{value:.1f}" for value in budget.snr_corner)),
@@ -280,7 +298,7 @@ class Scatter:
     """What the water between strobes, camera and floor does to a picture's middle."""
 
     veil_share: tuple[float, float, float]
-    """Light scattered once over all light, at the middle of the frame; red, green, blue."""
+    """Light thrown back over all light, at the middle of the frame; red, green, blue."""
     lit_from_m: float
     """Distance below the glass from which any strobe lights the axis of the camera."""
     seen_lit_from_m: float
@@ -304,10 +322,7 @@ class Shadows:
 
 
 def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: float) -> Scatter:
-    """Backscatter on the axis of the reference camera, single scattering.
-
-    Every piece of the ray sends `E(s) b p(angle) exp(-c s) ds` (as `seafloor.light`, summed here by
-    the trapezium rule on a finer grid near the glass).
+    """Backscatter on the axis of the reference camera, and the water that is lit.
 
     Args:
         rig: with its place on the vehicle.
@@ -319,33 +334,62 @@ def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: fl
     strobes = _strobes_cam(rig, imaging)
     half_beam = math.radians(imaging.strobe_beam_deg) / 2
     glass_z = float(camera.front_cam[2])
-    path = altitude_m * (np.arange(_STEPS + 1) / _STEPS) ** 2
-    points = np.stack([0 * path, 0 * path, glass_z + path], axis=1)
-    power = imaging.strobe_lumens * watts_per_lumen("planck")
-    sent = np.zeros((len(path), 3))
-    lit = np.zeros(len(path), dtype=bool)
-    for strobe in strobes:
-        away = points - strobe
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-        cos_beam = away[:, 2] / distance
-        strength = cone_intensity(cos_beam, half_beam) / distance**2
-        lit |= strength > 0
-        turned = strength * phase_per_sr(-cos_beam)
-        loss = np.exp(-(distance + path)[:, None] * water.attenuation_per_m)
-        sent += turned[:, None] * power * water.scattering_per_m * loss
-    veil = np.trapezoid(sent, path, axis=0)
+    veil = veil_radiance(rig, imaging, water, altitude_m, weakened_per_m(water, LIT_SHARE))
     centre = np.array([camera.cx_px, camera.cy_px])
-    signal = floor_radiance(rig, imaging, water, altitude_m, centre)
+    signal = floor_radiance(rig, imaging, water, altitude_m, centre).total
     share = np.divide(veil, veil + signal, out=np.zeros(3), where=veil + signal > 0)
+    path = _axis_paths(altitude_m)
+    reached = [strobe[2] + _reach(strobe) / math.tan(half_beam) - glass_z for strobe in strobes]
+    lit = np.any([path >= start for start in reached], axis=0)
     return Scatter(
         veil_share=_triple(share),
-        lit_from_m=min(
-            max(0.0, _reach(strobe) / math.tan(half_beam) + strobe[2] - glass_z)
-            for strobe in strobes
-        ),
+        lit_from_m=max(0.0, min(reached)),
         seen_lit_from_m=_field_lit_from_m(rig, strobes, half_beam, altitude_m),
         lit_share=float(np.sum(np.diff(path) * (lit[1:] & lit[:-1])) / altitude_m),
     )
+
+
+def veil_radiance(
+    rig: Rig,
+    imaging: ImagingConfig,
+    water: WaterOptics,
+    altitude_m: float,
+    attenuation_per_m: Array,
+    spectrum: Spectrum = "led",
+) -> Array:
+    """Radiance (3,) that water throws back along the axis of the reference camera, W / (m^2 sr).
+
+    Every piece of the ray sends `E(s) b p(angle) exp(-k s) ds` (as `seafloor.light`, summed here by
+    the trapezium rule on a finer grid near the glass).
+
+    Args:
+        rig: with its place on the vehicle.
+        imaging: the strobes; they point straight down.
+        water: of the three channels.
+        altitude_m: of the outer glass.
+        attenuation_per_m: (3,) of light to and from the water.
+        spectrum: of the strobes.
+    """
+    half_beam = math.radians(imaging.strobe_beam_deg) / 2
+    path = _axis_paths(altitude_m)
+    glass_z = float(rig.cameras[rig.reference].front_cam[2])
+    points = np.stack([0 * path, 0 * path, glass_z + path], axis=1)
+    sent = np.zeros((len(path), 3))
+    for strobe in _strobes_cam(rig, imaging):
+        away = points - strobe
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        cos_beam = away[:, 2] / distance
+        turned = cone_intensity(cos_beam, half_beam) / distance**2 * phase_per_sr(-cos_beam)
+        sent += turned[:, None] * np.exp(-(distance + path)[:, None] * attenuation_per_m)
+    power = imaging.strobe_lumens * watts_per_lumen(spectrum)
+    veil: Array = np.trapezoid(sent, path, axis=0) * power * water.scattering_per_m
+    return veil
+
+
+def _axis_paths(altitude_m: float) -> Array:
+    """Paths along the axis from glass to floor, close to each other near the glass."""
+    paths: Array = altitude_m * (np.arange(_STEPS + 1) / _STEPS) ** 2
+    return paths
 
 
 def _field_lit_from_m(rig: Rig, strobes: Array, half_beam: float, altitude_m: float) -> float:

@@ -27,10 +27,8 @@ from missions.exposure.footprints import (
     spacing_rows,
 )
 from missions.exposure.light import (
-    LEAST_SNR,
     LightBudget,
     light_budget,
-    light_for_snr_e,
     light_rows,
     scatter,
     scatter_rows,
@@ -188,7 +186,7 @@ def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> I
     if not quiet:
         for text in (
             too_open(focus, limits, plan),
-            _dark(budget, limits.read_noise_e, jerlov),
+            _dark(budget, jerlov),
             _near(plan),
             _gaps(spacing, prints, step_m),
             _slow_cable(storage, interval_s),
@@ -221,15 +219,14 @@ def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> I
     )
 
 
-def _dark(budget: LightBudget, read_noise_e: float, jerlov: str) -> str:
+def _dark(budget: LightBudget, jerlov: str) -> str:
     """What to do about too little light; empty where there is enough."""
     fault = too_dark(budget)
     if not fault:
         return ""
-    needed_e = light_for_snr_e(LEAST_SNR, read_noise_e)
     missing = "no light arrives"
-    if needed_e < _DARK * budget.median_e:
-        missing = f"{needed_e / budget.median_e:.1f} times the light is missing"
+    if budget.needed_light < _DARK:
+        missing = f"{budget.needed_light:.1f} times the light is missing"
     return (
         f"pictures will be {fault} in Jerlov {jerlov} water: {missing}; lower altitude_m or "
         "speed_mps, or raise allowed_blur_px or the aperture"

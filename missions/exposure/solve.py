@@ -12,7 +12,7 @@ from alice_survey.base.errors import AliceError, PlanError
 from alice_survey.base.text_table import text_table
 from missions.exposure.focus import largest_f_number, needed_f_number
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
-from missions.exposure.light import LEAST_SNR, light_for_snr_e, too_dark
+from missions.exposure.light import too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import (
     HIGHEST_ALTITUDE_M,
@@ -43,6 +43,8 @@ class LensOption:
     gain_db: float = math.nan
     snr: float = math.nan
     """Signal to noise of the median pixel."""
+    needed_light: float = math.nan
+    """Times the light that the median pixel needs."""
     hours_per_1000_m2: float = math.inf
     """Time on lines alone, without turns."""
     fits: bool = False
@@ -127,6 +129,7 @@ def _lens_option(
         exposure_ms=settings.exposure_s * 1e3,
         gain_db=settings.light.gain_db,
         snr=settings.light.snr_median,
+        needed_light=settings.light.needed_light,
         hours_per_1000_m2=1000.0 / settings.line_spacing_m / setup.plan.speed_mps / 3600.0,
         fits=not why,
         why=why,
@@ -191,11 +194,10 @@ def _lens_ways(
     def fits(changed: ImagingSetup, lens_mm: float) -> bool:
         return _lens_option(changed, deepest, resolution_mm, lens_mm).fits
 
-    noise_e = setup.camera.read_noise_e
     for option in options:
-        if math.isnan(option.snr):
+        times = option.needed_light
+        if not math.isfinite(times):
             continue
-        times = light_for_snr_e(LEAST_SNR, noise_e) / light_for_snr_e(option.snr, noise_e)
         blur_px = math.ceil(100 * plan.allowed_blur_px * times) / 100
         blurred = setup.with_plan(allowed_blur_px=blur_px)
         if blur_px > MOST_BLUR_PX or not fits(blurred, option.lens_mm):

@@ -119,9 +119,8 @@ def _cover(
     size_m = 2 * max(pattern.half_across_m, pattern.half_along_m)
     clusters = _clusters(patches[:, [U, V]], size_m)
     queue: list[tuple[float, int, Array]] = []
-    courses = []
+    courses, turned = [], to_uv(allowed, heading_rad)
     for number, cluster in enumerate(clusters):
-        turned = to_uv(allowed, heading_rad)
         courses.append(heading_rad + _directions(patches[cluster], turned, size_m))
         _offer(queue, number, patches[cluster], heading_rad, courses[-1], allowed, pattern)
     lines = []

@@ -23,9 +23,10 @@ from missions.coverage.certificate import Certificate
 from missions.exports.geometry import footprint_outline, rings_ne, route_ne
 from missions.values.plan_file import Plan
 
-KINDS = ("survey", "cross", "closing", "fill")
+KINDS = ("survey", "cross", "closing", "fill", "tie")
 COLOURS = {
     "survey": "#1b4f72", "cross": "#6c3483", "closing": "#117a65", "fill": "#b9770e",
+    "tie": "#c0392b",
     "area": "#c8553d", "allowed": "#566573", "no_go": "#b03a2e", "way": "#7f8c8d",
     "footprint": "#2e86c1", "contour": "#5d6d7e", "current": "#2471a3", "missed": "#d35400",
     "home": "#1e8449",

@@ -1,12 +1,13 @@
 """Lines and dives of an area, part by part where the vehicle cannot pass between its parts.
 
-Within one part lines are laid and divided into dives as a whole. Parts that are out of reach of
-each other have dives of their own, each launched and recovered in its part: between them the
-vehicle is carried, or goes at the surface.
+Within one part lines are laid and divided into dives as a whole; neighbouring dives share a line.
+Parts that are out of reach of each other have dives of their own, each launched and recovered in
+its part: between them the vehicle is carried, or goes at the surface.
 """
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import shapely
 import shapely.ops
@@ -71,10 +72,14 @@ def plan_parts(
             f"the vehicle may be in {len(parts)} parts and cannot pass between them in one dive: "
             "set split_dives = true, or widen area.turn_margin_m"
         )
-    whole = PlannedDives(lines=(), dives=(), sweep=None)
+    whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
         more = _plan_part(part, wanted, pattern, costs, home, usable_wh, depth_m)
         dives = (_from_line(dive, len(whole.lines)) for dive in more.dives)
+        tied = tied and all(
+            after.first_line == before.last_line + 1 and more.lines[after.first_line].kind == "tie"
+            for before, after in pairwise(more.dives)
+        )
         whole = PlannedDives(
             lines=(*whole.lines, *more.lines),
             dives=(*whole.dives, *dives),
@@ -85,10 +90,11 @@ def plan_parts(
             f"{len(parts)} parts are surveyed by {len(whole.dives)} dives, each launched and "
             "recovered in its part: fly them one by one (vehicle.dive)"
         )
-    if len(whole.dives) > len(parts) and not wanted.cross_lines:
+    if len(whole.dives) > len(parts) and not (tied or wanted.cross_lines):
+        room = "" if wanted.tie_dives else ", plan.tie_dives = true flies a line of each again"
         warn(
             f"{len(whole.dives)} dives are tied by the overlap of neighbouring lines "
-            "alone: plan.cross_lines = 1 crosses the lines of all of them"
+            f"alone: plan.cross_lines = 1 crosses the lines of all of them{room}"
         )
     return whole
 
@@ -168,8 +174,22 @@ def _plan_part(
         longest_s=math.inf if wanted.dive_s is None else wanted.dive_s,
         depth_m=depth_m,
         split=wanted.split_dives,
+        tied=wanted.tie_dives,
     )
-    return PlannedDives(lines=tuple(lines), dives=dives, sweep=sweep)
+    return with_ties(PlannedDives(lines=tuple(lines), dives=dives, sweep=sweep))
+
+
+def with_ties(planned: PlannedDives) -> PlannedDives:
+    """The same with lines that a dive flies again as lines of their own, of kind tie."""
+    lines: list[Line] = []
+    dives: list[Dive] = []
+    for dive in planned.dives:
+        own = list(planned.lines[dive.first_line : dive.last_line + 1])
+        if dives and dive.first_line <= planned.dives[len(dives) - 1].last_line:
+            own[0] = replace(own[0], kind="tie")
+        dives.append(_from_line(dive, len(lines) - dive.first_line))
+        lines += own
+    return replace(planned, lines=tuple(lines), dives=tuple(dives))
 
 
 def _from_line(dive: Dive, count: int) -> Dive:

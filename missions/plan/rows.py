@@ -12,7 +12,7 @@ from missions.coverage.certificate import Certificate
 from missions.exposure.settings_table import Setting, setting_from_json
 from missions.exposure.storage import raw_bytes
 from missions.lines.sweep import Sweep
-from missions.route.energy import battery_wh, usable_wh
+from missions.route.energy import battery_wh, hotel_w, usable_wh
 from missions.values.plan_file import Plan
 
 _GROUP = "LINES AND DIVES"
@@ -58,7 +58,7 @@ def plan_rows(
 
 
 def _line_rows(plan: Plan, sweep: Sweep | None) -> Sequence[Setting]:
-    counts = dict.fromkeys(("survey", "cross", "closing", "fill"), 0)
+    counts = dict.fromkeys(("survey", "cross", "closing", "fill", "tie"), 0)
     for line in plan.lines:
         counts[line.kind] += 1
     kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
@@ -92,8 +92,23 @@ def _dive_rows(plan: Plan, vehicle: VehicleConfig) -> Sequence[Setting]:
             f"the longest takes {longest:.0f} of {usable:.0f} Wh "
             f"({vehicle.battery_reserve:.0%} of {battery_wh(vehicle):.0f} Wh are kept)",
         ),
-        _row("energy", plan.energy_wh, "Wh", "sum of power x time", "hotel_w, drag, current"),
+        _row(
+            "energy", plan.energy_wh, "Wh", "sum of power x time", "hotel_w, drag, current",
+            _hotel_note(plan, vehicle),
+        ),
     )  # fmt: skip
+
+
+def _hotel_note(plan: Plan, vehicle: VehicleConfig) -> str:
+    """What of the energy is hotel load, and where that load has no source."""
+    load = hotel_w(vehicle)
+    note = f"hotel load {load:g} W is {load * plan.duration_s / 3600 / plan.energy_wh:.0%} of it"
+    if "hotel_w" in vehicle.model_fields_set or vehicle.name not in ("alice", "sparus2"):
+        return note
+    return (
+        f"{note}, and is inferred: measure what your vehicle draws with its thrusters at rest, "
+        "and set vehicle.hotel_w"
+    )
 
 
 def _data_row(plan: Plan, rig: Rig) -> Setting:

@@ -5,6 +5,9 @@ these the one that takes the least energy: a dynamic programme over the lines, e
 between two lines of a dive are the same whatever dive they are in. What is between lines comes from
 sums along the route through all of them; only the ways from home to each line and back are found
 for each line, and only the chosen dives get their own route.
+
+Tied dives share a line with the one before: they begin with its last line, flown again. That is
+done where it takes no dive more and little energy.
 """
 
 import math
@@ -23,6 +26,9 @@ from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.plan_file import Dive
 
+DEAREST_TIE = 1.1
+"""Tied dives may take so many times the energy of untied ones. Chosen: lines across tie them too.
+"""
 _J_PER_WH = 3600.0
 
 
@@ -77,6 +83,7 @@ def split_dives(
     longest_s: float | None,
     depth_m: float,
     split: bool,
+    tied: bool = False,
 ) -> tuple[Dive, ...]:
     """Divide lines into dives.
 
@@ -92,6 +99,9 @@ def split_dives(
         longest_s: of a dive, descent and ascent included; None: as long as the battery lasts.
         depth_m: that the vehicle goes down to and comes up from, once a dive.
         split: whether there may be more than one.
+        tied: whether each begins with the last line of the one before, which is not a fill line:
+            their `first_line` is its `last_line`. They are not where that takes more dives, or
+            more energy than `DEAREST_TIE` allows.
 
     Raises:
         PlanError: a line does not fit a dive by itself; or all do not and may not be split; or a
@@ -127,12 +137,26 @@ def split_dives(
     parted = _least_dives(sums, limits)
     if parted is None:
         raise PlanError(_line_too_long(lines, sums, limits, depth_m))
+    if tied:
+        parted = _tied(lines, sums, limits, parted)
     dives = []
     for first, last in parted:
         route = routed(first, last)
         energy_j, time_s = np.stack(leg_costs(route, costs)).sum(axis=1) + down_and_up
         dives.append(_dive(first, last, route, float(energy_j), float(time_s)))
     return tuple(dives)
+
+
+def _tied(
+    lines: Sequence[Line], sums: _Sums, limits: DiveLimits, parted: list[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Dives that share a line each, or those given where these would be more or dear."""
+    fill = np.array([line.kind == "fill" for line in lines])
+    joined = _least_dives(sums, limits, np.flatnonzero(fill) + 1, overlap=1)
+    if joined is None or len(joined) > len(parted):
+        return parted
+    energy_j, apart_j = (sum(sums.of(*dive)[0] for dive in dives) for dives in (joined, parted))
+    return joined if energy_j <= DEAREST_TIE * apart_j else parted
 
 
 def _dive(first: int, last: int, route: Route, energy_j: float, time_s: float) -> Dive:
@@ -186,10 +210,18 @@ def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth
     )
 
 
-def _least_dives(sums: _Sums, limits: DiveLimits) -> list[tuple[int, int]] | None:
+def _least_dives(
+    sums: _Sums, limits: DiveLimits, not_at: Sequence[int] | Array = (), overlap: int = 0
+) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
 
     Of the best division of lines up to each: how many dives, what energy, where the last begins.
+
+    Args:
+        sums: along the lines.
+        limits: of each dive.
+        not_at: lines that no dive begins with.
+        overlap: how many lines of the dive before each dive flies first.
     """
     count = sums.until.shape[1]
     energy_j, time_s = limits.energy_j, limits.time_s
@@ -205,8 +237,10 @@ def _least_dives(sums: _Sums, limits: DiveLimits) -> list[tuple[int, int]] | Non
         ):
             earliest += 1
         first = np.arange(earliest, last + 1)
-        dive_j = sums.home_to[0, first] + through[0] - sums.until[0, first]
-        dive_s = sums.home_to[1, first] + through[1] - sums.until[1, first]
+        first = first[~np.isin(first, not_at)]
+        flown = np.maximum(first - overlap, 0)
+        dive_j = sums.home_to[0, flown] + through[0] - sums.until[0, flown]
+        dive_s = sums.home_to[1, flown] + through[1] - sums.until[1, flown]
         fits = (dive_j <= energy_j) & (dive_s <= time_s) & np.isfinite(dives[first])
         if not fits.any():
             dives[last + 1] = spent[last + 1] = math.inf
@@ -221,7 +255,7 @@ def _least_dives(sums: _Sums, limits: DiveLimits) -> list[tuple[int, int]] | Non
     parted, end = [], count
     while end > 0:
         begin = int(begins[end])
-        parted.append((begin, end - 1))
+        parted.append((max(begin - overlap, 0), end - 1))
         end = begin
     return parted[::-1]
 

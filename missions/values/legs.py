@@ -63,14 +63,11 @@ class Leg:
 
     def places(self, along_m: Array) -> Array:
         """Where the path is, (N, 2) north and east, after distances (N,) from the leg's start."""
-        k = self.curvature_per_m
-        turned = self.heading_rad + k * along_m / 2
-        # The chord of an arc points along its mean heading and is sinc(half the angle) as long.
-        chord = along_m * np.sinc(k * along_m / 2 / math.pi)
-        ne: Array = np.array(self.start_ne_m) + chord[:, None] * np.stack(
-            [np.cos(turned), np.sin(turned)], axis=1
-        )
-        return ne
+        return _places(np.array([self._start]), along_m)
+
+    @property
+    def _start(self) -> tuple[float, float, float, float]:
+        return (*self.start_ne_m, self.heading_rad, self.curvature_per_m)
 
     @property
     def end_ne_m(self) -> tuple[float, float]:
@@ -102,6 +99,21 @@ class Leg:
         return data | ({"line": self.line} if self.line >= 0 else {})
 
 
+def _places(begins: Array, along_m: Array) -> Array:
+    """Places (N, 2) after distances (N,) along legs.
+
+    Args:
+        begins: (N, 4) or (1, 4) north, east, heading and curvature where each leg starts.
+        along_m: from there.
+    """
+    heading, k = begins[:, 2], begins[:, 3]
+    turned = heading + k * along_m / 2
+    # The chord of an arc points along its mean heading and is sinc(half the angle) as long.
+    chord = along_m * np.sinc(k * along_m / 2 / math.pi)
+    ne: Array = begins[:, :2] + chord[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    return ne
+
+
 @dataclass(frozen=True, kw_only=True)
 class Route:
     """Legs that follow one another without a gap. Places are of the left port's glass."""
@@ -122,8 +134,5 @@ class Route:
         """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
         starts = self.starts_m
         index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
-        result = np.empty((len(along_m), 2))
-        for i in np.unique(index):
-            rows = index == i
-            result[rows] = self.legs[i].places(along_m[rows] - starts[i])
-        return result
+        begins = np.array([leg._start for leg in self.legs])
+        return _places(begins[index], along_m - starts[index])

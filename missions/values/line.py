@@ -8,7 +8,7 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 
-LineKind = Literal["survey", "cross", "closing", "fill"]
+LineKind = Literal["survey", "cross", "closing", "fill", "tie"]
 """survey: of the pattern. cross: across it. closing: back over the start, so that the block's end
 is tied to its beginning. fill: what the pattern could not reach."""
 

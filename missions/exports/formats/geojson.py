@@ -32,7 +32,7 @@ def write_geojson(path: Path, export: Export, _dive: int) -> None:
         file.write('{"type": "FeatureCollection", "features": [\n')
         areas = (plan.area.survey, plan.area.allowed, plan.area.no_go)
         count = sum(len(area.geoms) for area in areas) + 1
-        count += len(plan.lines) + len(plan.dives) + 2 * plan.stations
+        count += 2 * len(plan.lines) + len(plan.dives)
         features = progress(_features(plan, rig), "plan features", count)
         for index, feature in enumerate(features):
             file.write((",\n" if index else "") + feature)
@@ -65,7 +65,7 @@ def _features(plan: Plan, rig: Rig) -> Iterator[str]:
 def _stations(
     plan: Plan, rig: Rig, dive_of: dict[int, int], floor_m: float, glass_m: float
 ) -> Iterator[str]:
-    """Stations and footprints; put together as text, since there may be 100,000 of them."""
+    """Stations and footprints of each line; put together as text, since there may be millions."""
     outline = footprint_outline(plan, rig)
     if not shapely.LinearRing(outline[:, ::-1]).is_ccw:  # east before north, as in the file
         outline = outline[::-1]
@@ -75,19 +75,21 @@ def _stations(
         places = _texts(plan.datum, line.stations_ne, glass_m)
         corners = _texts(plan.datum, footprints_ne(line, outline).reshape(-1, 2), floor_m)
         dive = json.dumps(dive_of.get(index))
+        features = []
         for i, place in enumerate(places):
             about = f'"station": {station}, "line": {index}, "dive": {dive}'
-            yield (
+            features.append(
                 f'{{"type": "Feature", "properties": {{"role": "station", {about}}}, '
                 f'"geometry": {{"type": "Point", "coordinates": {place}}}}}'
             )
             ring = corners[i * per_ring : (i + 1) * per_ring]
             closed = ", ".join((*ring, ring[0]))
-            yield (
+            features.append(
                 f'{{"type": "Feature", "properties": {{"role": "footprint", {about}}}, '
                 f'"geometry": {{"type": "Polygon", "coordinates": [[{closed}]]}}}}'
             )
             station += 1
+        yield ",\n".join(features)
 
 
 def _areas(plan: Plan, role: str, geometry: MultiPolygon) -> Iterator[str]:

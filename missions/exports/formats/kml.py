@@ -23,6 +23,7 @@ _STYLES = {
     "cross": ("ff833469", "2", "00ffffff"),
     "closing": ("ff12859c", "2", "00ffffff"),
     "fill": ("ff3c8f2e", "2", "00ffffff"),
+    "tie": ("ff2b39c0", "2", "00ffffff"),
     "route": ("b08d8c7f", "1", "00ffffff"),
 }
 

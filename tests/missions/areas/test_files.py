@@ -1,4 +1,5 @@
 import json
+import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -268,6 +269,14 @@ def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.shp").mkdir()
     assert "folder.shp" in refusal(file=tmp_path / "folder.shp")
     assert "a.geojson" in refusal(file=Path("/vsicurl/http:/localhost/a.geojson"))
+
+
+@pytest.mark.parametrize("ending", [".dbf", ".shx", ".prj", ".cpg"])
+def test_a_pipe_next_to_a_shapefile_is_refused(ending: str, tmp_path: Path) -> None:
+    side = shapefile(tmp_path).with_suffix(ending)
+    side.unlink(missing_ok=True)
+    os.mkfifo(side)
+    assert f"site{ending} is not a file" in refusal(file=tmp_path / "site.shp")
 
 
 def test_names_in_an_archive_lead_nowhere(tmp_path: Path, wanted: Area) -> None:

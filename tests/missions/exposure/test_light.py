@@ -2,13 +2,13 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from alice_survey.seafloor.light import LUMENS_PER_WATT, camera_light
 from alice_survey.seafloor.renderer import flat_floor_radiance
 from alice_survey.seafloor.sensor import make_sensor, nominal_gain
 from alice_survey.seafloor.texture import SAND_ALBEDO
 from camera_calib.water import WaterOptics, water_optics
+from missions.exposure.lamp import LED_B3, LED_NM, watts_per_lumen
 from missions.exposure.light import (
     FLOOR_REFLECTANCE,
     MIDDLE_GREY,
@@ -21,7 +21,7 @@ from missions.exposure.light import (
     scatter,
     shadows,
     signal_to_noise,
-    watts_per_lumen,
+    veil_radiance,
 )
 from tests.missions.exposure.surveys import survey
 
@@ -31,7 +31,7 @@ CLEAR = WaterOptics(absorption_per_m=np.zeros(3), scattering_per_m=np.zeros(3))
 @pytest.mark.parametrize("jerlov", ["I", "II", "3C", "7C"])
 @pytest.mark.parametrize("altitude_m", [1.5, 2.0, 3.0])
 def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: float) -> None:
-    """The simulator has an even spectrum and a soft cone here; its veil is computed separately."""
+    """The simulator has an even spectrum, a soft cone, and of scattered light only the veil."""
     rig, config = survey(water={"jerlov": jerlov})
     camera, optics = rig.cameras["left"], water_optics(config.water.jerlov)
     light = camera_light(
@@ -42,7 +42,8 @@ def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: f
     rendered = flat_floor_radiance(camera, light, range_m, SAND_ALBEDO, step).astype(np.float64)
     veil = flat_floor_radiance(camera, light, range_m, np.zeros(3), step)
     pixels = camera.pixel_centres(step)
-    ours = floor_radiance(rig, config.imaging, optics, altitude_m, pixels, "even")
+    lossy = WaterOptics(absorption_per_m=optics.attenuation_per_m, scattering_per_m=np.zeros(3))
+    ours = floor_radiance(rig, config.imaging, lossy, altitude_m, pixels, "even").total
     ours *= lens_falloff(rig, pixels)[..., None]
 
     np.testing.assert_array_equal(FLOOR_REFLECTANCE, SAND_ALBEDO)
@@ -52,9 +53,9 @@ def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: f
     assert np.median(ours[seen] / (rendered - veil)[seen]) == pytest.approx(1.0, abs=0.04)
 
     middle = (rendered.shape[0] // 2, rendered.shape[1] // 2)
-    share = veil[middle] / rendered[middle]
-    mine = scatter(rig, config.imaging, optics, altitude_m).veil_share
-    np.testing.assert_allclose(mine, share, rtol=0.15)
+    lost = optics.attenuation_per_m
+    mine = veil_radiance(rig, config.imaging, optics, altitude_m, lost, "even")
+    np.testing.assert_allclose(mine, veil[middle], rtol=0.15)
 
 
 def test_electrons_agree_with_the_simulators_sensor() -> None:
@@ -73,18 +74,24 @@ def test_an_even_spectrum_has_the_lumens_of_the_simulators() -> None:
     np.testing.assert_allclose(even, even[0], rtol=0.01)
 
 
-def test_warm_light_is_red_and_holds_its_lumens() -> None:
-    """At 4000 K red is twice blue; a body of 5800 K is nearly even; all give their lumens."""
-    red, green, blue = watts_per_lumen("planck", 4000.0)
-    assert red > green > blue
+def lobe(nm: np.ndarray, middle: float, below: float, above: float) -> np.ndarray:
+    return np.exp(-0.5 * ((nm - middle) / np.where(nm < middle, below, above)) ** 2)
 
-    # Planck's law itself, by quadrature over the bands.
-    def planck(nm: float) -> float:
-        return nm**-5 / math.expm1(1.438777e7 / nm / 4000.0)
 
-    assert red / blue == pytest.approx(
-        quad(planck, 600, 700)[0] / quad(planck, 400, 500)[0], rel=0.01
-    )
+def test_the_led_has_the_colour_that_cie_states() -> None:
+    """LED-B3 is x 0.3756, y 0.3723 (CIE 015:2018); colour matching by Wyman, Sloan and Shirley 2013
+    (JCGT 2, multi-lobe fit of CIE 1931)."""
+    nm, power = LED_NM, LED_B3
+    x = 1.056 * lobe(nm, 599.8, 37.9, 31.0) + 0.362 * lobe(nm, 442.0, 16.0, 26.7)
+    x -= 0.065 * lobe(nm, 501.1, 20.4, 26.2)
+    y = 0.821 * lobe(nm, 568.8, 46.9, 40.5) + 0.286 * lobe(nm, 530.9, 16.3, 31.1)
+    z = 1.217 * lobe(nm, 437.0, 11.8, 36.0) + 0.681 * lobe(nm, 459.0, 26.0, 13.8)
+    xyz = np.array([power @ x, power @ y, power @ z])
+    np.testing.assert_allclose(xyz[:2] / xyz.sum(), [0.3756, 0.3723], atol=0.004)
+    watts = watts_per_lumen("led")
+    assert 683.0 * (power @ y) / power.sum() == pytest.approx(1 / watts.sum(), rel=0.03)
+    red, green, blue = watts
+    assert green > red > blue
 
 
 def test_the_cone_sends_all_of_its_power() -> None:
@@ -103,9 +110,10 @@ def test_one_strobe_over_the_camera_in_clear_water_is_the_closed_form() -> None:
     camera = rig.cameras["left"]
     centre = np.array([camera.cx_px, camera.cy_px])
     radiance = floor_radiance(rig, config.imaging, CLEAR, 2.0, centre)
-    power = 30_000 * watts_per_lumen("planck")
+    np.testing.assert_array_equal(radiance.total, radiance.sharp)
+    power = 30_000 * watts_per_lumen("led")
     expected = FLOOR_REFLECTANCE / math.pi * power / (math.pi * math.sin(math.radians(60)) ** 2) / 4
-    np.testing.assert_allclose(radiance, expected, rtol=1e-9)
+    np.testing.assert_allclose(radiance.total, expected, rtol=1e-9)
 
 
 def test_the_budget_scales_as_light_does() -> None:
@@ -136,10 +144,10 @@ def test_signal_to_noise_is_poissons_and_the_readers() -> None:
     rng = np.random.default_rng(3)
     draws = rng.poisson(200.0, 200_000) + 12.0 * rng.standard_normal(200_000)
     expected = draws.mean() / draws.std()
-    assert signal_to_noise(np.array(200.0), 12.0) == pytest.approx(expected, rel=0.01)
+    assert signal_to_noise(np.array(200.0), 12.0, 200.0) == pytest.approx(expected, rel=0.01)
     for electrons in (3.0, 200.0, 9000.0):
-        ratio = float(signal_to_noise(np.array(electrons), 12.0))
-        assert light_for_snr_e(ratio, 12.0) == pytest.approx(electrons)
+        ratio = float(signal_to_noise(np.array(electrons), 12.0, 0.6 * electrons))
+        assert light_for_snr_e(ratio, 12.0, 0.6) == pytest.approx(electrons)
 
 
 def test_shadows_follow_from_similar_triangles() -> None:

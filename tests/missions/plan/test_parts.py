@@ -1,6 +1,7 @@
 """Parts that the vehicle cannot pass between have dives of their own."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,10 +12,12 @@ from shapely.geometry import LineString, MultiPolygon, box
 
 from alice_survey.base.config import parse_config
 from alice_survey.base.errors import PlanError
+from camera_calib.rig import Rig, design_rig
+from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.fly.flight_route import one_dive, path_of
 from missions.plan.parts import parts_of
 from missions.values.line import Line
-from missions.values.plan_file import Plan
+from missions.values.plan_file import Dive, Plan
 from tests.missions.flown_plans import planned
 from tests.oracles_lines import area_of
 
@@ -78,9 +81,53 @@ def _as_string(line: Line) -> LineString:
     return LineString([line.start_ne_m, line.end_ne_m])
 
 
+def _seen_by(plan: Plan, rig: Rig, dive: Dive) -> shapely.Geometry:
+    """What the first camera's pictures of a dive see."""
+    outline = footprint_outline(plan, rig)
+    lines = plan.lines[dive.first_line : dive.last_line + 1]
+    return shapely.union_all(
+        [shapely.Polygon(r) for line in lines for r in footprints_ne(line, outline)]
+    )
+
+
+@pytest.mark.parametrize("tie_dives", [False, True])
+def test_pictures_of_neighbouring_dives_overlap_by_a_line(tie_dives: bool) -> None:
+    """Along a whole line, by all that it sees; untied, by the overlap of two lines' sides alone."""
+    config = parse_config(
+        {
+            "area": {"length_m": 12.0, "width_m": 40.0},
+            "plan": {
+                "dive_s": 1600.0, "tie_dives": tie_dives, "cross_lines": 0, "closing_line": False,
+                "line_heading_deg": 0.0,
+            },
+        },
+        "test",
+    )  # fmt: skip
+    plan, rig = planned(config), design_rig(config.camera, config.water)
+    assert len(plan.dives) >= 3
+    assert sum(d.last_line - d.first_line + 1 for d in plan.dives) == len(plan.lines)
+    assert plan.dives[0].first_line == 0
+    for before, after in pairwise(plan.dives):
+        assert after.first_line == before.last_line + 1
+        shared, again = plan.lines[before.last_line], plan.lines[after.first_line]
+        both = _seen_by(plan, rig, before).intersection(_seen_by(plan, rig, after)).area
+        swath_m2 = plan.footprint_m[0] * shared.length_m
+        if tie_dives:
+            assert again == replace(shared, kind="tie")
+            assert 1.0 < both / swath_m2 < 2.0
+        else:
+            assert again.kind == "survey"
+            assert 0.1 < both / swath_m2 < 0.6
+    for dive in plan.dives:
+        assert dive.duration_s <= 1600.0
+        assert [leg.line for leg in dive.route.legs if leg.line >= 0] == list(
+            range(dive.first_line, dive.last_line + 1)
+        )
+
+
 @pytest.mark.parametrize("cross_lines", [0, 1])
 def test_cross_lines_tie_all_dives(cross_lines: int, capsys: pytest.CaptureFixture[str]) -> None:
-    wanted = {"dive_s": 500.0, "cross_lines": cross_lines}
+    wanted = {"dive_s": 500.0, "cross_lines": cross_lines, "tie_dives": False}
     plan = planned(parse_config({"plan": wanted}, "test"))
     assert len(plan.dives) >= 4
     owner = [

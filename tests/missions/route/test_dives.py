@@ -1,6 +1,7 @@
 """Lines divided into dives: fewest, then least energy, each within battery and time."""
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.base.errors import PlanError
-from missions.route.dives import split_dives
+from missions.route.dives import DEAREST_TIE, split_dives
 from missions.route.turns import route_through
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
@@ -94,6 +95,41 @@ def test_no_parting_is_better(
         assert longest_s is None or dive.duration_s <= longest_s * (1 + 1e-9)
         numbers = [leg.line for leg in dive.route.legs if leg.line >= 0]
         assert numbers == list(range(dive.first_line, dive.last_line + 1))
+
+
+@given(
+    count=st.integers(2, 8),
+    energy=st.floats(1.05, 6.0),
+    lengths=st.lists(st.floats(2.0, 25.0), min_size=8, max_size=8),
+    fill=st.integers(0, 7),
+)
+@settings(max_examples=25, deadline=None)
+def test_tied_dives_share_a_line_and_no_such_parting_is_better(
+    count: int, energy: float, lengths: list[float], fill: int
+) -> None:
+    """Each begins with the last line of the one before, unless that takes a dive more."""
+    lines = [_lines(count, length)[i] for i, length in enumerate(lengths[:count])]
+    lines = [replace(line, kind="fill") if i == fill else line for i, line in enumerate(lines)]
+    usable_j = energy * max(_of_dive(lines, i, i)[0] for i in range(count))
+
+    def cost(first: int, last: int) -> tuple[float, float]:
+        if first and lines[first - 1].kind == "fill":
+            return np.inf, np.inf
+        return _of_dive(lines, max(first - 1, 0), last)
+
+    apart = _split(lines, usable_j / 3600)
+    tied = _split(lines, usable_j / 3600, tied=True)
+
+    best = best_parting(count, cost, usable_j, np.inf)
+    assert len(tied) == len(apart)
+    apart_j = 3600 * sum(dive.energy_wh for dive in apart)
+    if best is None or best[0] > len(apart) or best[1] > DEAREST_TIE * apart_j:
+        assert tied == apart
+        return
+    assert sum(dive.energy_wh for dive in tied) * 3600 == pytest.approx(best[1], rel=1e-9)
+    assert [d.first_line for d in tied] == [0, *(d.last_line for d in tied[:-1])]
+    for dive in tied:
+        assert dive.energy_wh * 3600 <= usable_j * (1 + 1e-9)
 
 
 def test_ways_home_round_a_hole_count_whole() -> None:
