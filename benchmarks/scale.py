@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from benchmarks.scale_steps import MAKE, STEPS
+from benchmarks.scale_steps import MAKE, MAPPED, PLACING, STEPS
 
 _MANY = 100_000
 _MOST_GIB = 8.0
@@ -107,7 +107,10 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     rows: dict[str, list[StepCost]] = {}
     failed = []
-    for step in [s for s in STEPS if s == MAKE or not options.only or s in options.only]:
+    wanted = {*(options.only or STEPS), MAKE}
+    if PLACING in wanted:
+        wanted.add(MAPPED)
+    for step in [s for s in STEPS if s in wanted]:
         for pictures in sorted(options.pictures):
             spent = measure(step, pictures, options.work, options.threads)
             if spent is None:
@@ -119,7 +122,7 @@ def main() -> None:
     figures = [
         figure
         for step, row in rows.items()
-        if step != MAKE
+        if step not in (MAKE, MAPPED)
         for figure in figures_of(row, judged=not options.quick)
     ]
     findings = Findings(figures=tuple(figures), failed=tuple(failed))

@@ -20,21 +20,22 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.block_solver import minimise
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
-from benchmarks.bend_survey import calibrated_rig
+from alice_survey.base.records import RegistrationRecord
+from benchmarks.bend_survey import NOISE_PX, calibrated_rig
 from benchmarks.block_size import ALTITUDE_M, DATUM, Block, block, near_start, records_of
-from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from benchmarks.scale_model import pinhole_warps, write_mapped
 from camera_calib.freedom import Prior
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
     calibrated_parameters,
-    exact_observations,
 )
-from reconstruct.adjustment.pixel_parts import Workers
+from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
 from reconstruct.adjustment.survey_fit import SurveyProblem
 from reconstruct.adjustment.uncertainty import shape_of_block
 from reconstruct.dense.stereo_pairs import PointsInSight, choose_partners, neighbours
@@ -47,18 +48,21 @@ from reconstruct.mapping.refraction import refract
 from reconstruct.matching.matches import PairMatches
 from reconstruct.matching.pairs import choose_pairs, most_alike
 from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.run import run_sparse
 from reconstruct.views.model import SparseModel, View, WorldFrame
 from reconstruct.views.model_files import colmap_pinhole
 from reconstruct.views.range_shift import range_shift
 
-MAKE = "make"
+MAKE, MAPPED, PLACING = "make", "mapped", "placing"
 _EXAMPLE, _QUICK_EXAMPLE, _QUICK_PICTURES = "caesarea", "demo", 500
 _POINTS = 30
 """On the sea floor, of each station."""
 _LATTICE, _WITNESSES = (28, 22), 8
 """Spots along a view's width and height, and views it is compared with."""
 _MAPPED_POINTS = 100
-"""On the sea floor, of each station, where their matches are mapped."""
+"""On the sea floor, of each station, where their matches are mapped or their model is placed."""
+_UNMATCHED = 1000
+"""Keypoints of a picture of such a model that have no point."""
 _LEAST_MATCHES = 15
 _WRONG, _WRONG_PX = 0.005, 20.0
 """Share of the keypoints that are wrong, and by how much."""
@@ -181,8 +185,11 @@ def _shape(work: StepWork) -> Prepared:
     pixels, state = work.survey.pixels, work.state(work.read("adjust"))
 
     def run() -> int:
-        linear = exact_observations(state, pixels, ())
-        shape = shape_of_block(linear, state.centres, state.points, None, scale_free=False)
+        near, order = pixels.by_place(state.centres)
+        placed = replace(state, points=state.points[order])
+        parts = PixelParts(near, len(state.centres))
+        linear = Linearised(pixels=parts, state=placed, fields=(), noise=(NOISE_PX, NOISE_PX**2))
+        shape = shape_of_block(linear, near, placed.centres, placed.points, None, scale_free=False)
         np.savez(work.own / "shape.npz", modes=shape.modes.stations)
         return len(pixels.station)
 
@@ -201,6 +208,36 @@ def _place(work: StepWork) -> Prepared:
             modes=modes[:, [3, 4, 5, 0, 1, 2]],
         )  # fmt: skip
         return len(records)
+
+    return run
+
+
+def _mapped(work: StepWork) -> Prepared:
+    """What the whole stage of the next step starts from."""
+    rig, workspace = work.rig, work.own / "workspace"
+    shutil.rmtree(workspace, ignore_errors=True)
+    survey = block(rig, work.pictures // len(rig.cameras), _MAPPED_POINTS)
+
+    def run() -> int:
+        write_mapped(workspace, rig, survey, work.records, _UNMATCHED)
+        return len(survey.pixels.station)
+
+    return run
+
+
+def _placing(work: StepWork) -> Prepared:
+    """The whole stage: last adjustment, covariance, place and all files."""
+    workspace = work.own / "workspace"
+    folder = workspace / "sparse"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+
+    def run() -> int:
+        run_sparse(
+            workspace, folder, work.executor, reconstruct=ReconstructConfig(), index_sigma=0.0
+        )
+        found = RegistrationRecord.read(folder / "registration.json")
+        return round(found.points * found.mean_track_length)
 
     return run
 
@@ -287,7 +324,7 @@ def _partners(work: StepWork) -> Prepared:
 def _model(work: StepWork) -> SparseModel:
     """The truth as pinholes see it."""
     rig, truth, pixels = work.rig, work.survey.truth, work.survey.pixels
-    warps = _warps(rig)
+    warps = pinhole_warps(rig)
     shifts = {name: range_shift(warp) for name, warp in warps.items()}
     poses = RigidTransform.from_components(truth.centres, Rotation.from_matrix(truth.turns))
     in_rig = {
@@ -310,11 +347,6 @@ def _model(work: StepWork) -> SparseModel:
             [pixels.point, len(rig.cameras) * pixels.station + pixels.camera]
         ),
     )
-
-
-def _warps(rig: Rig) -> dict[str, PinholeWarp]:
-    near, far = 0.9 * ALTITUDE_M, 1.1 * ALTITUDE_M
-    return {name: best_warp(camera, near, far) for name, camera in rig.cameras.items()}
 
 
 def _map(work: StepWork) -> Prepared:
@@ -355,7 +387,7 @@ def _matched(work: StepWork) -> Observations:
         if len(rows[0]) >= _LEAST_MATCHES:
             matches = np.stack(rows, axis=1).astype(np.uint32)
             pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
-    warps = _warps(rig)
+    warps = pinhole_warps(rig)
     return Observations(
         images=records,
         cameras={name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()},
@@ -370,6 +402,8 @@ STEPS: dict[str, Callable[[StepWork], Prepared]] = {
     "adjust": _adjust,
     "shape": _shape,
     "place": _place,
+    MAPPED: _mapped,
+    PLACING: _placing,
     "partners": _partners,
     "light": _light,
     "looks": _looks,

@@ -115,7 +115,7 @@ def adjust_survey(
     found = replace(mapped, notes=notes) if exact is None else exact.on_pinholes()
     shape = None
     try:
-        shape = _shape(found, records, exact)
+        shape = _shape(found, records, exact, workers)
     except ReconstructionError as error:
         warn(f"no covariance: {error}")
     if exact is not None:
@@ -146,11 +146,14 @@ def _exact(
 
 @progress.step("covariance of the model")
 def _shape(
-    mapped: Mapped, records: Sequence[ImageRecord], exact: ExactSurvey | None
+    mapped: Mapped, records: Sequence[ImageRecord], exact: ExactSurvey | None, workers: Workers
 ) -> Uncertainty:
+    workers = workers.apart("covariance")
     if exact is None:
-        return estimate(mapped, records)
-    return estimate(mapped, records, exact.fit.calibration, held=not exact.fit.parameters)
+        return estimate(mapped, records, workers=workers)
+    return estimate(
+        mapped, records, exact.fit.calibration, held=not exact.fit.parameters, workers=workers
+    )
 
 
 def taken_pixels(

@@ -79,6 +79,10 @@ class LinearParts(Protocol):
     def points(self) -> Sequence[int]:
         """How many points each part has."""
 
+    @property
+    def pattern(self) -> "BlockPattern":
+        """Which of all stations see points in common."""
+
     def map(
         self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
     ) -> Iterator[Result]:
@@ -96,6 +100,11 @@ class OnePart:
     def points(self) -> Sequence[int]:
         """How many points it has."""
         return [len(self.linear.starts) - 1]
+
+    @property
+    def pattern(self) -> "BlockPattern":
+        """Which stations see points in common."""
+        return pattern_of(self.linear.starts, self.linear.station, len(self.stations[0]))
 
     def map(
         self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
@@ -191,6 +200,14 @@ class PointEquations(Equations):
         steps = ((poses[own], rest) for own in self.parts.stations)
         return self._by_point(_follow_part, steps)
 
+    def follow_poses(self, poses: Array) -> Iterator[Array]:
+        """Yield the motions (p, 3, K) of the points of each part by K steps (F, 6, K) of stations.
+
+        Nothing is shared.
+        """
+        steps = ((poses[own], np.zeros((poses.shape[2], 1))) for own in self.parts.stations)
+        return self.parts.map(_follow_steps_in_part, ((step, slice(None)) for step in steps))
+
     def follow_shared(self, response: Array, every: int) -> Array:
         """Motions (P', 3, G) of every n-th point by what is shared.
 
@@ -199,11 +216,12 @@ class PointEquations(Equations):
             every: n.
         """
         firsts = np.cumsum([0, *self.parts.points])[:-1].tolist()
+        units = np.eye(response.shape[2], response.shape[2] + 1)
         steps = (
-            (response[own], slice(-first % every, None, every))
+            ((response[own], units), slice(-first % every, None, every))
             for own, first in zip(self.parts.stations, firsts, strict=True)
         )
-        return self._by_point(_follow_shared_in_part, steps)
+        return self._by_point(_follow_steps_in_part, steps)
 
     def point_covariances(self, blocks: Array) -> Array:
         """Covariance of every point, (P, 3, 3), from those of its stations.
@@ -245,14 +263,14 @@ def _follow_part(linear: LinearObservations, steps: tuple[Array, Array]) -> Arra
     return _follow(*linear.arrays, _point_inverse(linear.starts, linear.by_point), *steps)
 
 
-def _follow_shared_in_part(linear: LinearObservations, by: tuple[Array, slice]) -> Array:
-    response, chosen = by
+def _follow_steps_in_part(
+    linear: LinearObservations, by: tuple[tuple[Array, Array], slice]
+) -> Array:
+    """Motions (p, 3, K) of chosen points by steps (f, 6, K) of stations, (K, G + 1) of the rest."""
+    (poses, rest), chosen = by
     inverse = _point_inverse(linear.starts, linear.by_point)
-    poses = np.ascontiguousarray(response.transpose(2, 0, 1))
-    units = np.eye(len(poses), len(poses) + 1)
-    moved = [
-        _follow(*linear.arrays, inverse, *step)[chosen] for step in zip(poses, units, strict=True)
-    ]
+    steps = zip(np.ascontiguousarray(poses.transpose(2, 0, 1)), rest, strict=True)
+    moved = [_follow(*linear.arrays, inverse, *step)[chosen] for step in steps]
     return np.stack(moved, axis=-1)
 
 
@@ -269,17 +287,12 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
         linear: observations; every point needs two that see it from apart.
         stations: F, how many there are.
     """
-    pattern = pattern_of(linear.starts, linear.station, stations)
-    return reduce_parts(OnePart(linear=linear, stations=[np.arange(stations)]), pattern)
+    return reduce_parts(OnePart(linear=linear, stations=[np.arange(stations)]))
 
 
-def reduce_parts(parts: LinearParts, pattern: BlockPattern) -> PointEquations:
-    """Eliminate the points, part by part; the sums are added in the order of the parts.
-
-    Args:
-        parts: the observations.
-        pattern: of all stations.
-    """
+def reduce_parts(parts: LinearParts) -> PointEquations:
+    """Eliminate the points, part by part; the sums are added in the order of the parts."""
+    pattern = parts.pattern
     stations = len(pattern.pointers) - 1
     found: PointEquations | None = None
     for own, sums in zip(

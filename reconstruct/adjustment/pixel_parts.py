@@ -47,6 +47,10 @@ class Workers:
         if self.folder is None and (self.executor.workers > 1 or self.executor.pool is not None):
             raise ValueError("workers of other processes need a folder")
 
+    def apart(self, name: str) -> "Workers":
+        """The same, with a folder of its own in that of these."""
+        return replace(self, folder=None if self.folder is None else self.folder / name)
+
 
 ALONE = Workers()
 """This process."""
@@ -192,6 +196,11 @@ class Linearised:
     def points(self) -> Sequence[int]:
         """How many points each part has."""
         return self.pixels.points
+
+    @property
+    def pattern(self) -> BlockPattern:
+        """Which of all stations see points in common."""
+        return self.pixels.pattern
 
     def map(
         self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]

@@ -8,7 +8,7 @@ inverse problems").
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ _MODES = 32
 """Soft modes at most: of a block of lines the tenth is known a hundred times as well as the first.
 """
 _MODES_TOLERANCE = 1e-4
+_ROWS = 10_000
+"""Points whose motions are worked on at a time: in double precision they take much memory."""
 _LEAST_MODE = 1e-13
 """Variance of a mode over that of the softest, above rounding: where two parts of a model hardly
 hang together, one mode is kilometres large and others are millimetres."""
@@ -82,6 +84,11 @@ class SoftModes:
         count = self.stations.shape[2]
         return np.repeat([1.0, 0.0], [count - self.joints, self.joints])
 
+    def of_points(self, rows: Indices) -> Self:
+        """The same of some of the points, (P',), in that order."""
+        groups = self.groups and replace(self.groups, point=self.groups.point[rows])
+        return replace(self, points=self.points[rows], groups=groups)
+
     def moved(
         self, sizes: Array, centres: Array, points: Array, rows: Indices | slice
     ) -> tuple[Rotation, Array, Array]:
@@ -98,7 +105,7 @@ class SoftModes:
         soft = sizes * self.known
         step = self.stations @ soft
         turns, centres = Rotation.from_rotvec(step[:, :3]), centres + step[:, 3:]
-        points = points + self.points[rows] @ soft
+        points = points + np.einsum("nik,k->ni", self.points[rows], soft)
         if self.groups is None:
             return turns, centres, points
         motions = sizes[-self.joints :].reshape(len(self.groups.middles) - 1, -1)
@@ -214,37 +221,72 @@ def soft_modes(
     start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
     values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
     kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
-    shape, rigs, rigid = [], [], gauge.of_points(points, group)
-    places = np.empty((*points.shape, len(kept)), np.float32)
-    nearest = None if calibration is None else calibration.nearest(points, group)
-    for n, k in enumerate(kept.tolist()):
+    owns, shape, rigs, wholes = [], [], [], []
+    for k in kept.tolist():
         own, step, rig = moved(vectors[:, k].reshape(stations, width))
-        place = equations.follow(own, np.zeros(1))
-        if calibration is not None:
-            place = place + calibration.points[nearest] @ rig
-        whole = gauge.motion_in(step)
-        size_of = np.sqrt(values[k])
-        shape.append((step - gauge.motions @ whole) / size_of)
-        places[..., n] = (place - rigid @ whole) / size_of
-        rigs.append(rig / size_of)
+        whole, sigma = gauge.motion_in(step), np.sqrt(values[k])
+        owns.append(own / sigma)
+        wholes.append(whole / sigma)
+        shape.append((step - gauge.motions @ whole) / sigma)
+        rigs.append(rig / sigma)
     soft = SoftModes(
         stations=np.stack(shape, axis=-1),
-        points=places,
+        points=_of_points(
+            equations, gauge, calibration, points, group,
+            (np.stack(owns, axis=-1), np.stack(rigs, axis=-1), np.stack(wholes, axis=-1)),
+        ),
         calibration=np.stack(rigs, axis=-1),
-    )
+    )  # fmt: skip
     joints = gauge.motions.shape[2] - gauge.each
     if not joints:
         return soft
     return SoftModes(
         stations=np.concatenate([soft.stations, gauge.motions[..., -joints:]], axis=2),
-        points=np.concatenate([places, rigid[..., -joints:].astype(np.float32)], axis=2),
+        points=np.concatenate(
+            [soft.points, gauge.of_points(points, group)[..., -joints:].astype(np.float32)], axis=2
+        ),
         calibration=np.pad(soft.calibration, ((0, 0), (0, joints))),
         joints=joints,
         groups=Groups(station=gauge.group, point=group, middles=gauge.middles),
     )
 
 
+def _of_points(
+    equations: PointEquations,
+    gauge: Gauge,
+    calibration: Motions | None,
+    points: Array,
+    group: Indices,
+    by: tuple[Array, Array, Array],
+) -> NDArray[np.float32]:
+    """Motions (P, 3, K) of points by modes.
+
+    Args:
+        equations: as of `soft_modes`, and so are the gauge, the calibration, points and groups.
+        gauge: motions of whole groups.
+        calibration: what errors of the rig do.
+        points: (P, 3).
+        group: (P,).
+        by: of each mode what stations do in a fixed rig (F, 6, K), what the rig does (G, K), and
+            the motions of whole groups (N, K) in both, which do not count.
+    """
+    stations, rig, whole = by
+    found = np.empty((*points.shape, whole.shape[1]), np.float32)
+    nearest = None if calibration is None else calibration.nearest(points, group)
+    end = 0
+    for place in equations.follow_poses(stations):
+        rows = slice(end, end + len(place))
+        end = rows.stop
+        if calibration is not None and nearest is not None:
+            place = place + calibration.points[nearest[rows]] @ rig
+        found[rows] = place - gauge.of_points(points[rows], group[rows]) @ whole
+    return found
+
+
 def spread(motions: Array | NDArray[np.float32], covariance: Array) -> Array:
     """Covariances (N, k, k) of what moves by (N, k, G)."""
-    found: Array = motions @ covariance @ motions.swapaxes(1, 2)
+    found = np.empty((len(motions), motions.shape[1], motions.shape[1]))
+    for first in range(0, len(motions), _ROWS):
+        some = motions[first : first + _ROWS]
+        found[first : first + _ROWS] = some @ covariance @ some.swapaxes(1, 2)
     return found

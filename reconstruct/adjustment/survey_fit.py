@@ -319,7 +319,7 @@ class SurveyProblem:
         parts = Linearised(
             pixels=self.parts, state=guess.state, fields=fields, noise=(sigma, variance)
         )
-        found = reduce_parts(parts, self.parts.pattern)
+        found = reduce_parts(parts)
         found.free[self.held] = False
         return found
 

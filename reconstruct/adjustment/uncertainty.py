@@ -23,25 +23,29 @@ from typing import Self
 import numpy as np
 import pycolmap
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.block_solver import product_of
 from alice_survey.base.contents import read_arrays, taken_from
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
+from camera_calib.camera import Camera
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.rig import Rig
+from reconstruct.adjustment.exact_observations import Pixels, RigState
 from reconstruct.adjustment.normal_equations import (
     POSE,
     Gauge,
-    LinearObservations,
+    LinearParts,
     PointEquations,
-    reduce_points,
+    reduce_parts,
 )
+from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
 from reconstruct.adjustment.soft_modes import Motions, SoftModes, no_modes, soft_modes, spread
 from reconstruct.mapping.arrays import (
     LEAST_POINTS,
     Indices,
-    Observed,
     frames_of,
     linked_groups,
     observed,
@@ -49,6 +53,7 @@ from reconstruct.mapping.arrays import (
 )
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
+from reconstruct.views.model_files import as_transform
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +105,7 @@ class Uncertainty:
             self, frame_cov=both @ self.frame_cov @ both.T, point_cov=places, point_noise=noise,
             modes=replace(
                 self.modes, stations=both @ self.modes.stations,
-                points=scale * turn @ self.modes.points, groups=None,
+                points=(scale * turn).astype(np.float32) @ self.modes.points, groups=None,
             ),
         )  # fmt: skip
 
@@ -111,6 +116,7 @@ def estimate(
     calibration: Motions | None = None,
     *,
     held: bool = False,
+    workers: Workers = ALONE,
 ) -> Uncertainty:
     """Covariances of an adjusted model of ideal pinholes.
 
@@ -119,42 +125,44 @@ def estimate(
         records: pictures.
         calibration: what errors of the rig do; None where they are unknown.
         held: whether the rig stays as it is, so that no mode may move it.
+        workers: where parts of a large survey are worked on.
 
     Raises:
         ReconstructionError: the model is too small to determine its covariance.
     """
-    model = mapped.model
-    seen = observed(model)
-    frames = frames_of(model)
-    linear, order = pinhole_observations(model, seen, frames)
+    frames = frames_of(mapped.model)
+    pixels, state, point_ids, first = pinhole_survey(mapped.model, frames)
     scale_free = not np.isfinite(mapped.baseline)
-    spare = 2 * len(order) - 3 * len(seen.point_ids) - POSE * len(frames) + 6 + int(scale_free)
+    count = len(pixels.station)
+    spare = 2 * count - 3 * pixels.points - POSE * len(frames) + 6 + int(scale_free)
     if spare < 1 or len(frames) < 2:
         raise ReconstructionError(
-            f"{len(order)} observations of {len(seen.point_ids)} points from {len(frames)} "
+            f"{count} observations of {pixels.points} points from {len(frames)} "
             "stations do not determine how well they are known"
         )
-    left = spare / (2 * len(order))
-    sigma = sigma_of(linear.miss, linear.seen_by, len(frames))
-    weights = cauchy_weights(linear.miss, sigma)
-    variance = variance_of(linear.miss, weights, left)
-    centres = rig_poses(model, frames).inv().translation
-    linear = linear.weighted(weights / variance)
+    pixels, order = pixels.by_place(state.centres)
+    state = replace(state, points=state.points[order])
+    parts = PixelParts(pixels, len(frames), workers)
+    miss = np.nan_to_num(parts.misses(state), nan=0.0)
+    sigma = sigma_of(miss, pixels.seen_by, len(frames))
+    weights = cauchy_weights(miss, sigma)
+    variance = variance_of(miss, weights, spare / (2 * count))
+    linear = Linearised(pixels=parts, state=state, fields=(), noise=(sigma, variance))
     shape = shape_of_block(
-        linear, centres, seen.points, calibration,
+        linear, pixels, state.centres, state.points, calibration,
         scale_free=scale_free, held=held,
     )  # fmt: skip
-    first = _first_pictures(model, seen, frames)
+    back = np.argsort(order)
     return Uncertainty(
         frames=frames,
         stations=np.array([records[n - 1].station for n in first], dtype=np.int64),
         images=tuple(records[n - 1].image for n in first),
         frame_cov=shape.stations,
-        point_ids=seen.point_ids,
-        point_cov=shape.points,
-        point_noise=shape.noise,
+        point_ids=point_ids,
+        point_cov=shape.points[back],
+        point_noise=shape.noise[back],
         sigma_px=float(np.sqrt(variance / weights.mean())),
-        modes=shape.modes,
+        modes=shape.modes.of_points(back),
     )
 
 
@@ -186,7 +194,8 @@ class BlockShape:
 
 
 def shape_of_block(
-    linear: LinearObservations,
+    linear: LinearParts,
+    pixels: Pixels,
     centres: Array,
     points: Array,
     calibration: Motions | None,
@@ -198,6 +207,7 @@ def shape_of_block(
 
     Args:
         linear: observations in their sigmas; nothing is shared.
+        pixels: the same.
         centres: (F, 3) of the stations.
         points: (P, 3).
         calibration: what errors of the rig do; None where they are unknown.
@@ -205,11 +215,11 @@ def shape_of_block(
         held: whether the rig stays as it is, so that no mode may move it.
     """
     count = len(centres)
-    group = linked_groups(linear.station, linear.point, count)
-    group_of_point = np.maximum.reduceat(group[linear.station], linear.starts[:-1])
-    gauge = Gauge(centres, float(np.median(np.linalg.norm(linear.arm, axis=1))), scale_free, group)
-    loose = np.bincount(linear.station, minlength=count) < LEAST_POINTS
-    equations = replace(reduce_points(linear, count), free=~(gauge.held | loose[:, None]))
+    group = linked_groups(pixels.station, pixels.point, count)
+    group_of_point = np.maximum.reduceat(group[pixels.station], pixels.starts[:-1])
+    gauge = Gauge(centres, _usual_reach(pixels, centres, points), scale_free, group)
+    loose = np.bincount(pixels.station, minlength=count) < LEAST_POINTS
+    equations = replace(reduce_parts(linear), free=~(gauge.held | loose[:, None]))
     blocks = gauge.shape_blocks(equations)
     blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
     of_points = equations.point_covariances(blocks)
@@ -231,6 +241,16 @@ def shape_of_block(
         equations=equations,
         calibration=calibration,
     )
+
+
+def _usual_reach(pixels: Pixels, centres: Array, points: Array) -> float:
+    """Median distance from the stations to the points that they see."""
+    reach = np.empty(len(pixels.station))
+    for first, end in pixels.parts():
+        rows = slice(pixels.starts[first], pixels.starts[end])
+        arm = points[pixels.point[rows]] - centres[pixels.station[rows]]
+        reach[rows] = np.linalg.norm(arm, axis=1)
+    return float(np.median(reach))
 
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
@@ -272,47 +292,64 @@ def read_uncertainty(path: Path) -> Uncertainty:
         )
 
 
-def pinhole_observations(
-    model: pycolmap.Reconstruction, seen: Observed, frames: Indices
-) -> tuple[LinearObservations, Indices]:
-    """The observations of a model of pinholes, linearised.
+def pinhole_survey(
+    model: pycolmap.Reconstruction, frames: Indices
+) -> tuple[Pixels, RigState, Indices, list[int]]:
+    """A model of pinholes as a survey.
 
     Returns:
-        Observations sorted by point, and which of `seen` they are.
+        Its observations, its state, the ids (P,) of its points, and for every frame the picture of
+        the reference camera, or else its first.
     """
-    points, local, pixels = seen.points, seen.in_cameras, seen.pixels
-    order = np.argsort(seen.point, kind="stable")
-    place = np.argsort(order)
-    station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
-    rest = np.empty((len(order), 2, 1))
-    centres = rig_poses(model, frames).inv().translation
-    for n, number in enumerate(seen.pictures.tolist()):
-        image, rows = model.images[number], seen.of(n)
-        fx, fy, cx, cy = image.camera.params
-        x, y, z = local[rows].T
-        zero = np.zeros_like(z)
-        slopes = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=-1)
-        turn = image.cam_from_world().matrix()[:, :3]
-        to = place[rows]
-        by_point[to] = slopes.reshape(-1, 2, 3) @ turn
-        rest[to, :, 0] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
-        station[to] = np.searchsorted(frames, image.frame_id)
-    counts = np.bincount(seen.point, minlength=len(points))
-    linear = LinearObservations(
-        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        station=station,
-        by_point=by_point,
-        arm=points[seen.point[order]] - centres[station],
-        rest=rest,
+    seen = observed(model)
+    images = [model.images[number] for number in seen.pictures.tolist()]
+    counts, order = np.diff(seen.starts), np.argsort(seen.point, kind="stable")
+    numbers = sorted({image.camera_id for image in images})
+    station = np.searchsorted(frames, [image.frame_id for image in images])
+    camera = np.searchsorted(numbers, [image.camera_id for image in images])
+    by_point = np.bincount(seen.point, minlength=len(seen.point_ids))
+    pixels = Pixels(
+        starts=np.concatenate([[0], np.cumsum(by_point)]).astype(np.int64),
+        station=np.repeat(station, counts)[order],
+        camera=np.repeat(camera, counts)[order],
+        taken=seen.pixels[order],
+        point=seen.point[order],
     )
-    return linear, order.astype(np.int64)
+    poses = rig_poses(model, frames).inv()
+    state = RigState(
+        rig=_pinhole_rig(model, numbers),
+        turns=poses.rotation.as_matrix(),
+        centres=poses.translation,
+        points=seen.points,
+    )
+    return pixels, state, seen.point_ids, _first_pictures(images, frames)
 
 
-def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indices) -> list[int]:
+def _pinhole_rig(model: pycolmap.Reconstruction, numbers: Sequence[int]) -> Rig:
+    """Cameras by their numbers, each where it is on its own rig."""
+    where = {
+        sensor.id: as_transform(pose)
+        for rig in model.rigs.values()
+        for sensor, pose in rig.non_ref_sensors.items()
+    }
+    cameras = {}
+    for number in numbers:
+        camera = model.cameras[number]
+        fx, fy, cx, cy = camera.params
+        lens = OpenCVLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
+        cameras[str(number)] = Camera(width_px=camera.width, height_px=camera.height, lens=lens)
+    return Rig(
+        cameras=cameras,
+        cam_from_rig={str(n): where.get(n, RigidTransform.identity()) for n in numbers},
+        body_from_rig=None,
+        source="pinholes of a model",
+    )
+
+
+def _first_pictures(images: Sequence[pycolmap.Image], frames: Indices) -> list[int]:
     """The picture of the reference camera of every frame, else its first."""
     chosen: dict[int, tuple[bool, int]] = {}
-    for number in seen.pictures.tolist():
-        image = model.images[number]
-        rank = (not image.is_ref_in_frame(), number)
+    for image in images:
+        rank = (not image.is_ref_in_frame(), int(image.image_id))
         chosen[image.frame_id] = min(rank, chosen.get(image.frame_id, rank))
     return [chosen[int(f)][1] for f in frames]

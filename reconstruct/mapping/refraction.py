@@ -19,13 +19,13 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observed
 from reconstruct.mapping.bundle import FULLY, ROUGHLY, all_pictures, held_options
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import loss_scale, pixel_sigma
 from reconstruct.mapping.spread_points import move_points, spread_part, take_poses
+from reconstruct.views.model_files import stored_of
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""
@@ -60,50 +60,35 @@ class Convergence:
     """Whether the last shift was negligible."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Picture:
-    """Keypoints of one picture, and their rays in water."""
-
-    warp: PinholeWarp
-    warped: Array
-    """(N, 2) keypoints as warped."""
-    slope: Array
-    """(N, 2) slopes, and (N, 2) offsets from the pinhole's centre; see `PinholeWarp.lines`."""
-    offset: Array
-
-    def ideal(self, at: Indices, depth_m: Array) -> Array:
-        """Where the pinhole sees the spots of some keypoints, (M, 2), from their depths (M,)."""
-        working = self.warp.working_depth_m
-        metres = np.clip(depth_m, _NEAREST * working, _FARTHEST * working)
-        ideal = self.warp.pinhole.pixels(self.slope[at] + self.offset[at] / metres[:, None])
-        return np.where(np.isfinite(ideal), ideal, self.warped[at])
-
-
 class Keypoints:
-    """The keypoints of a model as warped, and their exact places for the model's depths."""
+    """The keypoints of a model, whose exact places follow from the model's depths.
+
+    Rays are traced through the ports where they are needed: kept, they take twice the memory of
+    the keypoints.
+    """
 
     def __init__(self, mapped: Mapped, seen: Observations) -> None:
-        """Trace every keypoint through its port, once.
+        """Take a model and its keypoints.
 
         Args:
             mapped: picture i of `seen` has the id i + 1 and its keypoints in the same order.
             seen: keypoints.
         """
-        self._pictures = {
-            number: _picture(mapped.warps[seen.images[number - 1].camera], seen, number - 1)
+        self._seen = seen
+        self._warps = {
+            number: mapped.warps[seen.images[number - 1].camera]
             for number, image in sorted(mapped.model.images.items())
             if image.has_pose
         }
-        self._now = {number: p.warped.copy() for number, p in self._pictures.items()}
 
     @property
     def shifted(self) -> bool:
         """Whether distance moves any keypoint; not so for a pinhole calibrated in water."""
-        return any(p.warp.largest_offset_m > 0 for p in self._pictures.values())
+        return any(warp.largest_offset_m > 0 for warp in self._warps.values())
 
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""
-        working = [p.warp.working_depth_m for p in self._pictures.values()]
+        working = [warp.working_depth_m for warp in self._warps.values()]
         return float(np.median(working) / np.median(observed(model).in_cameras[:, 2]))
 
     def correct(
@@ -122,13 +107,13 @@ class Keypoints:
         seen = observed(model)
         depths = metres_per_unit * seen.in_cameras[:, 2]
         for n, number in enumerate(seen.pictures.tolist()):
-            picture, rows = self._pictures[number], seen.of(n)
+            rows = seen.of(n)
             at = seen.keypoint[rows]
             if not len(at):
                 continue
-            ideal = picture.ideal(at, depths[rows])
-            largest = max(largest, self._put(model, number, at, ideal))
-            squares += float(((ideal - picture.warped[at]) ** 2).sum())
+            ideal = self._ideal(number, at, depths[rows])
+            largest = max(largest, _put(model, number, at, seen.pixels[rows], ideal))
+            squares += float(((ideal - self._seen.pixels[number - 1][at]) ** 2).sum())
             count += len(at)
         return largest, float(np.sqrt(squares / count)) if count else 0.0
 
@@ -137,24 +122,35 @@ class Keypoints:
         from scipy.spatial import KDTree
 
         seen = observed(model)
-        depths = metres_per_unit * seen.in_cameras[:, 2]
+        depths, stored = metres_per_unit * seen.in_cameras[:, 2], stored_of(model).keypoints
         for n, number in enumerate(seen.pictures.tolist()):
-            picture, rows = self._pictures[number], seen.of(n)
+            rows, warped = seen.of(n), self._seen.pixels[number - 1]
             at = seen.keypoint[rows]
-            rest = np.setdiff1d(np.arange(len(picture.warped)), at)
+            rest = np.setdiff1d(np.arange(len(warped)), at)
             if not (len(at) and len(rest)):
                 continue
-            _, nearest = KDTree(picture.warped[at]).query(picture.warped[rest])
-            self._put(model, number, rest, picture.ideal(rest, depths[rows][nearest]))
+            _, nearest = KDTree(warped[at]).query(warped[rest])
+            ideal = self._ideal(number, rest, depths[rows][nearest])
+            _put(model, number, rest, stored[number]["xy"][rest], ideal)
 
-    def _put(self, model: pycolmap.Reconstruction, number: int, at: Indices, ideal: Array) -> float:
-        now, points = self._now[number], model.images[number].points2D
-        moved = np.linalg.norm(ideal - now[at], axis=1)
-        far = np.flatnonzero(moved > _UNMOVED_PX)
-        now[at[far]] = ideal[far]
-        for i, xy in zip(at[far].tolist(), ideal[far], strict=True):
-            points[i].xy = xy
-        return float(moved.max())
+    def _ideal(self, number: int, at: Indices, depth_m: Array) -> Array:
+        """Where a picture's pinhole sees the spots of some keypoints, (M, 2), from depths (M,)."""
+        warp, working = self._warps[number], self._warps[number].working_depth_m
+        metres = np.clip(depth_m, _NEAREST * working, _FARTHEST * working)
+        slope, offset = warp.lines(self._seen.taken[number - 1][at])
+        ideal = warp.pinhole.pixels(slope + offset / metres[:, None])
+        return np.where(np.isfinite(ideal), ideal, self._seen.pixels[number - 1][at])
+
+
+def _put(
+    model: pycolmap.Reconstruction, number: int, at: Indices, now: Array, ideal: Array
+) -> float:
+    """Put some keypoints of a picture, now at (M, 2), in their places; the farthest move."""
+    points, moved = model.images[number].points2D, np.linalg.norm(ideal - now, axis=1)
+    far = np.flatnonzero(moved > _UNMOVED_PX)
+    for i, xy in zip(at[far].tolist(), ideal[far], strict=True):
+        points[i].xy = xy
+    return float(moved.max())
 
 
 @progress.step("make refraction exact")
@@ -330,8 +326,3 @@ def _judge_again(
 def _wrong_px(model: pycolmap.Reconstruction) -> float:
     """Size of the miss from which an observation is wrong."""
     return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _LEAST_WRONG_PX, _MOST_WRONG_PX))
-
-
-def _picture(warp: PinholeWarp, seen: Observations, index: int) -> _Picture:
-    slope, offset = warp.lines(seen.taken[index])
-    return _Picture(warp=warp, warped=seen.pixels[index], slope=slope, offset=offset)

@@ -14,7 +14,11 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.block_solver import inverse_of, product_of
 from alice_survey.base.frames import Array
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
-from reconstruct.adjustment.normal_equations import LinearObservations, reduce_points
+from reconstruct.adjustment.normal_equations import (
+    LinearObservations,
+    OnePart,
+    reduce_points,
+)
 from reconstruct.adjustment.soft_modes import Motions
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
 from reconstruct.adjustment.uncertainty import BlockShape, shape_of_block
@@ -96,8 +100,9 @@ def predict(
         rest=np.ascontiguousarray(linear.rest[..., -1:]),
     )  # fmt: skip
     shape = shape_of_block(
-        bare, state.centres, state.points, motions, scale_free=len(rig.cameras) < 2
-    )
+        OnePart(linear=bare, stations=[np.arange(len(state.centres))]), block.pixels,
+        state.centres, state.points, motions, scale_free=len(rig.cameras) < 2,
+    )  # fmt: skip
     joint, middle = _placed(block, shape, navigation, control, control_sigma_m)
     return _precision(block, shape, joint, middle)
 

@@ -263,7 +263,7 @@ def test_parts_say_of_stations_and_points_what_all_observations_say(
     def equations(pixels: Pixels, state: RigState) -> PointEquations:
         parts = PixelParts(pixels, len(state.centres))
         linear = Linearised(pixels=parts, state=state, fields=fields, noise=(0.3, 0.09))
-        return reduce_parts(linear, parts.pattern)
+        return reduce_parts(linear)
 
     parts = equations(near, moved)
     assert len(parts.parts.stations) == 5

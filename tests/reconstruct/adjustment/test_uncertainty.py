@@ -1,5 +1,6 @@
 """Stated covariances against what many draws of noise show, and against dense algebra."""
 
+import tracemalloc
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,25 +12,31 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.block_solver import BlockStep
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from benchmarks.block_size import block
 from camera_calib.rig import Covariance, Rig
+from reconstruct.adjustment import exact_observations
+from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import (
     Gauge,
     LinearObservations,
     reduce_points,
 )
+from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
 from reconstruct.adjustment.soft_modes import Motions
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
     estimate,
-    pinhole_observations,
+    pinhole_survey,
     read_uncertainty,
+    shape_of_block,
     write_uncertainty,
 )
-from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.arrays import frames_of, observed
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
+from tests.engines import PicklingThreads
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, true_stations, warped_scene
@@ -97,6 +104,64 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved.ravel(), wanted, atol=1e-9)
 
 
+def test_parts_of_a_large_survey_know_what_the_whole_knows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapped, _ = points_with(noisy().rig, tmp_path)
+    records, part = noisy().records, part_of(mapped, warped_scene(noisy())[0], noisy().rig)
+    count = mapped.model.compute_num_observations()
+    whole = estimate(mapped, records, part)
+    monkeypatch.setattr(exact_observations, "PART", -(-count // 6))
+    parts = estimate(mapped, records, part)
+    for found, wanted in (
+        (parts.frame_cov, whole.frame_cov),
+        (parts.point_cov, whole.point_cov),
+        (parts.point_noise, whole.point_noise),
+        (np.array(parts.sigma_px), np.array(whole.sigma_px)),
+    ):
+        size = np.abs(wanted).max(axis=0)
+        np.testing.assert_allclose(found / size, wanted / size, rtol=1e-9, atol=1e-9)
+    for found, wanted in (
+        (parts.modes.stations, whole.modes.stations),
+        (parts.modes.points, whole.modes.points),
+        (parts.modes.calibration, whole.modes.calibration),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5 * np.abs(wanted).max())
+    for workers in (1, 3):
+        with PicklingThreads(workers) as engine:
+            given = Workers(executor=engine.executor, folder=tmp_path / f"{workers}")
+            again = estimate(mapped, records, part, workers=given)
+        assert engine.tasks >= 5 * 6
+        np.testing.assert_array_equal(again.frame_cov, parts.frame_cov)
+        np.testing.assert_array_equal(again.point_cov, parts.point_cov)
+        np.testing.assert_array_equal(again.modes.points, parts.modes.points)
+
+
+def test_memory_hardly_grows_with_the_observations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is what a part takes, and what is found of the points."""
+
+    def peak(points: int, part: int) -> tuple[int, int]:
+        monkeypatch.setattr(exact_observations, "PART", part)
+        survey = block(calibrated().rig, 60, points)
+        pixels, order = survey.pixels.by_place(survey.truth.centres)
+        state = replace(survey.truth, points=survey.truth.points[order])
+        tracemalloc.start()
+        linear = Linearised(
+            pixels=PixelParts(pixels, 60), state=state, fields=(), noise=(0.1, 0.01)
+        )
+        found = shape_of_block(linear, pixels, state.centres, state.points, None, scale_free=False)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        kept = sum(a.nbytes for a in (found.points, found.noise, found.modes.points))
+        return len(pixels.station), most - kept
+
+    (few, small), (many, large) = (peak(points, 4_000) for points in (300, 1200))
+    assert many > 3.5 * few > 14 * 4_000
+    assert abs(large - small) / (many - few) < 20  # bytes
+    _, whole = peak(1200, many)
+    assert (whole - small) / (many - few) > 300
+
+
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     scene, mapped = drawn(2, tmp_path)
     found = estimate(mapped, scene.records)
@@ -144,8 +209,8 @@ def _points_of(mapped: Mapped, number: int) -> list[int]:
 
 
 def _observations(mapped: Mapped) -> LinearObservations:
-    frames = np.array(sorted(mapped.model.frames), dtype=np.int64)
-    return pinhole_observations(mapped.model, observed(mapped.model), frames)[0]
+    pixels, state, *_ = pinhole_survey(mapped.model, frames_of(mapped.model))
+    return linearised(state, pixels, ())
 
 
 def _depth(mapped: Mapped) -> float:
