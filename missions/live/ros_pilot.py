@@ -5,6 +5,7 @@ it ticks by `/clock`, as fast as that runs.
 """
 
 import json
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,8 @@ from missions.logs.ros_builder import CLOCK, JOINTS, ODOMETRY, RANGE, STRING, WR
 _WAIT_S = 0.1
 _FAREWELLS = 3
 """Commands of no thrust when the node ends."""
+_SILENCE_S = 60.0
+"""With simulated time nothing ticks without a clock: it ends after so long without one."""
 _STATE_TICKS = 20
 """The state is published every so many ticks, and whenever it changes."""
 
@@ -54,7 +57,7 @@ def pilot_over_ros(mission: Mission, topics: Topics, *, sim_time: bool) -> None:
         sim_time: tick by `/clock`.
 
     Raises:
-        VehicleError: ROS 2 is not installed.
+        VehicleError: ROS 2 is not installed, a topic cannot have its name, or `/clock` stood still.
     """
     ros = load_ros()
     from rclpy.signals import SignalHandlerOptions
@@ -65,6 +68,11 @@ def pilot_over_ros(mission: Mission, topics: Topics, *, sim_time: bool) -> None:
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)
+                if sim_time and time.monotonic() - node.ticked > _SILENCE_S:
+                    raise VehicleError(
+                        f"/clock stood still for {_SILENCE_S:g} s: start the simulator first, or "
+                        "fly without --sim-time"
+                    )
         finally:
             node.farewell()
             node.node.destroy_node()
@@ -87,6 +95,8 @@ class _PilotNode:
         kind, node, qos = message_class, self.node, ros.qos
         self._shown: tuple[LinkState, str] | None = None
         self._clock_s = 0.0
+        self.ticked = time.monotonic()
+        """Wall time of the latest tick."""
         self._sim_time = sim_time
         try:
             self.wrench = node.create_publisher(kind(WRENCH), topics.wrench, qos)
@@ -145,6 +155,7 @@ class _PilotNode:
         self._tick()
 
     def _tick(self) -> None:
+        self.ticked = time.monotonic()
         self._publish(self.mission.tick(self.now_s))
 
     def _publish(self, command: Command) -> None:

@@ -85,7 +85,7 @@ def vehicle_over_ros(
 
     ros.rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = _VehicleNode(ros, vehicle, takes, rng)
+        node = VehicleNode(ros, vehicle, takes, rng)
         try:
             why = node.run(pace)
         except KeyboardInterrupt:
@@ -99,7 +99,9 @@ def vehicle_over_ros(
     return Trajectory(time_s=rows[:, 0], ned_from_body=poses), why
 
 
-class _VehicleNode:
+class VehicleNode:
+    """A simulated vehicle and its topics."""
+
     def __init__(
         self,
         ros: RosLibrary,
@@ -131,7 +133,7 @@ class _VehicleNode:
         if takes == "thrusters":
             topic, kind, take = "thrusters/command", message_class(JOINTS), self._on_speeds
         else:
-            topic, kind, take = "pilot/wrench", message_class(WRENCH), self._on_wrench
+            topic, kind, take = "pilot/wrench", message_class(WRENCH), self.on_wrench
         self.commands = self.node.create_subscription(kind, topic, take, ros.qos)
 
     @property
@@ -147,7 +149,7 @@ class _VehicleNode:
             self.track.append([self.now_s, *self.vehicle.world.now[:7].tolist()])
             if self.vehicle.touches_floor:
                 return "the hull touched the sea floor"
-            readings = self._readings(estimate)
+            readings = self.readings(estimate)
             self._publish(readings)
             if pace.rate == 0.0:
                 if not self._answered(readings, pace.patience_s):
@@ -156,7 +158,7 @@ class _VehicleNode:
                 due = begun + (self.vehicle.tick + 1) * TICK_S / pace.rate
                 late += time.monotonic() > due
                 self._spin_until(due)
-            self.vehicle.move(self._speeds())
+            self.vehicle.move(self.speeds())
         if late > 0.01 * self.vehicle.tick:
             warn(
                 f"{late} of {self.vehicle.tick} ticks were late: the machine does not keep the "
@@ -191,7 +193,7 @@ class _VehicleNode:
         while (left := due - time.monotonic()) > 0.0:
             self.ros.rclpy.spin_once(self.node, timeout_sec=left)
 
-    def _speeds(self) -> Array:
+    def speeds(self) -> Array:
         """Thruster speeds to follow, (n,) rev/s."""
         if self.command is None or self.now_s - self.command[0] > _KEPT_S:
             return np.zeros(len(self.thrusters))
@@ -202,7 +204,8 @@ class _VehicleNode:
         if np.all(np.isfinite(speeds)):
             self.command = (seconds(message.header.stamp), speeds)
 
-    def _on_wrench(self, message: Any) -> None:
+    def on_wrench(self, message: Any) -> None:
+        """Follow a wrench from its stamp on."""
         wrench = wrench_from(message)
         if np.all(np.isfinite(wrench)):
             allocate(wrench, self.vehicle.world.estimate, self.allocation)
@@ -213,7 +216,7 @@ class _VehicleNode:
         for publisher, message in readings:
             publisher.publish(message)
 
-    def _readings(self, estimate: Array) -> list[tuple[Any, Any]]:
+    def readings(self, estimate: Array) -> list[tuple[Any, Any]]:
         """What is published at this tick, the clock last."""
         build, frames, now_s = self.ros.build, self.frames, self.now_s
         stamp_ns = nanoseconds(now_s)

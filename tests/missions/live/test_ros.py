@@ -30,10 +30,10 @@ from missions.live import ros_messages
 from missions.live.loop import LinkLimits, Odometry
 from missions.live.mission import mission_of
 from missions.live.ros_pilot import Topics, pilot_over_ros
-from missions.live.ros_vehicle import START_S
+from missions.live.ros_vehicle import START_S, VehicleNode
 from missions.logs.ros_builder import JOINTS, ODOMETRY, WRENCH
 from missions.values.flight import trigger_times
-from tests.missions.live.flights import small_plan
+from tests.missions.live.flights import FLOOR_M, small_plan, vehicle_afloat
 
 rclpy = pytest.importorskip(
     "rclpy", reason="ROS 2 is not installed: pip install 'alice-survey[ros]'"
@@ -125,6 +125,83 @@ def test_ranges_out_of_bounds_are_no_echo() -> None:
         assert ros_messages.range_from(message) == expected
     message.range, message.max_range = 80.0, 75.0
     assert ros_messages.range_from(message) == math.inf
+
+
+# ------------------------------------------------------------------ the simulated vehicle
+
+
+@pytest.fixture
+def afloat(monkeypatch: pytest.MonkeyPatch) -> Iterator[VehicleNode]:
+    """The vehicle's node, in this process, that follows wrenches."""
+    for name, value in DOMAIN.items():
+        monkeypatch.setenv(name, value)
+    ros = ros_messages.load_ros()
+    still = {"current_mps": 0.0, "current_sigma_mps": 0.0, "gust_n": (0.0, 0.0, 0.0)}
+    calm = SurveyConfig.model_validate({"sea": still})
+    vehicle = vehicle_afloat(small_plan(), calm)
+    ros.rclpy.init(args=[])
+    node = VehicleNode(ros, vehicle, "wrench", np.random.default_rng(3))
+    yield node
+    node.node.destroy_node()
+    ros.rclpy.try_shutdown()
+
+
+def test_wrench_moves_the_vehicle_the_way_it_points(afloat: VehicleNode) -> None:
+    """20 N ahead and 30 N down, in FLU, for 4 s; then nothing comes, and the thrusters stop."""
+    vehicle, build = afloat.vehicle, ros_messages.load_ros().build
+    began = vehicle.world.now[:3].copy()
+    pushed = np.array([20.0, 0.0, -30.0, 0.0, 0.0, 0.0])
+    for _ in range(80):
+        vehicle.sense()
+        stamp_ns = ros_messages.nanoseconds(afloat.now_s)
+        afloat.on_wrench(build.wrench(stamp_ns, "alice/base_link", pushed))
+        vehicle.move(afloat.speeds())
+    allocation = afloat.allocation
+    made = allocation.matrix @ allocation.thrust
+    np.testing.assert_allclose(made[[0, 1, 2, 5]], [20.0, 0.0, 30.0, 0.0], atol=1e-6)
+    turn = Rotation.from_quat(vehicle.world.now[3:7])
+    ahead, starboard, down = turn.inv().apply(vehicle.world.now[:3] - began)
+    assert ahead > 0.3
+    assert down > 0.3
+    assert abs(starboard) < 0.1 * ahead
+    for _ in range(9):
+        vehicle.move(afloat.speeds())
+        assert np.any(afloat.speeds())
+    vehicle.move(afloat.speeds())
+    vehicle.move(afloat.speeds())
+    assert not np.any(afloat.speeds())
+
+
+def test_sensors_measure_what_is_true(afloat: VehicleNode) -> None:
+    """At rest, turned: gravity, no velocity, the way straight down, and the true pose."""
+    vehicle = afloat.vehicle
+    for _ in range(40):
+        vehicle.sense()
+        vehicle.move(np.zeros(5))
+    heard: dict[str, Any] = {}
+    for _ in range(4):
+        for publisher, message in afloat.readings(vehicle.sense()):
+            heard[publisher.topic_name] = message
+        vehicle.move(np.zeros(5))
+    truth, imu = heard["/alice/truth/odometry"], heard["/alice/imu"]
+    up = imu.linear_acceleration
+    assert math.hypot(up.x, up.y, up.z) == pytest.approx(9.81, abs=0.1)
+    assert up.z == pytest.approx(9.81, abs=0.1)
+    moving = heard["/alice/dvl"].twist.twist.linear
+    assert 0.0 < math.hypot(moving.x, moving.y) < 0.05
+    # From the DVL, 0.11 m below the origin, which floats near the surface.
+    depth = -truth.pose.pose.position.z
+    assert heard["/alice/altimeter"].range == pytest.approx(FLOOR_M - 0.11 - depth, abs=0.15)
+    true, believed = (
+        ros_messages.odometry_from(heard[f"/alice/{who}/odometry"])
+        for who in ("truth", "navigation")
+    )
+    np.testing.assert_allclose(true.position_ned, vehicle.world.now[:3], atol=0.02)
+    assert 0.0 < np.linalg.norm(true.position_ned - believed.position_ned) < 0.5
+    sigma = np.sqrt(np.diag(heard["/alice/navigation/odometry"].pose.covariance.reshape(6, 6)))
+    assert np.all((sigma > 0.0) & (sigma < 0.5))
+    clock = ros_messages.seconds(heard["/clock"].clock)
+    assert clock == pytest.approx(START_S + 0.05 * (vehicle.tick - 1), abs=1e-9)
 
 
 # ------------------------------------------------------------------ a dive
