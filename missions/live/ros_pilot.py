@@ -5,6 +5,7 @@ it ticks by `/clock`, as fast as that runs.
 """
 
 import json
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,19 +14,24 @@ from alice_survey.vehicle.simulated_vehicle import TICK_S
 from missions.live.loop import Command, LinkState
 from missions.live.mission import Mission
 from missions.live.ros_messages import (
-    Ros,
+    RosLibrary,
+    flipped_pair,
     load_ros,
+    message_class,
+    nanoseconds,
     odometry_from,
     range_from,
     seconds,
     speeds_from,
     speeds_message,
-    wrench_message,
 )
+from missions.logs.ros_builder import CLOCK, JOINTS, ODOMETRY, RANGE, STRING, WRENCH
 
 _WAIT_S = 0.1
 _FAREWELLS = 3
 """Commands of no thrust when the node ends."""
+_SILENCE_S = 60.0
+"""With simulated time nothing ticks without a clock: it ends after so long without one."""
 _STATE_TICKS = 20
 """The state is published every so many ticks, and whenever it changes."""
 
@@ -51,17 +57,22 @@ def pilot_over_ros(mission: Mission, topics: Topics, *, sim_time: bool) -> None:
         sim_time: tick by `/clock`.
 
     Raises:
-        VehicleError: ROS 2 is not installed.
+        VehicleError: ROS 2 is not installed, a topic cannot have its name, or `/clock` stood still.
     """
     ros = load_ros()
     from rclpy.signals import SignalHandlerOptions
 
     ros.rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = _Node(ros, mission, topics, sim_time)
+        node = _PilotNode(ros, mission, topics, sim_time)
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)
+                if sim_time and time.monotonic() - node.ticked > _SILENCE_S:
+                    raise VehicleError(
+                        f"/clock stood still for {_SILENCE_S:g} s: start the simulator first, or "
+                        "fly without --sim-time"
+                    )
         finally:
             node.farewell()
             node.node.destroy_node()
@@ -69,8 +80,8 @@ def pilot_over_ros(mission: Mission, topics: Topics, *, sim_time: bool) -> None:
         ros.rclpy.try_shutdown()
 
 
-class _Node:
-    def __init__(self, ros: Ros, mission: Mission, topics: Topics, sim_time: bool) -> None:
+class _PilotNode:
+    def __init__(self, ros: RosLibrary, mission: Mission, topics: Topics, sim_time: bool) -> None:
         from rclpy.clock import Clock, ClockType
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.parameter import Parameter
@@ -81,22 +92,24 @@ class _Node:
             namespace=mission.vehicle,
             parameter_overrides=[Parameter("use_sim_time", value=sim_time)],
         )
-        kinds, node, qos = ros.messages, self.node, ros.qos
+        kind, node, qos = message_class, self.node, ros.qos
         self._shown: tuple[LinkState, str] | None = None
         self._clock_s = 0.0
+        self.ticked = time.monotonic()
+        """Wall time of the latest tick."""
         self._sim_time = sim_time
         try:
-            self.wrench = node.create_publisher(kinds.Wrench, topics.wrench, qos)
-            self.command = node.create_publisher(kinds.JointState, topics.command, qos)
-            self.state = node.create_publisher(kinds.String, topics.state, qos)
+            self.wrench = node.create_publisher(kind(WRENCH), topics.wrench, qos)
+            self.command = node.create_publisher(kind(JOINTS), topics.command, qos)
+            self.state = node.create_publisher(kind(STRING), topics.state, qos)
             # Measurements before the clock, so that those of one instant come first.
-            node.create_subscription(kinds.Odometry, topics.odometry, self._on_odometry, qos)
-            node.create_subscription(kinds.Range, topics.altitude, self._on_range, qos)
-            node.create_subscription(kinds.JointState, topics.thrusters, self._on_thrusters, qos)
+            node.create_subscription(kind(ODOMETRY), topics.odometry, self._on_odometry, qos)
+            node.create_subscription(kind(RANGE), topics.altitude, self._on_range, qos)
+            node.create_subscription(kind(JOINTS), topics.thrusters, self._on_thrusters, qos)
         except InvalidTopicNameException as error:
             raise VehicleError(" ".join(str(error).split())) from None
         if sim_time:
-            node.create_subscription(kinds.Clock, "/clock", self._on_clock, qos)
+            node.create_subscription(kind(CLOCK), "/clock", self._on_clock, qos)
         else:
             node.create_timer(TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -142,18 +155,21 @@ class _Node:
         self._tick()
 
     def _tick(self) -> None:
+        self.ticked = time.monotonic()
         self._publish(self.mission.tick(self.now_s))
 
     def _publish(self, command: Command) -> None:
-        ros, mission = self.ros, self.mission
-        self.wrench.publish(wrench_message(ros, command.time_s, self.body, command.wrench))
+        mission = self.mission
+        build, time_s = self.ros.build, command.time_s
+        wrench = flipped_pair(command.wrench)
+        self.wrench.publish(build.wrench(nanoseconds(time_s), self.body, wrench))
         self.command.publish(
-            speeds_message(ros, command.time_s, mission.thrusters, command.rps, command.thrust_n)
+            speeds_message(build, time_s, mission.thrusters, command.rps, command.thrust_n)
         )
         shown = (command.state, mission.phase)
         if shown != self._shown or mission.loop.ticks % _STATE_TICKS == 0:
             self._shown = shown
-            self.state.publish(ros.messages.String(data=json.dumps(self._state_of(command))))
+            self.state.publish(build.make(STRING, data=json.dumps(self._state_of(command))))
 
     def _state_of(self, command: Command) -> dict[str, Any]:
         loop = self.mission.loop

@@ -27,18 +27,18 @@ from alice_survey.vehicle.pilot.command import allocate, new_allocation
 from alice_survey.vehicle.simulated_vehicle import TICK_S, SimulatedVehicle
 from missions.live.loop import Odometry
 from missions.live.ros_messages import (
-    Ros,
-    imu_message,
+    RosLibrary,
     load_ros,
+    message_class,
+    nanoseconds,
     odometry_message,
-    range_message,
     seconds,
     speeds_from,
     speeds_message,
-    stamp,
-    velocity_message,
     wrench_from,
 )
+from missions.logs.ros_builder import CLOCK, IMU, JOINTS, ODOMETRY, RANGE, TWIST, WRENCH
+from missions.logs.ros_frames import flipped_body, flipped_quaternion
 
 START_S = 1.0
 """The clock at the first tick: 0 would mean that it has not begun."""
@@ -86,7 +86,7 @@ def vehicle_over_ros(
 
     ros.rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = _Node(ros, vehicle, takes, rng)
+        node = VehicleNode(ros, vehicle, takes, rng)
         try:
             why = node.run(pace)
         except KeyboardInterrupt:
@@ -100,10 +100,12 @@ def vehicle_over_ros(
     return Trajectory(time_s=rows[:, 0], ned_from_body=poses), why
 
 
-class _Node:
+class VehicleNode:
+    """A simulated vehicle and its topics."""
+
     def __init__(
         self,
-        ros: Ros,
+        ros: RosLibrary,
         vehicle: SimulatedVehicle,
         takes: Literal["thrusters", "wrench"],
         rng: np.random.Generator,
@@ -120,18 +122,18 @@ class _Node:
         self.allocation = new_allocation(vehicle.vehicle, np.ones(count), exact=True, axes=axes)
         self.row = np.zeros(LOG_ROW)
         self.node = ros.rclpy.create_node("vehicle", namespace=name)
-        kinds, publisher = ros.messages, self.node.create_publisher
-        self.clock = publisher(kinds.Clock, "/clock", ros.qos)
-        self.navigation = publisher(kinds.Odometry, "navigation/odometry", ros.qos)
-        self.truth = publisher(kinds.Odometry, "truth/odometry", ros.qos)
-        self.altimeter = publisher(kinds.Range, "altimeter", ros.qos)
-        self.imu = publisher(kinds.Imu, "imu", ros.qos)
-        self.dvl = publisher(kinds.Twist, "dvl", ros.qos)
-        self.turning = publisher(kinds.JointState, "thrusters/state", ros.qos)
+        publisher = self.node.create_publisher
+        self.clock = publisher(message_class(CLOCK), "/clock", ros.qos)
+        self.navigation = publisher(message_class(ODOMETRY), "navigation/odometry", ros.qos)
+        self.truth = publisher(message_class(ODOMETRY), "truth/odometry", ros.qos)
+        self.altimeter = publisher(message_class(RANGE), "altimeter", ros.qos)
+        self.imu = publisher(message_class(IMU), "imu", ros.qos)
+        self.dvl = publisher(message_class(TWIST), "dvl", ros.qos)
+        self.turning = publisher(message_class(JOINTS), "thrusters/state", ros.qos)
         if takes == "thrusters":
-            topic, kind, take = "thrusters/command", kinds.JointState, self._on_speeds
+            topic, kind, take = "thrusters/command", message_class(JOINTS), self._on_speeds
         else:
-            topic, kind, take = "pilot/wrench", kinds.Wrench, self._on_wrench
+            topic, kind, take = "pilot/wrench", message_class(WRENCH), self.on_wrench
         self.commands = self.node.create_subscription(kind, topic, take, ros.qos)
 
     @property
@@ -147,7 +149,7 @@ class _Node:
             self.track.append([self.now_s, *self.vehicle.world.now[:7].tolist()])
             if self.vehicle.touches_floor:
                 return "the hull touched the sea floor"
-            readings = self._readings(estimate)
+            readings = self.readings(estimate)
             self._publish(readings)
             if pace.rate == 0.0:
                 if not self._answered(readings, pace.patience_s):
@@ -156,7 +158,7 @@ class _Node:
                 due = begun + (self.vehicle.tick + 1) * TICK_S / pace.rate
                 late += time.monotonic() > due
                 self._spin_until(due)
-            self.vehicle.move(self._speeds())
+            self.vehicle.move(self.speeds())
         if late > 0.01 * self.vehicle.tick:
             warn(
                 f"{late} of {self.vehicle.tick} ticks were late: the machine does not keep the "
@@ -191,7 +193,7 @@ class _Node:
         while (left := due - time.monotonic()) > 0.0:
             self.ros.rclpy.spin_once(self.node, timeout_sec=left)
 
-    def _speeds(self) -> Array:
+    def speeds(self) -> Array:
         """Thruster speeds to follow, (n,) rev/s."""
         if self.command is None or self.now_s - self.command[0] > _KEPT_S:
             return np.zeros(len(self.thrusters))
@@ -202,7 +204,8 @@ class _Node:
         if np.all(np.isfinite(speeds)):
             self.command = (seconds(message.header.stamp), speeds)
 
-    def _on_wrench(self, message: Any) -> None:
+    def on_wrench(self, message: Any) -> None:
+        """Follow a wrench from its stamp on."""
         wrench = wrench_from(message)
         if np.all(np.isfinite(wrench)):
             allocate(wrench, self.vehicle.world.estimate, self.allocation)
@@ -213,9 +216,10 @@ class _Node:
         for publisher, message in readings:
             publisher.publish(message)
 
-    def _readings(self, estimate: Array) -> list[tuple[Any, Any]]:
+    def readings(self, estimate: Array) -> list[tuple[Any, Any]]:
         """What is published at this tick, the clock last."""
-        ros, frames, now_s = self.ros, self.frames, self.now_s
+        build, frames, now_s = self.ros.build, self.frames, self.now_s
+        stamp_ns = nanoseconds(now_s)
         world, navigation = self.vehicle.world, self.vehicle.navigation
         log_row(navigation, self.row)
         north, east, depth, roll, pitch, heading = self.row[LOG_SIGMA : LOG_SIGMA + 6] ** 2
@@ -238,23 +242,23 @@ class _Node:
         base, readings = frames["base_link"], navigation.readings
         variances = np.array([east, north, depth, roll, pitch, heading])
         sent: list[tuple[Any, Any]] = [
-            (self.truth, odometry_message(ros, true, f"{base}_truth", _EXACT)),
-            (self.navigation, odometry_message(ros, navigated, base, variances)),
-            (self.turning, speeds_message(ros, now_s, self.thrusters, world.state[STATE:])),
+            (self.truth, odometry_message(build, true, f"{base}_truth", _EXACT)),
+            (self.navigation, odometry_message(build, navigated, base, variances)),
+            (self.turning, speeds_message(build, now_s, self.thrusters, world.state[STATE:])),
         ]
         if self.vehicle.tick > 0:
-            force = readings[PUSH : PUSH + 3] / TICK_S
-            rates = readings[RATES : RATES + 3]
-            sent.append((self.imu, imu_message(ros, now_s, frames["imu"], believed, rates, force)))
+            force = flipped_body(readings[PUSH : PUSH + 3] / TICK_S)
+            rates = flipped_body(readings[RATES : RATES + 3])
+            flu = flipped_quaternion(believed)
+            sent.append((self.imu, build.imu(stamp_ns, frames["imu"], flu, rates, force)))
         if self.vehicle.tick % self.vehicle.sensors.dvl_every == 0:
-            most_m = self.vehicle.sensors.dvl.most_range_m
             reach = self._altimeter_range(turn)
-            sent.append((self.altimeter, range_message(ros, now_s, frames["dvl"], reach, most_m)))
+            sent.append((self.altimeter, build.range(stamp_ns, frames["dvl"], reach)))
             velocity = readings[DVL_VELOCITY : DVL_VELOCITY + 3]
             if np.all(np.isfinite(velocity)) and readings[DVL_TIME] == self.vehicle.tick * TICK_S:
-                sent.append((self.dvl, velocity_message(ros, now_s, frames["dvl"], velocity)))
-        clock = ros.messages.Clock(clock=stamp(ros, now_s))
-        return [*sent, (self.clock, clock)]
+                velocity = flipped_body(velocity)
+                sent.append((self.dvl, build.velocity(stamp_ns, frames["dvl"], velocity)))
+        return [*sent, (self.clock, build.make(CLOCK, clock=build.stamp(stamp_ns)))]
 
     def _altimeter_range(self, turn: Rotation) -> float:
         """Range, m, of a beam straight down from the DVL's place; NaN is no echo."""

@@ -1,8 +1,7 @@
 """A flight as a ROS 2 bag (MCAP): what RViz, Foxglove, PlotJuggler and `ros2 bag` open.
 
 World `map` is ENU with its origin at the datum on the sea surface, the body is FLU (REP-103). Times
-are those of the flight: the same flight gives the same bytes. Definitions of the messages:
-ros2/common_interfaces, as shipped with rosbags (those of Humble, which later releases kept).
+are those of the flight: the same flight gives the same bytes.
 """
 
 import heapq
@@ -21,20 +20,18 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array, Datum
+from missions.logs.ros_builder import (
+    FIX,
+    JOINTS,
+    MAP,
+    NS_PER_S,
+    NUMBERS,
+    ODOMETRY,
+    RANGE,
+    TRANSFORMS,
+    MessageBuilder,
+)
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
-
-ODOMETRY = "nav_msgs/msg/Odometry"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-FIX = "sensor_msgs/msg/NavSatFix"
-RANGE = "sensor_msgs/msg/Range"
-JOINTS = "sensor_msgs/msg/JointState"
-NUMBERS = "std_msgs/msg/Float64MultiArray"
-
-MAP = "map"
-"""The world's frame: ENU, origin at the datum."""
-_NS_PER_S = 1_000_000_000
-_UNKNOWN, _DIAGONAL = 0, 2
-"""COVARIANCE_TYPE_UNKNOWN and _DIAGONAL_KNOWN of sensor_msgs/NavSatFix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,6 +93,7 @@ def write_bag(path: Path, record: BagRecord) -> None:
         WorkspaceError: the folder exists, or cannot be written.
     """
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
 
     if path.exists():
         raise WorkspaceError(f"{path} exists already: remove it or choose another name")
@@ -109,11 +107,10 @@ def write_bag(path: Path, record: BagRecord) -> None:
         with writer:
             for key, value in sorted(record.notes.items()):
                 writer.set_custom_data(key, value)
-            ros = _Ros()
-            topics = _topics(record, ros)
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            topics = _topics(record, MessageBuilder(store.types.__getitem__))
             connections = [
-                writer.add_connection(topic.name, topic.kind, typestore=ros.store)
-                for topic in topics
+                writer.add_connection(topic.name, topic.kind, typestore=store) for topic in topics
             ]
             ordered = heapq.merge(
                 *(
@@ -124,7 +121,7 @@ def write_bag(path: Path, record: BagRecord) -> None:
             total = sum(len(topic.stamps_ns) for topic in topics)
             for stamp, rank, row in progress(ordered, "bag", total):
                 topic = topics[rank]
-                data = ros.store.serialize_cdr(topic.message(stamp, row), topic.kind)
+                data = store.serialize_cdr(topic.message(stamp, row), topic.kind)
                 writer.write(connections[rank], stamp, data)
         os.replace(outer / path.name, path)  # noqa: PTH105 (a folder onto a free name)
     except OSError as error:
@@ -144,7 +141,7 @@ class _Topic:
     """Makes the message of a stamp and a row of the record."""
 
 
-def _topics(record: BagRecord, ros: "_Ros") -> list[_Topic]:
+def _topics(record: BagRecord, ros: MessageBuilder) -> list[_Topic]:
     """All topics of a record."""
     name, datum = record.name, record.datum
     body, true_body = f"{name}/base_link", f"{name}/base_link_truth"
@@ -223,136 +220,5 @@ def _in_ros(ned_from_body: RigidTransform, velocity_frd: Array) -> tuple[Array, 
 
 def _nanoseconds(time_s: Array) -> list[int]:
     """Times, (N,) seconds, as whole nanoseconds."""
-    stamps: list[int] = np.rint(time_s * _NS_PER_S).astype(np.int64).tolist()
+    stamps: list[int] = np.rint(time_s * NS_PER_S).astype(np.int64).tolist()
     return stamps
-
-
-class _Ros:
-    """Builds messages from numbers in ENU and FLU."""
-
-    def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self.store = get_typestore(Stores.ROS2_HUMBLE)
-
-    def _make(self, kind: str, **fields: Any) -> Any:
-        return self.store.types[kind](**fields)
-
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        sec, nanosec = divmod(stamp_ns, _NS_PER_S)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-    def _vector(self, xyz: Array, kind: str = "Vector3") -> Any:
-        x, y, z = (float(v) for v in xyz)
-        return self._make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
-
-    def _quaternion(self, xyzw: Array) -> Any:
-        x, y, z, w = (float(v) for v in xyzw)
-        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-    def odometry(
-        self,
-        stamp_ns: int,
-        child: str,
-        position_enu: Array,
-        enu_from_flu: Array,
-        pose_variances: Array,
-        velocity_flu: Array,
-    ) -> Any:
-        """A pose in the map and a velocity in the body, whose covariance is not known.
-
-        Args:
-            stamp_ns: of the header.
-            child: the body's frame.
-            position_enu: (3,).
-            enu_from_flu: (4,) quaternion xyzw.
-            pose_variances: (6,) of east, north, up, and of small turns about them.
-            velocity_flu: (6,).
-        """
-        pose = self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._vector(position_enu, "Point"),
-            orientation=self._quaternion(enu_from_flu),
-        )
-        twist = self._make(
-            "geometry_msgs/msg/Twist",
-            linear=self._vector(velocity_flu[:3]),
-            angular=self._vector(velocity_flu[3:]),
-        )
-        return self._make(
-            ODOMETRY,
-            header=self._header(stamp_ns, MAP),
-            child_frame_id=child,
-            pose=self._make(
-                "geometry_msgs/msg/PoseWithCovariance",
-                pose=pose,
-                covariance=np.diag(pose_variances).ravel(),
-            ),
-            twist=self._make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
-            ),
-        )
-
-    def transforms(self, stamp_ns: int, children: dict[str, tuple[Array, Array]]) -> Any:
-        """Transforms of bodies in the map: of each position ENU, (3,), and quaternion, (4,)."""
-        stamped = [
-            self._make(
-                "geometry_msgs/msg/TransformStamped",
-                header=self._header(stamp_ns, MAP),
-                child_frame_id=child,
-                transform=self._make(
-                    "geometry_msgs/msg/Transform",
-                    translation=self._vector(position),
-                    rotation=self._quaternion(quaternion),
-                ),
-            )
-            for child, (position, quaternion) in children.items()
-        ]
-        return self._make(TRANSFORMS, transforms=stamped)
-
-    def fix(self, stamp_ns: int, frame: str, geodetic: Array, variances_enu: Array | None) -> Any:
-        """Latitude, longitude (degrees) and height above the ellipsoid, (3,)."""
-        variances = np.zeros(3) if variances_enu is None else variances_enu
-        return self._make(
-            FIX,
-            header=self._header(stamp_ns, frame),
-            status=self._make("sensor_msgs/msg/NavSatStatus", status=0, service=1),
-            latitude=float(geodetic[0]),
-            longitude=float(geodetic[1]),
-            altitude=float(geodetic[2]),
-            position_covariance=np.diag(variances).ravel(),
-            position_covariance_type=_UNKNOWN if variances_enu is None else _DIAGONAL,
-        )
-
-    def range(self, stamp_ns: int, frame: str, range_m: float) -> Any:
-        """A range; one that is NaN is +inf, no echo (REP-117)."""
-        return self._make(
-            RANGE,
-            header=self._header(stamp_ns, frame),
-            radiation_type=0,
-            field_of_view=0.0,
-            min_range=0.0,
-            max_range=math.inf,
-            range=math.inf if math.isnan(range_m) else float(range_m),
-        )
-
-    def joints(self, stamp_ns: int, names: tuple[str, ...], speed_radps: Array) -> Any:
-        """Speeds, (n,), of propellers."""
-        return self._make(
-            JOINTS,
-            header=self._header(stamp_ns, ""),
-            name=list(names),
-            position=np.zeros(0),
-            velocity=np.ascontiguousarray(speed_radps),
-            effort=np.zeros(0),
-        )
-
-    def numbers(self, label: str, values: Array) -> Any:
-        """A row of numbers whose dimension carries a label."""
-        size = len(values)
-        dimension = self._make(
-            "std_msgs/msg/MultiArrayDimension", label=label, size=size, stride=size
-        )
-        layout = self._make("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)
-        return self._make(NUMBERS, layout=layout, data=np.ascontiguousarray(values))

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,7 +16,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import read_csv
-from alice_survey.base.config import load_config
+from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, attitude_from_rotation, interpolate_poses
 from alice_survey.base.trajectory import read_track
 from alice_survey.vehicle.floor import floor_depth
@@ -25,10 +27,13 @@ from missions.coverage.stations import Stations, plan_pattern, stations_of_fligh
 from missions.fly.run import flight_noise, true_floor
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.live import ros_messages
-from missions.live.loop import Odometry
-from missions.live.ros_vehicle import START_S
+from missions.live.loop import LinkLimits, Odometry
+from missions.live.mission import mission_of
+from missions.live.ros_pilot import Topics, pilot_over_ros
+from missions.live.ros_vehicle import START_S, VehicleNode
+from missions.logs.ros_builder import JOINTS, ODOMETRY, WRENCH
 from missions.values.flight import trigger_times
-from tests.missions.live.flights import small_plan
+from tests.missions.live.flights import FLOOR_M, small_plan, vehicle_afloat
 
 rclpy = pytest.importorskip(
     "rclpy", reason="ROS 2 is not installed: pip install 'alice-survey[ros]'"
@@ -62,7 +67,7 @@ def command(*words: str) -> list[str]:
 
 def test_odometry_is_in_the_frames_of_rep_103() -> None:
     """2 m north, 3 m east, 5 m deep, heading east, bow up by 0.1 rad, going ahead."""
-    ros = ros_messages.load_ros()
+    build = ros_messages.load_ros().build
     turn = Rotation.from_euler("ZYX", [math.pi / 2, 0.1, 0.0])
     odometry = Odometry(
         stamp_s=12.25,
@@ -71,7 +76,7 @@ def test_odometry_is_in_the_frames_of_rep_103() -> None:
         velocity_body=np.array([0.4, 0.1, 0.2]),
         rates_body=np.array([0.01, 0.02, 0.3]),
     )
-    message = ros_messages.odometry_message(ros, odometry, "alice/base_link", np.arange(6.0))
+    message = ros_messages.odometry_message(build, odometry, "alice/base_link", np.arange(6.0))
 
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 250_000_000)
     assert (message.header.frame_id, message.child_frame_id) == ("map", "alice/base_link")
@@ -93,9 +98,9 @@ def test_odometry_is_in_the_frames_of_rep_103() -> None:
 
 
 def test_wrench_and_speeds_come_back() -> None:
-    ros = ros_messages.load_ros()
+    build = ros_messages.load_ros().build
     wrench = np.array([1.0, 2.0, -3.0, 0.1, -0.2, 0.3])
-    message = ros_messages.wrench_message(ros, 1.0, "alice/base_link", wrench)
+    message = build.wrench(10**9, "alice/base_link", ros_messages.flipped_pair(wrench))
     force, torque = message.wrench.force, message.wrench.torque
     # To starboard is to -y, and up is +z.
     assert (force.x, force.y, force.z) == (1.0, -2.0, 3.0)
@@ -103,9 +108,8 @@ def test_wrench_and_speeds_come_back() -> None:
     np.testing.assert_array_equal(ros_messages.wrench_from(message), wrench)
 
     names = ("port", "stern")
-    message = ros_messages.speeds_message(
-        ros, 1.0, names, np.array([2.0, -3.0]), np.array([5, -6.0])
-    )
+    speeds, thrusts = np.array([2.0, -3.0]), np.array([5.0, -6.0])
+    message = ros_messages.speeds_message(build, 1.0, names, speeds, thrusts)
     np.testing.assert_allclose(message.velocity, [4 * math.pi, -6 * math.pi])
     assert list(message.effort) == [5.0, -6.0]
     # By name, in whatever order.
@@ -115,10 +119,89 @@ def test_wrench_and_speeds_come_back() -> None:
 
 
 def test_ranges_out_of_bounds_are_no_echo() -> None:
-    ros = ros_messages.load_ros()
-    for value, expected in ((2.0, 2.0), (math.nan, math.inf), (80.0, math.inf)):
-        message = ros_messages.range_message(ros, 1.0, "alice/dvl", value, 75.0)
+    build = ros_messages.load_ros().build
+    for value, expected in ((2.0, 2.0), (math.nan, math.inf)):
+        message = build.range(10**9, "alice/dvl", value)
         assert ros_messages.range_from(message) == expected
+    message.range, message.max_range = 80.0, 75.0
+    assert ros_messages.range_from(message) == math.inf
+
+
+# ------------------------------------------------------------------ the simulated vehicle
+
+
+@pytest.fixture
+def afloat(monkeypatch: pytest.MonkeyPatch) -> Iterator[VehicleNode]:
+    """The vehicle's node, in this process, that follows wrenches."""
+    for name, value in DOMAIN.items():
+        monkeypatch.setenv(name, value)
+    ros = ros_messages.load_ros()
+    still = {"current_mps": 0.0, "current_sigma_mps": 0.0, "gust_n": (0.0, 0.0, 0.0)}
+    calm = SurveyConfig.model_validate({"sea": still})
+    vehicle = vehicle_afloat(small_plan(), calm)
+    ros.rclpy.init(args=[])
+    node = VehicleNode(ros, vehicle, "wrench", np.random.default_rng(3))
+    yield node
+    node.node.destroy_node()
+    ros.rclpy.try_shutdown()
+
+
+def test_wrench_moves_the_vehicle_the_way_it_points(afloat: VehicleNode) -> None:
+    """20 N ahead and 30 N down, in FLU, for 4 s; then nothing comes, and the thrusters stop."""
+    vehicle, build = afloat.vehicle, ros_messages.load_ros().build
+    began = vehicle.world.now[:3].copy()
+    pushed = np.array([20.0, 0.0, -30.0, 0.0, 0.0, 0.0])
+    for _ in range(80):
+        vehicle.sense()
+        stamp_ns = ros_messages.nanoseconds(afloat.now_s)
+        afloat.on_wrench(build.wrench(stamp_ns, "alice/base_link", pushed))
+        vehicle.move(afloat.speeds())
+    allocation = afloat.allocation
+    made = allocation.matrix @ allocation.thrust
+    np.testing.assert_allclose(made[[0, 1, 2, 5]], [20.0, 0.0, 30.0, 0.0], atol=1e-6)
+    turn = Rotation.from_quat(vehicle.world.now[3:7])
+    ahead, starboard, down = turn.inv().apply(vehicle.world.now[:3] - began)
+    assert ahead > 0.3
+    assert down > 0.3
+    assert abs(starboard) < 0.1 * ahead
+    for _ in range(9):
+        vehicle.move(afloat.speeds())
+        assert np.any(afloat.speeds())
+    vehicle.move(afloat.speeds())
+    vehicle.move(afloat.speeds())
+    assert not np.any(afloat.speeds())
+
+
+def test_sensors_measure_what_is_true(afloat: VehicleNode) -> None:
+    """At rest, turned: gravity, no velocity, the way straight down, and the true pose."""
+    vehicle = afloat.vehicle
+    for _ in range(40):
+        vehicle.sense()
+        vehicle.move(np.zeros(5))
+    heard: dict[str, Any] = {}
+    for _ in range(4):
+        for publisher, message in afloat.readings(vehicle.sense()):
+            heard[publisher.topic_name] = message
+        vehicle.move(np.zeros(5))
+    truth, imu = heard["/alice/truth/odometry"], heard["/alice/imu"]
+    up = imu.linear_acceleration
+    assert math.hypot(up.x, up.y, up.z) == pytest.approx(9.81, abs=0.1)
+    assert up.z == pytest.approx(9.81, abs=0.1)
+    moving = heard["/alice/dvl"].twist.twist.linear
+    assert 0.0 < math.hypot(moving.x, moving.y) < 0.05
+    # From the DVL, 0.11 m below the origin, which floats near the surface.
+    depth = -truth.pose.pose.position.z
+    assert heard["/alice/altimeter"].range == pytest.approx(FLOOR_M - 0.11 - depth, abs=0.15)
+    true, believed = (
+        ros_messages.odometry_from(heard[f"/alice/{who}/odometry"])
+        for who in ("truth", "navigation")
+    )
+    np.testing.assert_allclose(true.position_ned, vehicle.world.now[:3], atol=0.02)
+    assert 0.0 < np.linalg.norm(true.position_ned - believed.position_ned) < 0.5
+    sigma = np.sqrt(np.diag(heard["/alice/navigation/odometry"].pose.covariance.reshape(6, 6)))
+    assert np.all((sigma > 0.0) & (sigma < 0.5))
+    clock = ros_messages.seconds(heard["/clock"].clock)
+    assert clock == pytest.approx(START_S + 0.05 * (vehicle.tick - 1), abs=1e-9)
 
 
 # ------------------------------------------------------------------ a dive
@@ -206,16 +289,16 @@ class Navigator:
         self.node = rclpy.create_node("navigator", namespace="alice", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        kinds, qos = self.ros.messages, self.ros.qos
-        self.odometry = self.node.create_publisher(kinds.Odometry, "navigation/odometry", qos)
+        kind, qos = ros_messages.message_class, self.ros.qos
+        self.odometry = self.node.create_publisher(kind(ODOMETRY), "navigation/odometry", qos)
         self.wrenches: list[Array] = []
         self.speeds: list[Array] = []
         self.node.create_subscription(
-            kinds.Wrench, "pilot/wrench",
+            kind(WRENCH), "pilot/wrench",
             lambda m: self.wrenches.append(ros_messages.wrench_from(m)), qos,
         )  # fmt: skip
         self.node.create_subscription(
-            kinds.JointState, "thrusters/command",
+            kind(JOINTS), "thrusters/command",
             lambda m: self.speeds.append(np.array(m.velocity)), qos,
         )  # fmt: skip
 
@@ -228,7 +311,7 @@ class Navigator:
             rates_body=np.zeros(3),
         )
         self.odometry.publish(
-            ros_messages.odometry_message(self.ros, odometry, "alice/base_link", np.zeros(6))
+            ros_messages.odometry_message(self.ros.build, odometry, "alice/base_link", np.zeros(6))
         )
 
     def until(self, holds: Any, *, depth: float | None, most_s: float = 120.0) -> None:
@@ -255,42 +338,67 @@ def navigator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Navigator]:
     made.close()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lost", ["silent", "nan"])
-def test_lost_odometry_stops_then_surfaces(
-    workspace: Path, navigator: Navigator, lost: str
-) -> None:
-    """In real time: a pilot process, whose odometry stops, or goes on as NaN."""
+@pytest.fixture
+def diving(workspace: Path, navigator: Navigator) -> Iterator[subprocess.Popen[str]]:
+    """A pilot process, in real time, whose vehicle is said to be 1 m deep: it dives."""
     pilot = subprocess.Popen(
         command("pilot", "-w", str(workspace), "--grace", "1"),
         env=DOMAIN, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    depth = None if lost == "silent" else math.nan
     try:
-        # It dives from 1 m: the wrench is down, and thrusters turn.
         navigator.until(
             lambda: (
                 navigator.wrenches
                 and navigator.wrenches[-1][2] > 1.0
+                and navigator.speeds
                 and np.any(navigator.speeds[-1])
             ),
             depth=1.0,
         )
-        begun = len(navigator.wrenches)
-        navigator.until(lambda: navigator.wrenches[-1][2] < -5.0, depth=depth)
-        after = np.array(navigator.wrenches[begun:])
-        off = np.flatnonzero(~np.any(after, axis=1))
-        # First off, then up and nothing else.
-        assert len(off) > 5
-        assert not np.any(after[-1, [0, 1, 3, 4, 5]])
-        # At the surface it ends, with no thrust.
-        navigator.until(lambda: pilot.poll() is not None, depth=0.1)
-        navigator.until(
-            lambda: not np.any(navigator.wrenches[-1]) and not np.any(navigator.speeds[-1]),
-            depth=None,
-        )
+        yield pilot
     finally:
         pilot.kill()
-    assert pilot.returncode == 1
-    assert pilot.stdout is not None
-    assert pilot.stdout.read().startswith("given up: ")
+
+
+def ends_without_thrust(pilot: subprocess.Popen[str], navigator: Navigator, depth: Any) -> None:
+    navigator.until(lambda: pilot.poll() is not None, depth=depth)
+    navigator.until(
+        lambda: not np.any(navigator.wrenches[-1]) and not np.any(navigator.speeds[-1]),
+        depth=None,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["silent", "nan"])
+def test_lost_odometry_stops_then_surfaces(
+    diving: subprocess.Popen[str], navigator: Navigator, lost: str
+) -> None:
+    """Odometry stops, or goes on as NaN."""
+    begun = len(navigator.wrenches)
+    depth = None if lost == "silent" else math.nan
+    navigator.until(lambda: navigator.wrenches[-1][2] < -5.0, depth=depth)
+    after = np.array(navigator.wrenches[begun:])
+    # First off, then up and nothing else.
+    assert np.count_nonzero(~np.any(after, axis=1)) > 5
+    assert not np.any(after[-1, [0, 1, 3, 4, 5]])
+    ends_without_thrust(diving, navigator, 0.1)
+    assert diving.returncode == 1
+    assert diving.stdout is not None
+    assert diving.stdout.read().startswith("given up: ")
+
+
+@pytest.mark.slow
+def test_interrupted_pilot_leaves_the_thrusters_off(
+    diving: subprocess.Popen[str], navigator: Navigator
+) -> None:
+    diving.send_signal(signal.SIGTERM)
+    ends_without_thrust(diving, navigator, 1.0)
+    assert diving.returncode == 128 + signal.SIGTERM
+
+
+def test_topic_that_cannot_be_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in DOMAIN.items():
+        monkeypatch.setenv(name, value)
+    mission = mission_of(small_plan(), flight_settings(SurveyConfig()), LinkLimits())
+    with pytest.raises(VehicleError, match="2 odometry"):
+        pilot_over_ros(mission, Topics(odometry="2 odometry"), sim_time=True)

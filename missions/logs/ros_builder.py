@@ -1,0 +1,211 @@
+"""ROS 2 messages from numbers in ENU and FLU, by whatever library has their classes.
+
+Definitions: ros2/common_interfaces, as of Humble, which later releases kept.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from alice_survey.base.frames import Array
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIX = "sensor_msgs/msg/NavSatFix"
+RANGE = "sensor_msgs/msg/Range"
+JOINTS = "sensor_msgs/msg/JointState"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+IMU = "sensor_msgs/msg/Imu"
+CLOCK = "rosgraph_msgs/msg/Clock"
+STRING = "std_msgs/msg/String"
+
+MAP = "map"
+"""The world's frame: ENU, origin at the datum."""
+NS_PER_S = 1_000_000_000
+_UNKNOWN, _DIAGONAL = 0, 2
+"""COVARIANCE_TYPE_UNKNOWN and _DIAGONAL_KNOWN of sensor_msgs/NavSatFix."""
+
+
+class MessageBuilder:
+    """Builds messages from numbers in ENU and FLU."""
+
+    def __init__(self, kind: Callable[[str], Any]) -> None:
+        """A builder by the classes of a library.
+
+        Args:
+            kind: class of a message by its name, such as `nav_msgs/msg/Odometry`.
+        """
+        self._kind = kind
+
+    def make(self, kind: str, **fields: Any) -> Any:
+        """A message by its fields; a library of ROS fills in those that are left out."""
+        return self._kind(kind)(**fields)
+
+    def stamp(self, stamp_ns: int) -> Any:
+        """A time."""
+        sec, nanosec = divmod(stamp_ns, NS_PER_S)
+        return self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        stamp = self.stamp(stamp_ns)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _vector(self, xyz: Array, kind: str = "Vector3") -> Any:
+        x, y, z = (float(v) for v in xyz)
+        return self.make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+    def _quaternion(self, xyzw: Array) -> Any:
+        x, y, z, w = (float(v) for v in xyzw)
+        return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        child: str,
+        position_enu: Array,
+        enu_from_flu: Array,
+        pose_variances: Array,
+        velocity_flu: Array,
+    ) -> Any:
+        """A pose in the map and a velocity in the body, whose covariance is not known.
+
+        Args:
+            stamp_ns: of the header.
+            child: the body's frame.
+            position_enu: (3,).
+            enu_from_flu: (4,) quaternion xyzw.
+            pose_variances: (6,) of east, north, up, and of small turns about them.
+            velocity_flu: (6,).
+        """
+        pose = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self._vector(position_enu, "Point"),
+            orientation=self._quaternion(enu_from_flu),
+        )
+        twist = self.make(
+            "geometry_msgs/msg/Twist",
+            linear=self._vector(velocity_flu[:3]),
+            angular=self._vector(velocity_flu[3:]),
+        )
+        return self.make(
+            ODOMETRY,
+            header=self._header(stamp_ns, MAP),
+            child_frame_id=child,
+            pose=self.make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=pose,
+                covariance=np.diag(pose_variances).ravel(),
+            ),
+            twist=self.make(
+                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
+            ),
+        )
+
+    def transforms(self, stamp_ns: int, children: dict[str, tuple[Array, Array]]) -> Any:
+        """Transforms of bodies in the map: of each position ENU, (3,), and quaternion, (4,)."""
+        stamped = [
+            self.make(
+                "geometry_msgs/msg/TransformStamped",
+                header=self._header(stamp_ns, MAP),
+                child_frame_id=child,
+                transform=self.make(
+                    "geometry_msgs/msg/Transform",
+                    translation=self._vector(position),
+                    rotation=self._quaternion(quaternion),
+                ),
+            )
+            for child, (position, quaternion) in children.items()
+        ]
+        return self.make(TRANSFORMS, transforms=stamped)
+
+    def fix(self, stamp_ns: int, frame: str, geodetic: Array, variances_enu: Array | None) -> Any:
+        """Latitude, longitude (degrees) and height above the ellipsoid, (3,)."""
+        variances = np.zeros(3) if variances_enu is None else variances_enu
+        return self.make(
+            FIX,
+            header=self._header(stamp_ns, frame),
+            status=self.make("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+            latitude=float(geodetic[0]),
+            longitude=float(geodetic[1]),
+            altitude=float(geodetic[2]),
+            position_covariance=np.diag(variances).ravel(),
+            position_covariance_type=_UNKNOWN if variances_enu is None else _DIAGONAL,
+        )
+
+    def range(self, stamp_ns: int, frame: str, range_m: float) -> Any:
+        """A range; one that is NaN is +inf, no echo (REP-117)."""
+        return self.make(
+            RANGE,
+            header=self._header(stamp_ns, frame),
+            radiation_type=0,
+            field_of_view=0.0,
+            min_range=0.0,
+            max_range=math.inf,
+            range=math.inf if math.isnan(range_m) else float(range_m),
+        )
+
+    def joints(
+        self,
+        stamp_ns: int,
+        names: tuple[str, ...],
+        speed_radps: Array,
+        thrust_n: Array | None = None,
+    ) -> Any:
+        """Speeds, (n,), of propellers, and their thrusts where they are given."""
+        return self.make(
+            JOINTS,
+            header=self._header(stamp_ns, ""),
+            name=list(names),
+            position=np.zeros(0),
+            velocity=np.ascontiguousarray(speed_radps),
+            effort=np.zeros(0) if thrust_n is None else np.ascontiguousarray(thrust_n),
+        )
+
+    def numbers(self, label: str, values: Array) -> Any:
+        """A row of numbers whose dimension carries a label."""
+        size = len(values)
+        dimension = self.make(
+            "std_msgs/msg/MultiArrayDimension", label=label, size=size, stride=size
+        )
+        layout = self.make("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)
+        return self.make(NUMBERS, layout=layout, data=np.ascontiguousarray(values))
+
+    def wrench(self, stamp_ns: int, frame: str, wrench_flu: Array) -> Any:
+        """Force and moment, (6,), on a body."""
+        wrench = self.make(
+            "geometry_msgs/msg/Wrench",
+            force=self._vector(wrench_flu[:3]),
+            torque=self._vector(wrench_flu[3:]),
+        )
+        return self.make(WRENCH, header=self._header(stamp_ns, frame), wrench=wrench)
+
+    def velocity(self, stamp_ns: int, frame: str, velocity_flu: Array) -> Any:
+        """Velocity, (3,), of a DVL, whose covariance is not known; turns are not measured."""
+        twist = self.make(
+            "geometry_msgs/msg/Twist",
+            linear=self._vector(velocity_flu),
+            angular=self._vector(np.zeros(3)),
+        )
+        known = self.make(
+            "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
+        )
+        return self.make(TWIST, header=self._header(stamp_ns, frame), twist=known)
+
+    def imu(
+        self, stamp_ns: int, frame: str, enu_from_flu: Array, rates_flu: Array, force_flu: Array
+    ) -> Any:
+        """Attitude, (4,) xyzw; rates, (3,) rad/s; specific force, (3,) m/s^2."""
+        return self.make(
+            IMU,
+            header=self._header(stamp_ns, frame),
+            orientation=self._quaternion(enu_from_flu),
+            orientation_covariance=np.zeros(9),
+            angular_velocity=self._vector(rates_flu),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=self._vector(force_flu),
+            linear_acceleration_covariance=np.zeros(9),
+        )
