@@ -227,9 +227,14 @@ def test_a_changed_setting_is_checked_like_one_in_the_file() -> None:
 
 
 def test_weak_thrusters_are_read_from_their_texts() -> None:
-    assert parse_health(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, None)
+    assert parse_health(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, None, None)
     assert parse_health(["stern@600", "bow=0.5@30"])[1] == [("stern", 600, 0), ("bow", 30, 0.5)]
-    assert parse_health(None) == (None, None)
+    assert parse_health(["bow:propeller=0.2", "stern:propeller@600"]) == (
+        None,
+        None,
+        [("bow", 0.0, 0.2), ("stern", 600.0, 0.0)],
+    )
+    assert parse_health(None) == (None, None, None)
     with pytest.raises(ConfigError, match="stern@600"):
         parse_health(["bow@soon"])
     with pytest.raises(ConfigError):

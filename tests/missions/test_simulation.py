@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from alice_survey.base.config import (
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.floor import FloorGrid
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
+from alice_survey.vehicle.pilot.thrust_watch import ThrustWatch
 from alice_survey.vehicle.sea import current_at
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
@@ -352,6 +354,45 @@ def test_nothing_is_found_where_nothing_fails() -> None:
     other = {"name": "sparus2", "controller": "los"}
     for changes in ({}, {"sea": {"current_mps": 0.3}}, {"vehicle": other}):
         assert fly(survey(**changes)).flown.found == ()
+
+
+@pytest.mark.slow
+def test_in_seven_seas_nothing_adds_up_and_lost_propellers_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two hours of sound flights, of which no sum comes near the alarm; the failures it finds."""
+    sums: list[float] = []
+    judge = ThrustWatch.judge
+
+    def noted(self: ThrustWatch, *args: Any) -> Any:
+        found = judge(self, *args)
+        sums.append(float(self.sums.max()))
+        return found
+
+    monkeypatch.setattr(ThrustWatch, "judge", noted)
+    across = {"current_mps": 0.3}
+    along = {"current_mps": 0.2, "current_towards_deg": 0.0}
+    swell = {"swell_m": 0.8, "swell_period_s": 8.0}
+    seas: tuple[dict[str, Any], ...] = (
+        {}, {"sea": across}, {"sea": along}, {"sea": swell},
+        {"sea": {**along, "swell_m": 0.5}}, {"vehicle": {"coefficients": "computed"}},
+        {"vehicle": {"name": "sparus2", "controller": "los"}},
+    )  # fmt: skip
+    flown_s = 0.0
+    for seed in (1, 2, 3):
+        for changes in seas:
+            sound = fly(survey(**changes), seed=seed)
+            assert sound.flown.found == ()
+            flown_s += float(sound.flown.time_s[-1])
+    alarm = ThrustWatch(sound.vehicle, 0.05).alarm
+    assert 1.8 < flown_s / 3600.0 < 2.6
+    assert 0.5 < max(sums) < 0.5 * alarm
+    for sea, latest_s in ((None, 60.0), (along, 60.0), (across, 150.0)):
+        for name in ("bow", "stern", "vertical"):
+            lost = {"lost_propellers": [[name, 70.0, 0.0]]}
+            one = fly(survey(vehicle=lost, **({"sea": sea} if sea else {}))).flown.found[0]
+            assert (one.thruster, one.turns) == (name, True)
+            assert 5.0 <= one.time_s - 70.0 <= latest_s
 
 
 def test_a_vehicle_that_loses_its_only_vertical_thruster_gives_up() -> None:
