@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.cli.options import (
     CONTEXT,
     WORK,
@@ -106,8 +105,9 @@ def compare(
 def identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
     vehicle: Annotated[
-        str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
-    ] = DEFAULT_VEHICLE,
+        str | None,
+        typer.Option(help="A known vehicle, or a TOML or JSON file; alice if not given."),
+    ] = None,
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
     ] = None,
@@ -139,10 +139,12 @@ def identify(
     Damping, added mass, body lift, a constant current and more, each with its sigma; and how well
     they predict another log.
     """
+    from alice_survey.base.config import DEFAULT_VEHICLE
     from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
 
     options = IdentifyOptions(
-        vehicle=vehicle, coefficients=coefficients, validate=validate, bollard=bollard,
+        vehicle=vehicle or DEFAULT_VEHICLE, coefficients=coefficients, validate=validate,
+        bollard=bollard,
         free=tuple((free or "").split(",")) if free else (), held=tuple(held or ()),
         method=method, columns=columns, given=tuple(given.split(",")) if given else (),
         window_s=window, hold_input=hold_input,
