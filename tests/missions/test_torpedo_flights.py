@@ -150,10 +150,10 @@ def test_the_circle_is_flown_on_the_roomier_side() -> None:
     for port, starboard, side, share in (
         (20.0, 4.0, -1.0, 0.0),
         (4.0, 20.0, 1.0, 0.0),
-        (8.0, 8.0, 1.0, 0.5),
+        (8.0, 9.0, 1.0, 0.42),
     ):
         corners = np.array([[-40, -port], [40, -port], [40, starboard], [-40, starboard]])
-            corners = corners @ turned + start
+        corners = corners @ turned + start
         area = replace(plan.area, allowed=MultiPolygon([Polygon(corners)]))
         found, outside = roomier_side(replace(plan, area=area), path, 5.0, 8.0)
         assert found == side
