@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.cli.options import (
     CONTEXT,
     WORK,
@@ -18,6 +17,10 @@ from alice_survey.cli.options import (
     print_result,
 )
 
+VehicleName = Annotated[
+    str | None,
+    typer.Option(help="A known vehicle, or a TOML or JSON file; alice if not given."),
+]
 app = typer.Typer(
     help="The vehicle: coefficients from geometry and from logs, and how its two forms compare.",
     no_args_is_help=True,
@@ -105,9 +108,7 @@ def compare(
 )
 def identify(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
-    vehicle: Annotated[
-        str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
-    ] = DEFAULT_VEHICLE,
+    vehicle: VehicleName = None,
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
     ] = None,
@@ -146,11 +147,13 @@ def identify(
     Damping, added mass, body lift, a constant current and more, each with its sigma; and how well
     they predict another log.
     """
+    from alice_survey.base.config import DEFAULT_VEHICLE
     from alice_survey.vehicle.identification.prior import read_prior
     from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
 
     options = IdentifyOptions(
-        vehicle=vehicle, coefficients=coefficients, validate=validate, bollard=bollard,
+        vehicle=vehicle or DEFAULT_VEHICLE, coefficients=coefficients, validate=validate,
+        bollard=bollard,
         free=tuple((free or "").split(",")) if free else (), held=tuple(held or ()),
         method=method, columns=columns, given=tuple(given.split(",")) if given else (),
         window_s=window, hold_input=hold_input, prior=read_prior(prior or ""),
@@ -167,9 +170,7 @@ def identify(
 )
 def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="docs/vehicle-logs.md")],
-    vehicle: Annotated[
-        str, typer.Option(help="A known vehicle, or a TOML or JSON file.")
-    ] = "alice",
+    vehicle: VehicleName = None,
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file, as of identify; the vehicle's if not given.")
     ] = None,
@@ -197,10 +198,12 @@ def replay(
     Velocities, rates, attitude and place that the model makes of the log's thruster speeds, thrusts
     or forces, next to what was measured: errors of each axis, and how fast they grow.
     """
+    from alice_survey.base.config import DEFAULT_VEHICLE
     from alice_survey.vehicle.identification.replay import ReplayOptions, replay_report
 
     options = ReplayOptions(
-        vehicle=vehicle, coefficients=coefficients, held=tuple(held or ()), columns=columns,
+        vehicle=vehicle or DEFAULT_VEHICLE, coefficients=coefficients, held=tuple(held or ()),
+        columns=columns,
         given=tuple(given.split(",")) if given else (), commanded=commanded, reset_s=reset,
         hold_input=hold_input,
     )  # fmt: skip

@@ -26,7 +26,8 @@ from missions.fly.monte_carlo import monte_carlo as fly_often
 from missions.fly.refly import refly_plan, to_see, write_refly
 from missions.fly.simulation import flight_settings, floor_grid
 from missions.plan.strength import survey_costs
-from missions.route.energy import usable_wh
+from missions.route.energy import craft_of, usable_wh
+from missions.route.flyable import without_stops
 from missions.values.plan_file import Plan, read_plan
 
 _LISTED = 20
@@ -187,7 +188,7 @@ def check_report(
                 check.flown.pattern,
                 name=f"{check.plan.name} holes",
                 costs=survey_costs(config),
-                settings=config.plan,
+                settings=without_stops(config.plan, craft_of(config.vehicle)),
                 usable_wh=usable_wh(config.vehicle),
             )
         except PlanError as error:

@@ -125,24 +125,24 @@ def room_behind_m(plan: Plan, path: Path, most_m: float) -> float:
     return min(most_m, max((float(part.length) for part in parts), default=0.0))
 
 
-def roomier_side(plan: Plan, path: Path, way_in_m: float, radius_m: float) -> float:
-    """On which side of the way in a circle lies more inside the allowed area: +1 to starboard.
+def roomier_side(plan: Plan, path: Path, way_in_m: float, radius_m: float) -> tuple[float, float]:
+    """On which side of the way in a circle lies more inside the allowed area, +1 to starboard.
 
     Args:
         plan: whose allowed area counts.
         path: its first leg's course.
         way_in_m: length of the way in, at whose start the circle touches it.
         radius_m: of the circle.
+
+    Returns:
+        The side, and the share of the circle that lies outside.
     """
     course = float(path.heading_rad[0])
     ahead = np.array([math.cos(course), math.sin(course)])
     touches = np.array([path.start_n[0], path.start_e[0]]) - way_in_m * ahead
     starboard = np.array([-ahead[1], ahead[0]])
-    inside = [
-        Point(touches + side * radius_m * starboard)
-        .buffer(radius_m)
-        .intersection(plan.area.allowed)
-        .area
-        for side in (1.0, -1.0)
-    ]
-    return 1.0 if inside[0] >= inside[1] else -1.0
+    outside = []
+    for side in (1.0, -1.0):
+        circle = Point(touches + side * radius_m * starboard).buffer(radius_m)
+        outside.append(float(circle.difference(plan.area.allowed).area / circle.area))
+    return (1.0 if outside[0] <= outside[1] else -1.0), min(outside)

@@ -64,6 +64,8 @@ _PATIENCE = 3.0
 """A mission is aborted after this many times the time its plan takes."""
 _PITCH_MARGIN = 0.8
 """Share of the speed at which pitch diverges that a plan may have without a warning (inferred)."""
+_OUTSIDE = 0.01
+"""Share of a circle that may lie outside of the allowed area without a warning."""
 _USBL_HZ = 0.5
 """A fix every other second: the turn-around of a modem at short range."""
 
@@ -216,9 +218,18 @@ def piloting_of(
             ),
         )
         way_in_m = min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
-        side = roomier_side(plan, path, way_in_m, guidance.under_way.circle_m)
-        under_way = guidance.under_way._replace(side=side)
-        return gains, guidance._replace(way_in_m=way_in_m, under_way=under_way)
+        guidance = guidance._replace(way_in_m=way_in_m)
+        radius_m = guidance.under_way.circle_m
+        if radius_m == 0.0:
+            return gains, guidance
+        side, outside = roomier_side(plan, path, way_in_m, radius_m)
+        if outside > _OUTSIDE:
+            warn(
+                f"{outside:.0%} of the circle of {radius_m:.1f} m on which {craft.name} dives lies "
+                "outside of the allowed area or in zones: widen area.turn_margin_m, or move "
+                "plan.home_ne_m"
+            )
+        return gains, guidance._replace(under_way=guidance.under_way._replace(side=side))
 
     # The pilot flies as well as the thrusters allow that he knows to be sound.
     known = settings.vehicle.impaired if settings.vehicle.health_known else {}

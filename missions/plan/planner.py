@@ -40,7 +40,7 @@ from missions.plan.ready import check_depth, check_no_stops, check_turns, gap_m,
 from missions.plan.rows import plan_rows
 from missions.plan.strength import survey_costs, turn_rate_deg_s, warn_of_swell
 from missions.route.energy import sound_craft_of, usable_wh
-from missions.route.flyable import as_flown
+from missions.route.flyable import as_flown, without_stops
 from missions.route.terrain import (
     Reach,
     TerrainLimits,
@@ -126,7 +126,7 @@ def _planned(config: SurveyConfig, rig: Rig) -> Planned:
         warn_of_swell(config, depth_m)
         flown = plan_parts(
             area,
-            wanted,
+            without_stops(wanted, craft),
             pattern,
             costs,
             home,

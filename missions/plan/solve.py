@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import PlanConfig, SurveyConfig, changed
+from alice_survey.base.config import PlanConfig, SurveyConfig
 from alice_survey.base.errors import ConfigError, PlanError
 from alice_survey.vehicle.limits import spot_rate_rad_s
 from missions.exposure.settings import ImagingSetup, imaging_settings
@@ -24,7 +24,7 @@ from missions.plan.ready import with_tried_ways
 from missions.plan.strength import survey_costs
 from missions.plan.trade import both_ways_w
 from missions.route.energy import craft_of, usable_wh
-from missions.route.flyable import as_flown
+from missions.route.flyable import as_flown, without_stops
 from missions.values.costs import time_costs
 
 
@@ -108,9 +108,7 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
         PlanError: the dive or the battery is too short for one line of one picture's length.
     """
     config = as_flown(config)
-    if craft_of(config.vehicle).fins:
-        config = changed(config, "plan", turns="arcs")
-    setup, plan = ImagingSetup.of(config), config.plan
+    setup, plan = ImagingSetup.of(config), without_stops(config.plan, craft_of(config.vehicle))
     try:
         settings = imaging_settings(setup.rig, setup, quiet=True)
     except ConflictError as found:

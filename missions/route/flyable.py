@@ -23,6 +23,11 @@ def as_flown(config: SurveyConfig) -> SurveyConfig:
     return config if plan is config.plan else config.model_copy(update={"plan": plan})
 
 
+def without_stops(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
+    """Settings for laying routes: of a vehicle that fins steer, by arcs alone."""
+    return plan.model_copy(update={"turns": "arcs"}) if craft.fins else plan
+
+
 def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
     """Settings with arcs that fins hold and run-ins as long as their radius.
 

@@ -22,7 +22,8 @@ from missions.exports.write import counted
 from missions.fly.check import rig_of
 from missions.fly.refly import write_refly
 from missions.plan.strength import survey_costs
-from missions.route.energy import usable_wh
+from missions.route.energy import craft_of, usable_wh
+from missions.route.flyable import without_stops
 from missions.values.plan_file import Plan
 from reconstruct.precision.candidates import Candidate
 from reconstruct.precision.instruments import expected_rig
@@ -69,7 +70,8 @@ def revisit_report(
     if found.places:
         try:
             again = plan_revisit(
-                found, costs=survey_costs(config), settings=config.plan,
+                found, costs=survey_costs(config),
+                settings=without_stops(config.plan, craft_of(config.vehicle)),
                 usable_wh=usable_wh(config.vehicle),
             )  # fmt: skip
         except PlanError as error:

@@ -1,7 +1,10 @@
 """Surveys of a vehicle that fins steer: planned with its turns, flown, aborted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from shapely.geometry import MultiPolygon, Polygon
 
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import PlanError, VehicleError
@@ -9,6 +12,7 @@ from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.pilot.memory import ABORT, PHASE
 from alice_survey.vehicle.under_way import least_radius_m, least_speed_mps
 from missions.exposure.ways_out import ConflictError
+from missions.fly.flight_route import path_of, roomier_side
 from missions.plan.solve import area_for_dive
 from missions.route.energy import craft_of
 from missions.route.flyable import as_flown
@@ -134,8 +138,26 @@ def test_a_dive_holds_less_area_where_turns_are_wide() -> None:
     wide = area_for_dive(survey(), 3600.0)
     assert 40.0 < wide.turn_s < 90.0
     assert wide.side_m > 20.0
-    with pytest.raises(ConflictError):
-        area_for_dive(survey({"speed_mps": 0.2}), 3600.0)
+
+
+def test_the_circle_is_flown_on_the_roomier_side() -> None:
+    """A circle of 8 m radius beside a way, in areas that reach so far to port and starboard."""
+    plan = planned(survey())
+    path = path_of(plan)
+    heading = float(path.heading_rad[0])
+    turned = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+    start = np.array([path.start_n[0], path.start_e[0]])
+    for port, starboard, side, share in (
+        (20.0, 4.0, -1.0, 0.0),
+        (4.0, 20.0, 1.0, 0.0),
+        (8.0, 9.0, 1.0, 0.42),
+    ):
+        corners = np.array([[-40, -port], [40, -port], [40, starboard], [-40, starboard]])
+        corners = corners @ turned + start
+        area = replace(plan.area, allowed=MultiPolygon([Polygon(corners)]))
+        found, outside = roomier_side(replace(plan, area=area), path, 5.0, 8.0)
+        assert found == side
+        assert outside == pytest.approx(share, abs=0.01)
 
 
 def test_other_vehicles_are_planned_as_before() -> None:
