@@ -231,11 +231,11 @@ def _legend(axes: Axes, title: str = "") -> None:
     longest = max((len(name) for name in names), default=0) + _MARK
     columns = max(1, min(len(names), _NAMED, _ROOM // longest))
     width = _BOLD * len(title) + sum(len(name) + _MARK for name in names)
-    beside = width <= _ROOM and len(names) <= _NAMED
-    lines = 0 if beside else math.ceil(len(names) / columns)
+    fits = width <= _ROOM and len(names) <= _NAMED
+    lines = 0 if fits else math.ceil(len(names) / columns)
     if names:
         axes.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=_NAMED if beside else columns,
+            loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=_NAMED if fits else columns,
             fontsize=7.5, borderaxespad=0.0, columnspacing=1.2, handlelength=1.6,
         )  # fmt: skip
     if title:

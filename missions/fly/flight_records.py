@@ -1,7 +1,7 @@
 """A flight as logs that other tools read, and as summary figures."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -28,9 +28,9 @@ _BAG_EVERY = 2
 
 
 def true_log(flight: Flight) -> VehicleLog:
-    """How the vehicle truly moved, and what its thrusters did."""
+    """How the vehicle truly moved, and what its thrusters and fins did."""
     flown = flight.flown
-    return vehicle_log(
+    log = vehicle_log(
         flown.time_s,
         source="truth",
         position_ned=flown.truth[:, :3],
@@ -39,13 +39,14 @@ def true_log(flight: Flight) -> VehicleLog:
         rates_body=flown.truth[:, 10:13],
         rpm=rpm_of(flown),
     )
+    return replace(log, others=_fin_columns(flight))
 
 
 def believed_log(flight: Flight) -> VehicleLog:
-    """What the vehicle's own computer knows of its motion, and what its thrusters did."""
+    """What the vehicle's own computer knows of its motion, thrusters and fins."""
     flown, log = flight.flown, flight.log
     believed = believed_velocity(flown)
-    return vehicle_log(
+    known = vehicle_log(
         flown.time_s,
         source="navigation",
         position_ned=log.position_ned,
@@ -55,6 +56,14 @@ def believed_log(flight: Flight) -> VehicleLog:
         altitude_m=log.altitude_m,
         rpm=rpm_of(flown),
     )
+    return replace(known, others=_fin_columns(flight))
+
+
+def _fin_columns(flight: Flight) -> dict[str, Array]:
+    """Angles of the fins, (T,) degrees each."""
+    angles = np.rad2deg(flight.flown.fin_rad).T
+    fins = flight.vehicle.fins
+    return {f"fin_{fin.name}_deg": angle for fin, angle in zip(fins, angles, strict=True)}
 
 
 def bag_record(flight: Flight) -> BagRecord:

@@ -12,6 +12,7 @@ from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.pilot.memory import ABORT, PHASE
 from alice_survey.vehicle.under_way import least_radius_m, least_speed_mps
 from missions.exposure.ways_out import ConflictError
+from missions.fly.flight_records import true_log
 from missions.fly.flight_route import path_of, roomier_side
 from missions.plan.solve import area_for_dive
 from missions.route.energy import craft_of
@@ -63,6 +64,10 @@ def test_a_survey_is_planned_with_turns_that_it_holds_and_flown_on_its_lines() -
     u = flight.flown.state[:, 7]
     assert u[flight.flown.time_s > 20.0].min() > 0.7
     assert -4.0 < np.rad2deg(flight.attitude_rad[on, 1]).mean() < -0.5
+    angles = true_log(flight).others
+    assert list(angles) == ["fin_stern_planes_deg", "fin_rudders_deg"]
+    for angle in angles.values():
+        assert 3.0 < np.abs(angle).max() <= 13.6 + 1e-9
     # The plan's energy is that of the flight: thrusters, and the hotel load.
     hours = flight.flown.time_s[-1] / 3600.0
     spent_wh = float(flight.flown.energy_j.sum()) / 3600.0 + 30.0 * hours

@@ -110,7 +110,7 @@ def identify_report(
     vehicle = given_vehicle(options.vehicle, options.coefficients)
     if vehicle.fins:
         raise VehicleError(
-            f"{vehicle.name} is steered by fins, whose angles no log holds yet: give the file of a "
+            f"{vehicle.name} is steered by fins, whose angles are not used: give the file of a "
             "vehicle without [[fins]], and logs of the whole wrench (X_n to N_nm)"
         )
     thrust: list[ThrustCoefficient] = []
