@@ -123,7 +123,7 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
     return [
         *lines,
         f"{expected[0].upper()}{expected[1:]}. To see it flown: alice-survey fly --mission FILE. "
-        "What helps: lines along the current, closer lines (plan.track_error_m), a longer run-in.",
+        "What helps: lines along the current, and closer lines (plan.track_error_m).",
     ]
 
 
