@@ -64,12 +64,13 @@ class Row:
     expected: float
     """The same as `about.txt` expects."""
     warned: bool
-    """Whether the export warned that the promise would not be kept, or expects less."""
+    """Whether the export warned that the promise would not be kept."""
     flown: float
 
     def figure(self) -> Figure:
         """What is seen, and as its goal what is promised, unless less was said beforehand."""
-        goal = None if self.warned else Goal(least=100.0 * (self.promised - _SPARE))
+        said_less = self.warned or self.expected < self.promised - _SPARE
+        goal = None if said_less else Goal(least=100.0 * (self.promised - _SPARE))
         return Figure(
             name=f"{self.vehicle}, {self.format}, {_sea(self)}: at the requested overlap",
             value=100.0 * self.flown,
@@ -133,7 +134,6 @@ def _fly(plan: Plan, rig: Rig, config: SurveyConfig, name: str, *, across: bool)
         outlook = cola2_outlook(plan, rig, options.follower, lever_m)
         expected = outlook.share_at_overlap
         warned = outlook.offset_m > outlook.allowed_m or outlook.at_most
-        warned = warned or expected < plan.coverage - _SPARE
     return Row(
         vehicle=config.vehicle.name,
         format=name,

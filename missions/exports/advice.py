@@ -71,24 +71,26 @@ def cola2_outlook(plan: Plan, rig: Rig, follower: Follower, lever_m: float) -> C
     )
 
 
-def advice(export: Export, formats: list[str]) -> list[str]:
+def advice(export: Export, formats: list[str], *, chosen: bool) -> list[str]:
     """Lines for people who load missions: parameters to set, and what is to be expected.
 
-    Warns where COLA2 cannot hold the plan's lines in the expected current.
+    Warns where COLA2 cannot hold the plan's lines in the expected current, if its formats were
+    chosen or the vehicle has no sway: others are flown by what holds them better.
 
     Args:
         export: the plan.
         formats: names of those that are written.
+        chosen: whether somebody chose them.
     """
     lines = []
     if any(name.startswith("cola2") for name in formats):
-        lines += _cola2(export)
+        lines += _cola2(export, chosen=chosen)
     if any(name in ("wpl", "qgc", "qgc-survey") for name in formats):
         lines += _ardusub(export)
     return lines
 
 
-def _cola2(export: Export) -> list[str]:
+def _cola2(export: Export, *, chosen: bool) -> list[str]:
     plan, follower = export.plan, export.options.follower
     if follower is None:
         return []
@@ -111,7 +113,8 @@ def _cola2(export: Export) -> list[str]:
         f"{'at most ' if outlook.at_most else ''}{share(outlook.share_at_overlap)} of the area is "
         "expected to be seen at the requested overlap"
     )
-    if outlook.offset_m > outlook.allowed_m or outlook.at_most:
+    exceeds = outlook.offset_m > outlook.allowed_m or outlook.at_most
+    if exceeds and (chosen or not follower.sways):
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
         warn(
             f"{expected}: lay lines along the current (line_heading_deg = {towards_deg:.0f}), wait "
@@ -120,7 +123,7 @@ def _cola2(export: Export) -> list[str]:
     return [
         *lines,
         f"{expected[0].upper()}{expected[1:]}. To see it flown: alice-survey fly --mission FILE. "
-        "What helps: lines along the current, closer lines (plan.track_error_m), a longer run-in.",
+        "What helps: lines along the current, and closer lines (plan.track_error_m).",
     ]
 
 

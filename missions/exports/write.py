@@ -52,7 +52,7 @@ def write_exports(
         files |= each.write(folder, export)
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
-    _write_about(about, export, files, advice(export, names))
+    _write_about(about, export, files, advice(export, names, chosen=formats is not None))
     return files
 
 

@@ -58,7 +58,7 @@ def _in_comment(text: str) -> str:
 
 def root_of(text: str) -> ET.Element | None:
     """The root of a document; None where the text is no XML, or declares entities."""
-    if "<!DOCTYPE" in text or not text.lstrip("\ufeff \t\r\n").startswith("<"):
+    if "!DOCTYPE" in text or not text.lstrip("\ufeff \t\r\n").startswith("<"):
         return None
     try:
         return ET.fromstring(text.lstrip("\ufeff"))  # noqa: S314  no entities

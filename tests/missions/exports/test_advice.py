@@ -1,0 +1,113 @@
+"""What exports say beforehand of the vehicles that will follow them."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alice_survey.base.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
+from alice_survey.base.errors import heard
+from alice_survey.vehicle.pilot.cola2 import steady_drift
+from missions.coverage.stations import stations_of_plan
+from missions.exports.follower import (
+    end_tolerance_m,
+    follower_of,
+    line_offset_m,
+    predicted_stations,
+)
+from missions.exports.options import Options, options_of
+from missions.exports.write import write_exports
+from tests.missions.exports.plans import RIG, small_plan
+
+
+def options(vehicle: str = "alice", **sea: Any) -> Options:
+    wanted = SeaConfig(**({"gust_n": (0.0, 0.0, 0.0)} | sea))
+    return options_of(CameraConfig(), PlanConfig(), VehicleConfig(name=vehicle), wanted)
+
+
+def about(folder: Path, given: Options, formats: list[str] | None) -> tuple[str, list[str]]:
+    with heard() as warnings:
+        write_exports(folder, small_plan(), RIG, formats=formats, options=given)
+    return (folder / "about.txt").read_text(), list(warnings)
+
+
+def test_the_parameters_to_set_are_stated(tmp_path: Path) -> None:
+    text, warnings = about(tmp_path, options(current_mps=0.0), None)
+    follower = follower_of(VehicleConfig(), SeaConfig(current_mps=0.0), 0.2)
+    assert f"section/delta {follower.delta_m:.1f} m" in text
+    for name in ("section/tolerance_z", "section/min_surge_velocity", "WPNAV_RADIUS 12 cm",
+                 "WPNAV_SPEED 20 cm/s", "WP_YAW_BEHAVIOR"):  # fmt: skip
+        assert name in text
+    assert "in the expected current of 0 m/s" in text.lower()
+    assert not warnings
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "formats", "towards_deg", "warns"),
+    [
+        ("alice", ["cola2"], 90.0, True),  # lines run north and south
+        ("alice", ["cola2"], 0.0, False),
+        ("alice", ["wpl"], 90.0, False),
+        ("alice", None, 90.0, False),
+        ("sparus2", None, 90.0, True),
+    ],
+)
+def test_lines_that_cola2_cannot_hold_are_said_beforehand(
+    vehicle: str, formats: list[str] | None, towards_deg: float, warns: bool, tmp_path: Path
+) -> None:
+    given = options(vehicle, current_mps=0.1, current_towards_deg=towards_deg)
+    _, warnings = about(tmp_path, given, formats)
+    assert any("COLA2 holds" in text for text in warnings) == warns
+    assert all("\n" not in text for text in warnings)
+
+
+def test_the_outlook_is_the_plan_moved_down_the_current() -> None:
+    plan = small_plan()
+    follower = options(current_mps=0.05, current_towards_deg=90.0).follower
+    assert follower is not None
+    # Of the glass 0.55 m ahead of a vehicle that heads upstream.
+    wanted = (follower.delta_m - 0.55) * steady_drift(0.05, 0.2)
+    north = line_offset_m(follower, 0.0, 0.2, 0.55)
+    assert (
+        north
+        == pytest.approx(wanted)
+        == pytest.approx(-line_offset_m(follower, math.pi, 0.2, 0.55))
+    )
+    assert line_offset_m(follower, math.pi / 2, 0.2, 0.55) == pytest.approx(0.0, abs=1e-12)
+
+    exact, moved = stations_of_plan(plan), predicted_stations(plan, follower, 0.55)
+    off = moved.glass_ne - exact.glass_ne
+    survey = exact.line < 4
+    np.testing.assert_allclose(off[survey, 0], 0.0, atol=1e-9)
+    assert np.all((off[survey, 1] > 0.0) & (off[survey, 1] < wanted))
+    turned = moved.attitude_rad[survey, 2] - exact.attitude_rad[survey, 2]
+    np.testing.assert_allclose(np.abs(turned), math.asin(steady_drift(0.05, 0.2)), atol=1e-9)
+    still = options(current_mps=0.0).follower
+    assert still is not None
+    np.testing.assert_allclose(
+        predicted_stations(plan, still, 0.55).glass_ne, exact.glass_ne, atol=1e-9
+    )
+
+
+def test_gusts_push_it_off_as_much_as_they_are_strong() -> None:
+    weak, strong = (
+        follower_of(VehicleConfig(), SeaConfig(gust_n=(0.0, force, 0.0)), 0.2)
+        for force in (0.25, 0.5)
+    )
+    # Quadratic damping takes a share: less than twice as far.
+    assert 0.02 < weak.wander_m < strong.wander_m < 2.0 * weak.wander_m
+    # 0.14 m in the flights of `python -m benchmarks.missions`.
+    assert 0.10 < strong.wander_m < 0.22
+    assert strong.mode_per_s.real < 0.0
+
+
+def test_tolerances_grow_with_the_current() -> None:
+    calm, fast = (
+        end_tolerance_m(follower_of(VehicleConfig(), SeaConfig(current_mps=speed), 0.2))
+        for speed in (0.0, 0.1)
+    )
+    assert 0.34 < calm < 0.44
+    # 30 degrees a second is the most that a vehicle is asked to turn.
+    assert fast - calm == pytest.approx(0.1 / math.radians(30.0), rel=1e-6)
