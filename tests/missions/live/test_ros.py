@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,7 +45,8 @@ DOMAIN = {
     **os.environ,
     "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+    "FASTDDS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("loopback.xml")),
+    "ROS_LOG_DIR": f"{tempfile.gettempdir()}/alice-survey-ros-{os.getpid()}",
 }
 """One domain a test process, on the loopback alone."""
 
@@ -331,8 +333,8 @@ class Navigator:
 
 @pytest.fixture
 def navigator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Navigator]:
-    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTDDS_BUILTIN_TRANSPORTS"):
-        monkeypatch.setenv(name, DOMAIN[name])
+    for name, value in DOMAIN.items():
+        monkeypatch.setenv(name, value)
     made = Navigator()
     yield made
     made.close()
