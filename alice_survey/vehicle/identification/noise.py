@@ -90,24 +90,3 @@ def correlated_information(slopes: Sequence[Array], covariance: Array) -> Array:
             filtered = fftconvolve(run, np.concatenate([lags[:0:-1], lags])[:, None], axes=0)
             total += run.T @ filtered[len(lags) - 1 : len(lags) - 1 + len(run)]
     return 0.5 * (total + total.T)
-
-
-def score_information(scores: Sequence[Array], lags: int) -> Array:
-    """Covariance of the sum of scores correlated in time, (P, P), positive definite.
-
-    A score is what a row of the log adds to S^T e, over all channels: those that one force moves
-    together count together. The covariances at each lag are tapered linearly (W. K. Newey &
-    K. D. West, Econometrica 55(3), 1987).
-
-    Args:
-        scores: (N_i, P), independent runs.
-        lags: number of rows over which scores are correlated.
-    """
-    width = scores[0].shape[1]
-    total = np.zeros((width, width))
-    for run in scores:
-        total += run.T @ run
-        for lag in range(1, min(lags, len(run) - 1) + 1):
-            product = run[lag:].T @ run[:-lag]
-            total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
-    return total

@@ -27,7 +27,7 @@ from alice_survey.vehicle.identification.covariance import (
 )
 from alice_survey.vehicle.identification.noise import autocovariance, noise_sigma
 from alice_survey.vehicle.identification.parameters import Parameters
-from alice_survey.vehicle.identification.prior import Prior, PriorSigmas, prior_of
+from alice_survey.vehicle.identification.prior import PriorSigmas, StartPrior, prior_of
 from alice_survey.vehicle.identification.sensitivity import (
     CHANNELS,
     START,
@@ -193,7 +193,7 @@ class _FitProblem:
         parameters: Parameters,
         how: Simulation,
         sigma: Array,
-        prior: Prior | None,
+        prior: StartPrior | None,
         settled: float = _SETTLED,
     ) -> None:
         self.windows, self.parameters, self.how, self.settled = windows, parameters, how, settled

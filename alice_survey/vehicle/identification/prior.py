@@ -87,7 +87,7 @@ def read_prior(text: str) -> PriorSigmas | None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Prior:
+class StartPrior:
     """A normal distribution of each parameter, or of its logarithm."""
 
     start: Array
@@ -117,7 +117,7 @@ class Prior:
 
 def prior_of(
     parameters: Parameters, windows: Sequence[Window], sigmas: PriorSigmas | None
-) -> Prior | None:
+) -> StartPrior | None:
     """The prior of parameters for a fit to windows; None if there is none."""
     if sigmas is None:
         return None
@@ -143,7 +143,7 @@ def prior_of(
             sigma[k] = relative * scale
     if not np.any(np.isfinite(sigma)):
         return None
-    return Prior(start=start, sigma=sigma, logarithmic=logarithmic)
+    return StartPrior(start=start, sigma=sigma, logarithmic=logarithmic)
 
 
 def _speeds(windows: Sequence[Window]) -> Array:

@@ -21,7 +21,7 @@ from alice_survey.vehicle.files import read_table, validated
 from alice_survey.vehicle.identification.drawing import draw_replay
 from alice_survey.vehicle.identification.given import given_log, given_values, given_vehicle
 from alice_survey.vehicle.identification.output_error import Simulation
-from alice_survey.vehicle.identification.parameters import CURRENTS, OTHERS, Parameters
+from alice_survey.vehicle.identification.parameters import CURRENTS, GAINS, OTHERS, Parameters
 from alice_survey.vehicle.identification.sensitivity import with_given
 from alice_survey.vehicle.identification.validation import fit_percent, measured_start, simulated
 from alice_survey.vehicle.identification.windows import make_windows, of_windows
@@ -300,10 +300,9 @@ def _text(found: Replay, vehicle: Vehicle, data: dict[str, Any], options: Replay
         f"started from what was measured {len(starts)} times, at {listed}{more} s (the log's "
         f"start, gaps{resets}); the longest stretch is {data['longest_stretch_s']:.4g} s",
     ]
-    if data["others"]:
-        lines.append(
-            "with " + ", ".join(f"{name} {value:.4g}" for name, value in data["others"].items())
-        )
+    set_ = {name: value for name, value in data["others"].items() if value != float(name in GAINS)}
+    if set_:
+        lines.append("with " + ", ".join(f"{name} {value:.4g}" for name, value in set_.items()))
     if options.given:
         lines.append(f"{', '.join(options.given)} follow the log")
     lines += [

@@ -48,8 +48,6 @@ TWO_STEP_FREE = ("X_udot", "X_uu", "Z_wdot", "Z_ww", "N_rdot", "N_rr")
 """Parameters free by default; the second as in the paper's three manoeuvres."""
 _VALIDATION_WINDOW_S = 10.0
 _HIGH_CORRELATION = 0.9
-_LONG_CORRELATION = 0.2
-"""Correlation time, by the length of windows, from which their sigmas are not to be trusted."""
 _POOR = 0.25
 """Relative sigma of a coefficient that the logs hardly determine."""
 
@@ -311,7 +309,6 @@ def _remarks(result: _Identified) -> list[str]:
         if math.isfinite(value)
     )  # fmt: skip
     lines.append(f"residuals: {sigma}")
-    spans = [w.record.time_s[-1] - w.record.time_s[0] for w in fit.windows]
     white = np.sqrt(np.diag(fit.white_covariance))
     ratio = np.max(np.where(fit.at_bound, 1.0, fit.sigma / np.where(white > 0, white, 1.0)))
     longest = float(np.nanmax(fit.correlation_s))
@@ -320,11 +317,6 @@ def _remarks(result: _Identified) -> list[str]:
             f"Residuals are correlated (over {longest:.2g} s): the model misses something or the "
             f"vehicle was pushed unseen. Sigmas allow for it (up to {ratio:.2g} times those of "
             "white noise), but not for what a wrong model shifts."
-        )
-    if longest > _LONG_CORRELATION * float(np.median(spans)):
-        lines.append(
-            f"They are correlated over much of the {np.median(spans):.3g} s that are simulated in "
-            "one go: sigmas are too small; simulate shorter stretches (--window)"
         )
     return lines
 

@@ -7,7 +7,6 @@ from alice_survey.vehicle.identification.noise import (
     autocovariance,
     correlated_information,
     noise_sigma,
-    score_information,
 )
 from tests.oracles_identification import dense_information
 
@@ -51,20 +50,3 @@ def test_information_is_that_of_the_written_out_matrix(count: int) -> None:
     runs = [rng.normal(size=(rows, 3)) for rows in (40, 25)]
     expected = sum(dense_information(run, lags) for run in runs)
     np.testing.assert_allclose(correlated_information(runs, lags), expected, rtol=1e-10, atol=1e-9)
-
-
-def test_scores_of_one_push_count_together() -> None:
-    rng = np.random.default_rng(5)
-    sums, estimates = [], []
-    for _ in range(300):
-        push = rng.normal(size=(400, 1))
-        # Each push is felt for five rows, by both scores alike.
-        felt = np.apply_along_axis(np.convolve, 0, push, np.ones(5), mode="valid")
-        scores = np.column_stack([felt, 2 * felt])
-        sums.append(scores.sum(axis=0))
-        estimates.append(score_information([scores], 25))
-    expected, mean = np.cov(np.array(sums).T), np.mean(estimates, axis=0)
-    np.testing.assert_allclose(mean, expected, rtol=0.25)
-    assert np.linalg.eigvalsh(estimates[0])[0] > -1e-9 * np.linalg.eigvalsh(estimates[0])[1]
-    white = rng.normal(size=(500, 3))
-    np.testing.assert_allclose(score_information([white], 0), white.T @ white)
