@@ -152,7 +152,7 @@ def _tied(
 ) -> list[tuple[int, int]]:
     """Dives that share a line each, or those given where these would be more or dear."""
     fill = np.array([line.kind == "fill" for line in lines])
-    joined = _least_dives(sums, limits, np.flatnonzero(fill) + 1, overlap=1)
+    joined = _least_dives(sums, limits, (np.flatnonzero(fill) + 1).tolist(), overlap=1)
     if joined is None or len(joined) > len(parted):
         return parted
     energy_j, apart_j = (sum(sums.of(*dive)[0] for dive in dives) for dives in (joined, parted))
@@ -211,7 +211,7 @@ def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth
 
 
 def _least_dives(
-    sums: _Sums, limits: DiveLimits, not_at: Sequence[int] | Array = (), overlap: int = 0
+    sums: _Sums, limits: DiveLimits, not_at: Sequence[int] = (), overlap: int = 0
 ) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
 
