@@ -274,9 +274,10 @@ def light_rows(
          f"fills {budget.full_share:.1%} of the well of {limits.full_well_e:g} e"),
         ("electrons, corner", budget.corner_e, "e", "the same, with cos^4", _SOURCE, "lens, beam",
          ""),
-        ("sharp light, centre", budget.sharp_share, "%", "exp(-(m' - m) s)", _FORWARD_SOURCE,
-         "water", "share of these electrons that is detail: the water scatters the rest by a few "
-         "degrees on its way from the floor, which blurs"),
+        ("sharp light, centre", budget.sharp_share, "%", f"exp(-{SEEN_SHARE:.3f} b s)",
+         _FORWARD_SOURCE, "water",
+         "share of these electrons that is detail: the water scatters the rest by a few degrees "
+         "on its way from the floor, which blurs"),
         ("signal to noise", budget.snr_centre, "", "sharp S / sqrt(S + read^2)",
          "Poisson shot noise and read noise", "electrons",
          f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "

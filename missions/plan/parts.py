@@ -6,6 +6,7 @@ its part: between them the vehicle is carried, or goes at the surface.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -21,7 +22,7 @@ from missions.route.dives import split_dives
 from missions.route.fence import TOUCH_M
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
-from missions.values.costs import Costs
+from missions.values.costs import Costs, power_at
 from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.pattern import Pattern
@@ -88,7 +89,8 @@ def plan_parts(
     if len(parts) > 1:
         warn(
             f"{len(parts)} parts are surveyed by {len(whole.dives)} dives, each launched and "
-            "recovered in its part: fly them one by one (vehicle.dive)"
+            "recovered in its part: fly them one by one (vehicle.dive). "
+            + transit_text(whole.dives, costs, usable_wh)
         )
     if len(whole.dives) > len(parts) and not (tied or wanted.cross_lines):
         room = "" if wanted.tie_dives else ", plan.tie_dives = true flies a line of each again"
@@ -97,6 +99,40 @@ def plan_parts(
             f"alone: plan.cross_lines = 1 crosses the lines of all of them{room}"
         )
     return whole
+
+
+def transit_text(dives: Sequence[Dive], costs: Costs, usable_wh: float) -> str:
+    """What it takes to go from dive to dive at the surface, and how many charges all then need.
+
+    Each charge holds as many dives, one after the other, as fit with the ways between them; by the
+    power of ways between lines. Ascent and descent are in the dives.
+
+    Args:
+        dives: in order; where one begins elsewhere than the one before there is a way.
+        costs: of the vehicle.
+        usable_wh: of the battery.
+    """
+    ways_m, ways_wh = [], []
+    for before, after in pairwise(dives):
+        (north, east), (north_2, east_2) = before.home_ne_m, after.home_ne_m
+        way_m = math.hypot(north_2 - north, east_2 - east)
+        power_w = power_at(costs.way_w, math.atan2(east_2 - east, north_2 - north))
+        ways_m.append(way_m)
+        ways_wh.append(way_m / costs.speed_mps * power_w / 3600.0)
+    charges, spent_wh = 1, dives[0].energy_wh
+    for dive, way_wh in zip(dives[1:], ways_wh, strict=True):
+        spent_wh += way_wh + dive.energy_wh
+        if spent_wh > usable_wh:
+            charges, spent_wh = charges + 1, dive.energy_wh
+    total_m = sum(ways_m)
+    text = (
+        f"At the surface the {total_m:.0f} m between them take "
+        f"{total_m / costs.speed_mps / 60:.0f} min and {sum(ways_wh):.1f} Wh"
+    )
+    if charges == len(dives):
+        return f"{text}, but no charge holds two dives and the way between: carry the vehicle"
+    held = "one charge holds" if charges == 1 else f"{charges} charges hold"
+    return f"{text}: {held} all dives without recovery between them"
 
 
 def parts_of(area: Area, home_ne: Place) -> list[tuple[Area, Place]]:
