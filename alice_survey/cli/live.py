@@ -71,11 +71,11 @@ def pilot(
     from alice_survey.survey import settings
     from missions.live.loop import LinkLimits
     from missions.live.mavlink_pilot import pilot_over_mavlink
-    from missions.live.mission import Mission
+    from missions.live.mission import LiveMission
     from missions.live.ros_pilot import Topics, pilot_over_ros
     from missions.live.run import pilot_report
 
-    def fly(mission: Mission) -> None:
+    def fly(mission: LiveMission) -> None:
         if mavlink is not None:
             pilot_over_mavlink(mission, mavlink, sim_time=sim_time)
         else:

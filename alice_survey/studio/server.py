@@ -35,7 +35,7 @@ _ENDING_S = 3
 _MOST_CONNECTIONS = 400
 
 
-class _Connection(H11Protocol):
+class _TimedConnection(H11Protocol):
     """A connection that is closed where its request or the reading of an answer takes too long."""
 
     _deadline: asyncio.TimerHandle | None = None
@@ -92,7 +92,7 @@ class Server:
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 application(workspace, self._layers, frozenset(hosts)),
-                http=_Connection,
+                http=_TimedConnection,
                 ws="none",
                 lifespan="off",
                 log_config=None,

@@ -24,7 +24,7 @@ from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.simulated_vehicle import TICK_S
 from missions.live.loop import Command, LinkState, Odometry
-from missions.live.mission import Mission
+from missions.live.mission import LiveMission
 
 GUIDED, SURFACE = 4, 9
 """Modes of ArduSub."""
@@ -54,7 +54,7 @@ _SILENCE_S = 60.0
 """With simulated time nothing ticks without messages: it ends after so long without one."""
 
 
-def pilot_over_mavlink(mission: Mission, address: str, *, sim_time: bool) -> None:
+def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) -> None:
     """Fly a mission with ArduSub until it is over or interrupted.
 
     Args:
@@ -100,7 +100,7 @@ def pilot_over_mavlink(mission: Mission, address: str, *, sim_time: bool) -> Non
 class MavlinkPilot:
     """A mission and what the vehicle says of itself; the wall's time is an argument."""
 
-    def __init__(self, mission: Mission, mav: Any, *, sim_time: bool) -> None:
+    def __init__(self, mission: LiveMission, mav: Any, *, sim_time: bool) -> None:
         """A pilot that has heard nothing yet.
 
         Args:

@@ -53,7 +53,7 @@ def need_thrusters_alone(vehicle: Vehicle) -> None:
 
 
 @dataclass(eq=False)
-class Mission:
+class LiveMission:
     """A plan with the loop that flies it, and a row for each tick."""
 
     plan: Plan
@@ -119,7 +119,7 @@ def mission_of(
     settings: FlightSettings,
     limits: LinkLimits,
     altimeter_body_m: tuple[float, float, float] | None = None,
-) -> Mission:
+) -> LiveMission:
     """A mission that flies a plan.
 
     Args:
@@ -145,4 +145,4 @@ def mission_of(
         limits=limits,
     )
     thrusters = tuple(thruster.name for thruster in flies.vehicle.thrusters)
-    return Mission(plan, loop, flies.vehicle.name, thrusters)
+    return LiveMission(plan, loop, flies.vehicle.name, thrusters)

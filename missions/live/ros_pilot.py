@@ -12,7 +12,7 @@ from typing import Any
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.simulated_vehicle import TICK_S
 from missions.live.loop import Command, LinkState
-from missions.live.mission import Mission
+from missions.live.mission import LiveMission
 from missions.live.ros_messages import (
     RosLibrary,
     flipped_pair,
@@ -48,7 +48,7 @@ class Topics:
     state: str = "pilot/state"
 
 
-def pilot_over_ros(mission: Mission, topics: Topics, *, sim_time: bool) -> None:
+def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> None:
     """Fly a mission until it is over or interrupted; thrusters are off then.
 
     Args:
@@ -81,7 +81,9 @@ def pilot_over_ros(mission: Mission, topics: Topics, *, sim_time: bool) -> None:
 
 
 class _PilotNode:
-    def __init__(self, ros: RosLibrary, mission: Mission, topics: Topics, sim_time: bool) -> None:
+    def __init__(
+        self, ros: RosLibrary, mission: LiveMission, topics: Topics, sim_time: bool
+    ) -> None:
         from rclpy.clock import Clock, ClockType
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.parameter import Parameter

@@ -13,7 +13,7 @@ from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
 from missions.fly.run import flight_noise, true_floor
 from missions.fly.simulation import flight_settings, longest_mission_s, mission_setup
 from missions.live.loop import LinkLimits
-from missions.live.mission import Mission, mission_of, need_thrusters_alone, plan_to_fly
+from missions.live.mission import LiveMission, mission_of, need_thrusters_alone, plan_to_fly
 from missions.live.ros_vehicle import Pace, vehicle_over_ros
 
 _ALTIMETER_STREAM = 21
@@ -23,7 +23,7 @@ def pilot_report(
     workspace: Path,
     survey: SurveyConfig,
     limits: LinkLimits,
-    fly: Callable[[Mission], None],
+    fly: Callable[[LiveMission], None],
     *,
     altimeter_body_m: tuple[float, float, float] | None,
     record: Path | None,
@@ -55,7 +55,7 @@ def pilot_report(
     return _result(mission)
 
 
-def _result(mission: Mission) -> tuple[str, dict[str, Any]]:
+def _result(mission: LiveMission) -> tuple[str, dict[str, Any]]:
     loop = mission.loop
     return mission.summary(), {
         "ending": loop.ending,

@@ -10,7 +10,7 @@ from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.live.loop import LinkLimits, Odometry
-from missions.live.mission import Mission, mission_of
+from missions.live.mission import LiveMission, mission_of
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import plan_of, walk
 
@@ -42,7 +42,9 @@ class LoopFlight:
         survey = survey or SurveyConfig()
         self.plan = small_plan()
         self.vehicle = vehicle_afloat(self.plan, survey)
-        self.mission: Mission = mission_of(self.plan, flight_settings(survey), LinkLimits(**limits))  # type: ignore[arg-type]
+        self.mission: LiveMission = mission_of(
+            self.plan, flight_settings(survey), LinkLimits(**limits)
+        )  # type: ignore[arg-type]
         self.loop = self.mission.loop
         self.glass: list[Array] = []
         self.clock_offset_s = 0.0
