@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord, write_manifest
 from alice_survey.base.records import (
     CamerasRecord,
@@ -20,7 +21,9 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, write_rig
 from reconstruct.adjustment.exact_observations import Pixels
 from reconstruct.mapping.arrays import Indices
-from reconstruct.mapping.mapper import model_baseline
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.refraction import Keypoints
 from reconstruct.matching.matches import as_seen
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
 
@@ -45,10 +48,10 @@ def write_mapped(
         unmatched: keypoints of every picture that have no point.
     """
     warps, images, mapping = pinhole_warps(rig), workspace / "images", workspace / "mapping"
-    model = _model(rig, survey, records, warps, unmatched)
+    mapped = _model(rig, survey, records, warps, unmatched)
     (mapping / "model").mkdir(parents=True)
     (workspace / "calibration").mkdir()
-    model.write_binary(mapping / "model")
+    mapped.model.write_binary(mapping / "model")
     write_rig(workspace / "calibration" / "rig.json", rig)
     for number, (name, camera) in enumerate(rig.cameras.items()):
         first = images / records[number].image  # of a camera, its first alone is looked at
@@ -63,8 +66,8 @@ def write_mapped(
         {"cameras": {name: warp.to_json() for name, warp in warps.items()}, "images": known},
     )
     MappingRecord(
-        registered=len(records), total=len(records), models=(len(records),), scaled=True,
-        baseline=model_baseline(model), rig_factor=1.0,
+        registered=len(records), total=len(records), models=mapped.models, scaled=True,
+        baseline=mapped.baseline, rig_factor=1.0,
         distances=RangeRecord(near_m=NEAR_M, far_m=FAR_M, source="synthetic"),
     ).write(mapping / "mapping.json")  # fmt: skip
 
@@ -75,7 +78,8 @@ def _model(
     records: list[ImageRecord],
     warps: dict[str, PinholeWarp],
     unmatched: int,
-) -> pycolmap.Reconstruction:
+) -> Mapped:
+    """The model, its keypoints where its pinholes see them."""
     rng = np.random.default_rng(0)
     names, pixels, start = list(rig.cameras), survey.pixels, near_start(survey.truth)
     in_rig = {name: warps[name].pinhole_from_cam * rig.cam_from_rig[name] for name in names}
@@ -92,6 +96,7 @@ def _model(
         else:
             colmap_rig.add_sensor(camera.sensor_id, rigid3d(in_rig[name] * from_reference))
     model.add_rig(colmap_rig)
+    keypoints: list[Array] = []
     of_picture, row = _by_picture(pixels, len(names), len(records))
     poses = RigidTransform.from_components(start.centres, Rotation.from_matrix(start.turns))
     for station, pose in enumerate(poses):
@@ -104,7 +109,8 @@ def _model(
         for c, number in enumerate(numbers):
             taken = pixels.taken[of_picture[number - 1]]
             aside = rng.uniform([1, 1], warps[names[c]].size_px, (unmatched, 2)) - 1
-            seen = as_seen(np.concatenate([taken, aside]), warps[names[c]])
+            keypoints.append(np.concatenate([taken, aside]))
+            seen = as_seen(keypoints[-1], warps[names[c]])
             rows = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in seen])
             model.add_image(
                 pycolmap.Image(
@@ -119,8 +125,15 @@ def _model(
         own = range(starts[point], starts[point + 1])
         track = [pycolmap.TrackElement(picture[o], rows[o]) for o in own]
         model.add_point3D(xyz, pycolmap.Track(track))
+    mapped = Mapped(
+        model=model, warps=warps, models=(len(records),), scaled=True,
+        baseline=model_baseline(model), rig_factor=1.0,
+    )  # fmt: skip
+    cameras = {name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()}
+    seen = Observations(images=records, cameras=cameras, taken=keypoints, pairs=(), warps=warps)
+    Keypoints(mapped, seen).correct(model, 1.0)
     model.update_point_3d_errors()
-    return model
+    return mapped
 
 
 def _by_picture(pixels: Pixels, cameras: int, pictures: int) -> tuple[list[Indices], Indices]:
