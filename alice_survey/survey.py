@@ -122,9 +122,12 @@ def run(
     executor = executor or local_executor()
     with _only_one(workspace):
         if "fly" in stages and "plan" not in stages:
-            state = spec("plan").state(workspace, planned, {})
-            if state.startswith("stale"):
-                warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
+            by = flight or FlightChanges()  # what a plan may have been made with
+            alike = [planned, changed(planned, "vehicle", name=by.vehicle)]
+            alike.append(changed(alike[1], "vehicle", controller=by.controller))
+            states = [spec("plan").state(workspace, one, {}) for one in alike]
+            if all(state.startswith("stale") for state in states):
+                warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
                 task_mib = task_memory_mib(stage.name, workspace, config)

@@ -114,7 +114,7 @@ def simulate(
     ] = None,
     patience: Annotated[
         float, typer.Option(min=1, help="s to wait for a command at rate 0.")
-    ] = 60.0,
+    ] = 600.0,
     track: Annotated[Path | None, typer.Option(help="CSV of the true track.")] = None,
     as_json: AsJson = False,
 ) -> None:

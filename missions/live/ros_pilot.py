@@ -30,8 +30,9 @@ from missions.logs.ros_builder import CLOCK, JOINTS, ODOMETRY, RANGE, STRING, WR
 _WAIT_S = 0.1
 _FAREWELLS = 3
 """Commands of no thrust when the node ends."""
-_SILENCE_S = 60.0
-"""With simulated time nothing ticks without a clock: it ends after so long without one."""
+_FIRST_S, _SILENCE_S = 600.0, 60.0
+"""With simulated time nothing ticks without a clock: it ends after so long without one, at first
+(the simulator may have to compile) and later."""
 _STATE_TICKS = 20
 """The state is published every so many ticks, and whenever it changes."""
 
@@ -68,9 +69,10 @@ def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> N
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)
-                if sim_time and time.monotonic() - node.ticked > _SILENCE_S:
+                most_s = _SILENCE_S if mission.loop.ticks else _FIRST_S
+                if sim_time and time.monotonic() - node.ticked > most_s:
                     raise VehicleError(
-                        f"/clock stood still for {_SILENCE_S:g} s: start the simulator first, or "
+                        f"/clock stood still for {most_s:g} s: start the simulator first, or "
                         "fly without --sim-time"
                     )
         finally:

@@ -57,7 +57,7 @@ class Pace:
     """Simulated over wall time; 0 waits for the command of each tick."""
     longest_s: float = math.inf
     """Simulated time after which it ends."""
-    patience_s: float = 60.0
+    patience_s: float = 600.0
     """Wall time for which it waits for a command, at rate 0."""
 
 

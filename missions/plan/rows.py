@@ -103,7 +103,7 @@ def _hotel_note(plan: Plan, vehicle: VehicleConfig) -> str:
     """What of the energy is hotel load, and where that load has no source."""
     load = hotel_w(vehicle)
     note = f"hotel load {load:g} W is {load * plan.duration_s / 3600 / plan.energy_wh:.0%} of it"
-    if "hotel_w" in vehicle.model_fields_set or vehicle.name not in ("alice", "sparus2"):
+    if "hotel_w" in vehicle.model_fields_set or vehicle.file is not None:
         return note
     return (
         f"{note}, and is inferred: measure what your vehicle draws with its thrusters at rest, "

@@ -16,7 +16,7 @@ from alice_survey import stages
 from alice_survey.base import records
 from alice_survey.base.artefacts import JsonRecord, read_stage
 from alice_survey.base.config import SurveyConfig, load_config
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.errors import WorkspaceError, heard
 from alice_survey.base.executor import Executor
 from alice_survey.cli.main import app
 from alice_survey.report.figures import Figures
@@ -24,7 +24,7 @@ from alice_survey.report.held import Held
 from alice_survey.report.sections import sections
 from alice_survey.report.verdicts import verdicts
 from alice_survey.stages import STAGES, StageSpec, spec
-from alice_survey.survey import run, workspace_status
+from alice_survey.survey import FlightChanges, run, workspace_status
 
 OLD = Path(__file__).parent / "workspace_0_1_0.zip"
 """Made with version 0.1.0: records and small files as it wrote them, others cut short."""
@@ -269,3 +269,19 @@ def test_a_stage_added_in_one_file_is_run_shown_reported_and_documented(
     record = read_stage(tmp_path / "toys")
     assert record is not None
     assert (record.stage, record.version, record.settings) == ("toys", 1, {"seed": 3})
+
+
+def test_a_plan_made_for_a_vehicle_is_not_stale_when_that_flies(tmp_path: Path) -> None:
+    (tmp_path / "survey.toml").write_text(
+        "[area]\nlength_m = 1.0\nwidth_m = 1.2\nseafloor_depth_m = 5.0\n"
+        "[plan]\ncross_lines = 0\nclosing_line = false\n[seafloor]\ngrid_m = 0.05\n"
+    )
+    for_sparus = FlightChanges(vehicle="sparus2", controller="los")
+    with heard() as planning:
+        run(["plan"], tmp_path, None, flight=for_sparus)
+    with heard() as flying:
+        run(["fly"], tmp_path, None, flight=for_sparus)
+    assert not any("stale" in text for text in [*planning, *flying])
+    with heard() as others:
+        run(["fly"], tmp_path, None)
+    assert sum("the plan is stale (changed: vehicle.name" in text for text in others) == 1

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from alice_survey.base.config import DEFAULT_VEHICLE
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import read_table, validated
@@ -39,7 +40,7 @@ _DRIFTS = range(6, 12)
 class ReplayOptions:
     """Options of `vehicle replay`."""
 
-    vehicle: str = "alice"
+    vehicle: str = DEFAULT_VEHICLE
     coefficients: str | None = None
     """A named set or a file; the vehicle's own if not given. What a file of `vehicle identify` says
     of buoyancy, trim, biases and gains is taken, too; its current is of another day."""

@@ -244,7 +244,7 @@ def test_dive_over_udp(tmp_path: Path) -> None:
                 sys.executable, "-m", "alice_survey", "pilot", "-w", str(tmp_path), "--sim-time",
                 "--mavlink", f"udpin:127.0.0.1:{port}", "--record", str(record), "--json",
             ],
-            capture_output=True, text=True, timeout=280, check=False,
+            capture_output=True, text=True, timeout=900, check=False,
         )  # fmt: skip
         fake.wait(60)
     finally:

@@ -222,9 +222,9 @@ def test_dive_of_two_processes_covers_what_the_closed_loop_does(workspace: Path)
             command(
                 "pilot", "-w", str(workspace), "--sim-time", "--record", str(record), "--json"
             ),
-            env=DOMAIN, capture_output=True, text=True, timeout=280, check=False,
+            env=DOMAIN, capture_output=True, text=True, timeout=900, check=False,
         )  # fmt: skip
-        said, _ = at_sea.communicate(timeout=60)
+        said, _ = at_sea.communicate(timeout=240)
     finally:
         at_sea.kill()
     assert pilot.returncode == 0, pilot.stderr
@@ -316,7 +316,7 @@ class Navigator:
             ros_messages.odometry_message(self.ros.build, odometry, "alice/base_link", np.zeros(6))
         )
 
-    def until(self, holds: Any, *, depth: float | None, most_s: float = 120.0) -> None:
+    def until(self, holds: Any, *, depth: float | None, most_s: float = 600.0) -> None:
         """Spin, and publish odometry if there is a depth, until something holds."""
         end = time.monotonic() + most_s
         while not holds():
