@@ -37,6 +37,9 @@ from alice_survey.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure
 from alice_survey.vehicle.rotations import wrapped
 from alice_survey.vehicle.simulated_vehicle import TICK_S
 
+FIRST_S, SILENCE_S = 600.0, 60.0
+"""With simulated time nothing ticks without messages: a transport ends after so long without one,
+at first (the simulator may have to compile) and later."""
 _LONGEST_STEP_S = 4.0 * TICK_S
 """The pilot's integrals and timers advance by no more in a tick."""
 _SAME_S = 1e-6

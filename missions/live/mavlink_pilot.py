@@ -23,7 +23,7 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.simulated_vehicle import TICK_S
-from missions.live.loop import Command, LinkState, Odometry
+from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState, Odometry
 from missions.live.mission import LiveMission
 
 GUIDED, SURFACE = 4, 9
@@ -50,8 +50,6 @@ _ASK_S = 1.0
 _ASKED_BEFORE_SETTING = 3
 """A vehicle that does not state its origin so many times has none: it is given the datum."""
 _WAIT_S = 0.005
-_SILENCE_S = 60.0
-"""With simulated time nothing ticks without messages: it ends after so long without one."""
 
 
 def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) -> None:
@@ -81,16 +79,16 @@ def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) ->
             f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
         ) from None
     pilot = MavlinkPilot(mission, link.mav, sim_time=sim_time)
-    heard = time.monotonic()
+    heard, most_s = time.monotonic(), FIRST_S
     try:
         while mission.loop.state != LinkState.OVER:
             message = link.recv_match(blocking=True, timeout=_WAIT_S)
             now = time.monotonic()
             if message is not None:
                 pilot.hear(message, now)
-                heard = now
-            elif sim_time and now - heard > _SILENCE_S:
-                raise VehicleError(f"no message came on {address} for {_SILENCE_S:g} s")
+                heard, most_s = now, SILENCE_S
+            elif sim_time and now - heard > most_s:
+                raise VehicleError(f"no message came on {address} for {most_s:g} s")
             pilot.step(now)
     finally:
         pilot.farewell()

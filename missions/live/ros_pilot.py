@@ -11,7 +11,7 @@ from typing import Any
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.simulated_vehicle import TICK_S
-from missions.live.loop import Command, LinkState
+from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState
 from missions.live.mission import LiveMission
 from missions.live.ros_messages import (
     RosLibrary,
@@ -30,9 +30,6 @@ from missions.logs.ros_builder import CLOCK, JOINTS, ODOMETRY, RANGE, STRING, WR
 _WAIT_S = 0.1
 _FAREWELLS = 3
 """Commands of no thrust when the node ends."""
-_FIRST_S, _SILENCE_S = 600.0, 60.0
-"""With simulated time nothing ticks without a clock: it ends after so long without one, at first
-(the simulator may have to compile) and later."""
 _STATE_TICKS = 20
 """The state is published every so many ticks, and whenever it changes."""
 
@@ -69,7 +66,7 @@ def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> N
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)
-                most_s = _SILENCE_S if mission.loop.ticks else _FIRST_S
+                most_s = SILENCE_S if mission.loop.ticks else FIRST_S
                 if sim_time and time.monotonic() - node.ticked > most_s:
                     raise VehicleError(
                         f"/clock stood still for {most_s:g} s: start the simulator first, or "

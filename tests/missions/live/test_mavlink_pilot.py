@@ -246,7 +246,7 @@ def test_dive_over_udp(tmp_path: Path) -> None:
             ],
             capture_output=True, text=True, timeout=900, check=False,
         )  # fmt: skip
-        fake.wait(60)
+        fake.wait(240)
     finally:
         fake.kill()
     assert ended.returncode == 0, ended.stderr
