@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
+from alice_survey.vehicle.allocation import AXIS_WEIGHTS
 from alice_survey.vehicle.floor import floor_range
 from alice_survey.vehicle.navigation.sensors import DVL
 from alice_survey.vehicle.pilot.command import allocate, new_allocation
@@ -45,7 +46,7 @@ class InnerLoops:
         gains = gains_for(vehicle.vehicle, 0.2)
         self.mass, self.least, self.most = (gains.axes[list(AXES), k] for k in (MASS, LEAST, MOST))
         self.allocation = new_allocation(
-            vehicle.vehicle, np.ones(len(vehicle.vehicle.thrusters)), exact=True, holds_level=False
+            vehicle.vehicle, np.ones(len(vehicle.vehicle.thrusters)), exact=True, axes=AXIS_WEIGHTS
         )
         self.total = np.zeros(4)
 
@@ -62,7 +63,7 @@ class InnerLoops:
         estimate = np.zeros(14)
         estimate[6:9], estimate[9:12] = body.apply(truth[7:10]), truth[10:13]
         allocate(wrench, estimate, self.allocation)
-        return self.allocation.command_rps.copy()
+        return self.allocation.command.copy()
 
 
 def fly(port: int, settings: Path, track: Path) -> None:
