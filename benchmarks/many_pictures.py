@@ -355,7 +355,7 @@ def mapping_of(tile: Path, pictures: int, work: Path, threads: int) -> StageCost
     folder, rig = work / "tracks", tile / "calibration" / "rig.json"
     folder.mkdir(exist_ok=True)
     for step in (MAKE, "map"):
-        row = measure(step, pictures, folder, threads, rig)
+        row = measure(step, pictures, folder, threads, "--rig", str(rig))
     if row is None:
         return None
     return StageCost(stage="mapping", pictures=pictures, cpu_s=row.cpu_s, wall_s=math.nan,

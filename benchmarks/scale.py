@@ -1,7 +1,7 @@
 """What the serial parts of a reconstruction cost by the number of pictures: up to 100,000 of them.
 
     python -m benchmarks.scale --work FOLDER [--pictures 1000 5000 10000] [--only STEP ...]
-        [--threads 1] [--quick] [--json FILE]
+        [--threads 1] [--points 100] [--unmatched 1000] [--quick] [--json FILE]
 
 A calibrated stereo rig flies a lawnmower pattern over a rough plane; tracks, footprints and samples
 of light are made from the truth, and no picture is rendered (`benchmarks.scale_steps`). Every step
@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from benchmarks.scale_steps import MAKE, MAPPED, PLACING, STEPS
+from benchmarks.scale_steps import MAKE, MAPPED, MAPPED_POINTS, PLACING, STEPS, UNMATCHED
 
 _MANY = 100_000
 _MOST_GIB = 8.0
@@ -47,16 +47,14 @@ class StepCost:
     """How many of what it works on: observations, pairs, samples."""
 
 
-def measure(
-    step: str, pictures: int, work: Path, threads: int, rig: Path | None = None
-) -> StepCost | None:
-    """Run a step, on an example's rig or that of a file, unless it is done; None if it failed."""
+def measure(step: str, pictures: int, work: Path, threads: int, *more: str) -> StepCost | None:
+    """Run a step, with more options of `scale_steps`, unless it is done; None if it failed."""
     file = work / f"{pictures}" / f"{step}.json"
     if not file.is_file():
         command = [sys.executable, "-m", "benchmarks.scale_steps", step, str(pictures)]
         # threads of libraries that wait for each other count as computing on a busy machine
         alone = {**os.environ, **dict.fromkeys(_THREADS, "1")}
-        command += [str(work), str(threads), *(() if rig is None else ("--rig", str(rig)))]
+        command += [str(work), str(threads), *more]
         ran = subprocess.run(command, check=False, env=alone)
         if ran.returncode:
             return None
@@ -107,12 +105,13 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     rows: dict[str, list[StepCost]] = {}
     failed = []
+    more = ("--points", str(options.points), "--unmatched", str(options.unmatched))
     wanted = {*(options.only or STEPS), MAKE}
     if PLACING in wanted:
         wanted.add(MAPPED)
     for step in [s for s in STEPS if s in wanted]:
         for pictures in sorted(options.pictures):
-            spent = measure(step, pictures, options.work, options.threads)
+            spent = measure(step, pictures, options.work, options.threads, *more)
             if spent is None:
                 failed.append(f"{step} of {pictures} pictures")
                 continue
@@ -136,6 +135,12 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--pictures", type=int, nargs="+", default=[1000, 5000, 10000], metavar="N")
     parser.add_argument("--only", nargs="+", default=[], choices=STEPS, metavar="STEP")
     parser.add_argument("--threads", type=int, default=1, help="workers")
+    parser.add_argument(
+        "--points", type=int, default=MAPPED_POINTS, help="of a station in `map` and `placing`"
+    )
+    parser.add_argument(
+        "--unmatched", type=int, default=UNMATCHED, help="keypoints of a picture in `placing`"
+    )
     add_options(parser, quick="200 and 400 pictures of the demo's rig")
     options = parser.parse_args()
     if options.quick:

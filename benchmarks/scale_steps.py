@@ -1,6 +1,7 @@
 """One step of `benchmarks.scale` in this process, on a survey of synthetic tracks.
 
-python -m benchmarks.scale_steps STEP PICTURES FOLDER THREADS [--rig FILE]
+python -m benchmarks.scale_steps STEP PICTURES FOLDER THREADS [--rig FILE] [--points N]
+    [--unmatched N]
 """
 
 import argparse
@@ -59,10 +60,8 @@ _POINTS = 30
 """On the sea floor, of each station."""
 _LATTICE, _WITNESSES = (28, 22), 8
 """Spots along a view's width and height, and views it is compared with."""
-_MAPPED_POINTS = 100
-"""On the sea floor, of each station, where their matches are mapped or their model is placed."""
-_UNMATCHED = 1000
-"""Keypoints of a picture of such a model that have no point."""
+MAPPED_POINTS, UNMATCHED = 100, 1000
+"""Of a station where matches are mapped, and keypoints of a picture that have no point."""
 _LEAST_MATCHES = 15
 _WRONG, _WRONG_PX = 0.005, 20.0
 """Share of the keypoints that are wrong, and by how much."""
@@ -79,6 +78,10 @@ class StepWork:
     executor: Executor
     rig_file: Path | None = None
     """Of a calibrated rig; an example's is calibrated where there is none."""
+    points: int = MAPPED_POINTS
+    """On the sea floor, of each station, where matches are mapped or their model is placed."""
+    unmatched: int = UNMATCHED
+    """Keypoints of a picture of such a model that have no point."""
 
     @property
     def own(self) -> Path:
@@ -216,10 +219,10 @@ def _mapped(work: StepWork) -> Prepared:
     """What the whole stage of the next step starts from."""
     rig, workspace = work.rig, work.own / "workspace"
     shutil.rmtree(workspace, ignore_errors=True)
-    survey = block(rig, work.pictures // len(rig.cameras), _MAPPED_POINTS)
+    survey = block(rig, work.pictures // len(rig.cameras), work.points)
 
     def run() -> int:
-        write_mapped(workspace, rig, survey, work.records, _UNMATCHED)
+        write_mapped(workspace, rig, survey, work.records, work.unmatched)
         return len(survey.pixels.station)
 
     return run
@@ -372,7 +375,7 @@ def _matched(work: StepWork) -> Observations:
     """Keypoints of dense tracks, and matches of the pairs that navigation chooses."""
     rig, records, rng = work.rig, work.records, np.random.default_rng(work.pictures)
     cameras = len(rig.cameras)
-    pixels = block(rig, work.pictures // cameras, _MAPPED_POINTS).pixels
+    pixels = block(rig, work.pictures // cameras, work.points).pixels
     wrong = np.flatnonzero(rng.uniform(size=len(pixels.taken)) < _WRONG)
     pixels.taken[wrong] += rng.normal(0, _WRONG_PX, (len(wrong), 2))
     picture = cameras * pixels.station + pixels.camera
@@ -428,10 +431,12 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("threads", type=int)
     parser.add_argument("--rig", type=Path)
+    parser.add_argument("--points", type=int, default=MAPPED_POINTS)
+    parser.add_argument("--unmatched", type=int, default=UNMATCHED)
     given = parser.parse_args()
     work = StepWork(
         folder=given.work, pictures=given.pictures, executor=local_executor(given.threads),
-        rig_file=given.rig,
+        rig_file=given.rig, points=given.points, unmatched=given.unmatched,
     )  # fmt: skip
     work.own.mkdir(parents=True, exist_ok=True)
     run = STEPS[given.step](work)
