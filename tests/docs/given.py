@@ -239,6 +239,6 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "real-pictures.md": _stereo,
     "reconstruction.md": _reconstruction,
     "vehicle-logs.md": _identified,
-    "view.md": _reef,
+    "studio.md": _reef,
 }
 """By page."""
