@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alice_survey.vehicle.fleet import vehicle
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from alice_survey.base.errors import NavigationError
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
 from alice_survey.vehicle.identification.windows import make_windows
 from alice_survey.vehicle.log import read_vehicle_log
@@ -251,7 +251,7 @@ def test_a_tank_log_without_position_reaches_the_identification(tmp_path: Path) 
     np.testing.assert_allclose(
         log.thrust_n["t2"][1:60], np.minimum(mirrored - 1475.0, 0.0) / 375.0 * 40.0, atol=1e-3
     )
-    bare = vehicle("alice")
+    bare = vehicle_from("alice")
     eight = replace(
         bare, thrusters=tuple(replace(bare.thrusters[0], name=name) for name in names)
     )  # fmt: skip

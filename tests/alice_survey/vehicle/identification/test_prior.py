@@ -4,16 +4,16 @@ import math
 
 import numpy as np
 import pytest
-from alice_survey.vehicle.fleet import vehicle
 
 from alice_survey.base.errors import VehicleError
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.output_error import Simulation, fit_output_error
 from alice_survey.vehicle.identification.parameters import free_parameters
 from alice_survey.vehicle.identification.prior import PriorSigmas, prior_of, read_prior
 from alice_survey.vehicle.identification.windows import make_windows
 from tests.alice_survey.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
 
-KNOWN = vehicle("alice")
+KNOWN = vehicle_from("alice")
 QUICK = Simulation(longest_step_s=0.05)
 
 

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from alice_survey.vehicle.fleet import vehicle
 from typer.testing import CliRunner
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.cli.vehicle import app
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.identification.replay import AXES, ReplayOptions, replay, replay_report
 from alice_survey.vehicle.log import VehicleLog, read_vehicle_log, write_vehicle_log
 from alice_survey.vehicle.propulsion import turned_speeds
 from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, survey_like
 
-KNOWN = vehicle("alice")
+KNOWN = vehicle_from("alice")
 U, W, HEADING, NORTH, EAST, DEPTH = (
     AXES.index(a) for a in ["u", "w", "heading", "north", "east", "depth"]
 )

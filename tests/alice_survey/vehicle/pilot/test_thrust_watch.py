@@ -6,17 +6,17 @@ from functools import cache
 
 import numpy as np
 import pytest
-from alice_survey.vehicle.fleet import vehicle
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.files import vehicle_from
 from alice_survey.vehicle.pilot.thrust_watch import FALSE_ALARM_H, NavigatedStretch, ThrustWatch
 from alice_survey.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure
 from alice_survey.vehicle.vehicle import Vehicle
 from tests.alice_survey.vehicle.identification.manoeuvres import fly, survey_like
 
 TICK_S, STRETCH = 0.05, 100
-ALICE = vehicle("alice")
+ALICE = vehicle_from("alice")
 NAMES = tuple(thruster.name for thruster in ALICE.thrusters)
 GUST_N = np.array([0.5, 0.5, 0.5, 0.0, 0.0, 0.1])
 SOUND_S = 60.0
