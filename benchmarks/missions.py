@@ -4,7 +4,7 @@
 
 The paper's survey, 15 x 17 m with lines 1 m apart, is planned once; ALICE and SPARUS II (this one
 by COLA2 alone, since ArduSub needs thrusters sideways) fly each format in currents along and across
-the lines, with gusts and sensors as by default. Each mission is exported anew with its current as
+the lines, with gusts and sensors as by default. Each mission is exported again with its current as
 the expected one. For each: cross-track rms on lines, ends of lines overshot, and how much of the
 area is seen at the requested overlap, next to the plan's certificate and to what `about.txt` of the
 export expected beforehand.

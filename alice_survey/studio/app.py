@@ -178,7 +178,9 @@ class _Answers:
             return _line(409, _CHANGED)
         except FileNotFoundError:
             return _line(404, "nothing is here")
-        except Exception as fault:
+        except (
+            Exception
+        ) as fault:  # libraries raise known faults as all kinds; bugs are raised again
             known = known_fault(fault)
             if known is None:
                 raise

@@ -40,6 +40,7 @@ class _TimedConnection(H11Protocol):
 
     _deadline: asyncio.TimerHandle | None = None
 
+    # asyncio gives a server a Transport; uvicorn narrows the type of its base in the same way.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._allow(_ASK_S)

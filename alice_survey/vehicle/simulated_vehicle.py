@@ -1,4 +1,4 @@
-"""A vehicle in its sea: it senses and moves, tick by tick, whoever commands its thrusters.
+"""A vehicle in its sea: it senses and moves, tick by tick, under the commands of any pilot.
 
 A tick is 0.05 s: the sensors measure the true state for the navigation, and the equations of motion
 advance by five Runge-Kutta steps of 10 ms.

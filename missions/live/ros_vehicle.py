@@ -1,6 +1,6 @@
 """The simulated vehicle as a ROS 2 node: thruster speeds or a wrench in, sensors and truth out.
 
-Stamps are of the simulation's own clock, which `/clock` publishes: whoever listens uses simulated
+Stamps are of the simulation's own clock, which `/clock` publishes: nodes that listen use simulated
 time. With a rate the simulation keeps pace with the wall; without, it waits at each tick for the
 command of that tick, so that it is as fast as what commands it, on any machine.
 """

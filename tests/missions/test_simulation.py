@@ -379,7 +379,7 @@ def test_in_seven_seas_nothing_adds_up_and_lost_propellers_do(
         {"vehicle": {"name": "sparus2", "controller": "los"}},
     )  # fmt: skip
     flown_s = 0.0
-    for seed in (1, 2, 3):
+    for seed in (11, 12, 13):  # none that its settings were chosen by
         for changes in seas:
             sound = fly(survey(**changes), seed=seed)
             assert sound.flown.found == ()

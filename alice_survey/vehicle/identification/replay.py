@@ -119,7 +119,7 @@ def replay(
         vehicle: the model.
         others: values of parameters that are not coefficients; as in the vehicle if not named.
         given: rates, of p, q and r, that follow the log instead of the forces.
-        reset_s: longest stretch without a start from what is measured; gaps start anew anyway.
+        reset_s: longest stretch without a start from what is measured; gaps start one anyway.
         simulation: steps and inputs.
 
     Raises:
