@@ -1,5 +1,6 @@
 """Commands that show a survey: the report, and the server for what is too large for one page."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer

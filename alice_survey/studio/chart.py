@@ -55,7 +55,7 @@ def check_chart(path: Path) -> Path:
 
 
 def _has_palette(raster: rasterio.DatasetReader) -> bool:
-    return raster.colorinterp[0].name == "palette"
+    return bool(raster.colorinterp[0].name == "palette")
 
 
 def chart_numbers(path: Path) -> Numbers | None:
