@@ -119,6 +119,11 @@ def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
     raise VehicleError(f"vehicle {name_or_file!r} is not known; known: {known}, or a TOML file")
 
 
+def known_vehicles() -> list[str]:
+    """Names of the vehicles that are known."""
+    return list(_DESCRIBED)
+
+
 def vehicles_of_a_geometry() -> list[str]:
     """Names of the known vehicles whose shape is known: they carry the same payload."""
     return [name for name in _DESCRIBED if name in GEOMETRIES]
@@ -140,7 +145,7 @@ def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
 
 @lru_cache(maxsize=32)
 def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
-    """The vehicle of a file's text; kept, since the water inside of a hull takes a while to find."""
+    """The vehicle of a file's text; kept, as the water inside of a hull takes a while to find."""
     found = validated(path, _VehicleFile, _with_shape(_table_of(path, text)))
     for what, parts in (("thrusters", found.thrusters), ("fins", found.fins)):
         names = [part.name for part in parts]

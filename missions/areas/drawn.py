@@ -8,15 +8,17 @@ files next to them. Shapes that were not changed leave their settings and files 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from alice_survey.base.config import AreaConfig, Config
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array, Datum
-from missions.areas.crs import FARTHEST_M, LocalFrame
+from missions.areas.crs import FARTHEST_M, LocalFrame, middle
+from missions.areas.files import Role, read_area_file
 from missions.areas.raw import RawShapes
 from missions.areas.survey import GivenShapes, corridor_strip, given_shapes
 
@@ -47,7 +49,7 @@ Open = tuple[Place, ...]
 
 
 class DrawnPolygon(Config):
-    """A polygon, north and east of the datum, metres; its rings are open."""
+    """A polygon as a page sends it, north and east of the datum, metres; its rings are open."""
 
     outer: Open = Field(min_length=3, max_length=_MOST_CORNERS)
     holes: tuple[Open, ...] = ()
@@ -59,7 +61,9 @@ class DrawnPolygon(Config):
 
 
 class DrawnShapes(Config):
-    """All shapes of an area."""
+    """All shapes of an area, as a page sends them."""
+
+    model_config = ConfigDict(extra="ignore")
 
     survey: tuple[DrawnPolygon, ...] = ()
     no_go: tuple[DrawnPolygon, ...] = ()
@@ -149,6 +153,42 @@ def area_settings(
     if settings.crs is not None and not _needs_crs(settings, values):
         values["crs"] = None
     return values, files
+
+
+def drawing_of_file(
+    path: Path,
+    settings: AreaConfig,
+    *,
+    role: Role = "survey",
+    layer: str | None = None,
+    crs: str | None = None,
+    at_datum: bool = True,
+) -> AreaDrawing:
+    """The shapes of a file, to be drawn.
+
+    Args:
+        path: of a kind that areas are read from.
+        settings: of the area so far.
+        role: what the shapes are for.
+        layer: of a file with several.
+        crs: of a file that does not say.
+        at_datum: whether they count to the datum so far; else to the middle of the file.
+
+    Raises:
+        PlanError: the file cannot be read, or lies too far from the datum.
+    """
+    raw = read_area_file(path, layer, crs, role=role)
+    datum = area_drawing(settings).datum if at_datum or not raw.geographic else middle(raw)
+    frame = LocalFrame(datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True)
+    given = GivenShapes(
+        survey=raw if role == "survey" else replace(raw, polygons=(), lines=()),
+        no_go=tuple(
+            zone for zone in (raw if role == "no_go" else None, raw.no_go) if zone is not None
+        ),
+        allowed=raw if role == "allowed" else None,
+        frame=frame,
+    )
+    return _drawing(given, settings)
 
 
 def _drawing(given: GivenShapes, settings: AreaConfig) -> AreaDrawing:

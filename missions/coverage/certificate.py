@@ -76,6 +76,8 @@ class Certificate:
     """By camera: share of the area, (N,), that 0, 1, 2, ... of its pictures see."""
     line_histograms: dict[str, Array]
     """By camera: share of the area, (N,), that is seen on 0, 1, 2, ... lines."""
+    estimated: bool = False
+    """Whether it is a quick look: cells are larger than usual, and borders have fewer points."""
 
     @property
     def taken(self) -> int:
@@ -250,6 +252,7 @@ def certificate(
         cameras=names,
         stations=len(stations),
         blind=blind,
+        estimated=coarse,
         grid=grid,
         inside=mask,
         histograms={n: _histogram([t.pictures[i] for t in tiles]) for i, n in enumerate(names)},

@@ -165,8 +165,8 @@ def legs_alone(
     pieces = np.split(legs, begins[1:-1])
     for i in np.flatnonzero(detours).tolist():
         line, own = table[i // 2], pieces[i][-1:] if i % 2 == 0 else legs[:0]
-        ends = (line[2:], home) if i % 2 else (home, line[[0, 1, 4]])
-        way = _round_corners(ways, *ends, run_in_m)
+        end, goal = (line[2:], home) if i % 2 else (home, line[[0, 1, 4]])
+        way = _round_corners(ways, end, goal, run_in_m)
         direct = pieces[i][: len(pieces[i]) - len(own)]
         pieces[i] = np.concatenate([_cheaper(kinds[i], direct, way, costs)[0], own])
     begins[1:] = np.cumsum([len(piece) for piece in pieces])
