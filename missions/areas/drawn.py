@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -44,7 +44,8 @@ _SAME_M = 6e-4
 """Corners this near are the same: whoever draws may round to a millimetre."""
 _MOST_CORNERS = 200_000
 
-Place = tuple[float, float]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Place = tuple[Metres, Metres]
 Open = tuple[Place, ...]
 
 
