@@ -1,10 +1,7 @@
 """The page is safe, small and right; its script finds stations, alone and in Chromium."""
 
 import json
-import os
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +22,7 @@ from missions.plan.page import SCRIPTS, write_page
 from missions.plan.page_map import counts_picture, geodetic_fit, plan_map
 from missions.values.plan_file import Plan
 from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.node import run_node
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 
 NASTY = "<script>alert('a')</script>&\"<!--</title>"
@@ -37,17 +35,6 @@ ROW = Setting(
 def seen_of(plan: Plan, cell_m: float | None = None) -> Certificate:
     pattern = plan_pattern(plan, RIG)
     return certificate(plan.area, RIG, stations_of_plan(plan), pattern, cell_m=cell_m)
-
-
-def run_node(*arguments: str) -> Any:
-    node = shutil.which("node")
-    if node is None:
-        if os.environ.get("CI"):
-            pytest.fail("CI needs node to run the page's script")
-        pytest.skip("no node here")
-    done = subprocess.run([node, *arguments], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
 
 
 def layers_of(
