@@ -291,3 +291,56 @@ def test_counts_are_coloured_and_what_lacks_overlap_stands_out(tmp_path: Path) -
     assert rgba[:, 3].tolist() == [0, 215, 215, 215, 190]
     assert rgba[4, :3].tolist() == [0xD3, 0x54, 0x00]
     assert rgba[1, :3].sum() > rgba[3, :3].sum() > rgba[2, :3].sum()
+
+
+def test_places_along_a_way_agree_with_shapely(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    way = rng.uniform(-20, 20, (12, 2))
+    line = shapely.LineString(way)
+    lengths = rng.uniform(0, line.length, 60)
+    found, beyond = run(
+        tmp_path, "plan_way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
+        p=way.tolist(), s=lengths.tolist(),
+    )  # fmt: skip
+    expected = shapely.get_coordinates(shapely.line_interpolate_point(line, lengths))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert beyond == way[-1].tolist()
+
+
+def test_a_profile_leads_to_its_place_whether_or_not_dives_begin_at_zero(tmp_path: Path) -> None:
+    routes = [[[0, 0], [10, 0]], [[5, 5], [5, 25]]]
+    ends = {"s_m": [0, 5, 10, 0, 8, 20], "dive": [1, 1, 1, 2, 2, 2]}
+    goes_on = {**ends, "s_m": [0, 5, 10, 10, 18, 30]}
+    places, along = run(
+        tmp_path, "plan_way",
+        "[both.map((p) => p.s_m.map((_, i) => m.profilePlace(p, routes, i))),"
+        " both.map((p) => m.growing(p.s_m))]",
+        both=[ends, goes_on], routes=routes,
+    )  # fmt: skip
+    assert places == [[[0, 0], [5, 0], [10, 0], [5, 5], [5, 13], [5, 25]]] * 2
+    assert along == [goes_on["s_m"]] * 2
+
+
+def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> None:
+    dive = {
+        "t_s": [0, 2, 4, 6], "n": [0, 1, 2, 3], "e": [0, 0, 0, 4], "depth_m": [0, 10, 10, 10],
+        "altitude_m": [12, 2, 2, 2], "heading_deg": [350, 10, 10, 190],
+    }  # fmt: skip
+    states, counts, near = run(
+        tmp_path, "plan_way",
+        "[[0, 1, 2, 3.5, 9, -1].map((t) => m.stateAt(d, t)),"
+        " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t)),"
+        " q.map((x) => m.nearestIndex([0, 1, 5, 9], x))]",
+        d=dive, q=[-3, 0.4, 0.6, 3.1, 7.1, 40],
+    )  # fmt: skip
+    assert [state["heading"] for state in states] == [350, 0, 10, 10, 190, 350]
+    assert [state["index"] for state in states] == [0, 0, 1, 1, 3, 0]
+    assert states[3]["n"] == 1.75 and states[1]["depth"] == 5
+    assert states[4]["e"] == 4 and states[5]["n"] == 0
+    assert counts == [0, 1, 3, 4]
+    assert near == [0, 0, 1, 2, 3, 3]
+
+
+def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
+    path = run(tmp_path, "plan_way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
+    assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
