@@ -3,6 +3,7 @@
    datum; Leaflet has them as latitude and longitude. */
 
 const MOST_SHOWN = 3000;  /* stations and footprints in view that are drawn one by one */
+const MOST_CHECKED = 60_000;  /* stations of lines in view, of which those in view are looked for */
 const NEAR_PX = 14;
 const FOOTPRINT = "#2e86c1";
 const HOVER = "#b7950b";
@@ -60,7 +61,10 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
 
   function refresh() {
     const view = map.getBounds().pad(0.05);
-    const inView = lines().filter((line) => view.intersects([[line.n0, line.e0], [line.n1, line.e1]]));
+    const [south, west, north, east] = [view.getSouth(), view.getWest(), view.getNorth(), view.getEast()];
+    const inView = lines().filter(({n0, e0, n1, e1}) => (
+      Math.max(n0, n1) >= south && Math.min(n0, n1) <= north && Math.max(e0, e1) >= west && Math.min(e0, e1) <= east
+    ));
     stations.clearLayers();
     footprints.clearLayers();
     arrows.clearLayers();
@@ -71,8 +75,9 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     if (inView.length <= 400) inView.forEach(arrow);
     const apartPx = (line) => line.length / Math.max(1, line.stations - 1) * metrePx();
     const far = inView.filter((line) => line.stations === 1 || apartPx(line) >= 6);
-    const places = far.flatMap((line) => Array.from({length: line.stations}, (_, i) => [line, stationAt(line, i)]))
-      .filter(([, place]) => view.contains(place));
+    const checked = far.reduce((sum, line) => sum + line.stations, 0) <= MOST_CHECKED ? far : [];
+    const places = checked.flatMap((line) => Array.from({length: line.stations}, (_, i) => [line, stationAt(line, i)]))
+      .filter(([, [n, e]]) => n >= south && n <= north && e >= west && e <= east);
     if (map.hasLayer(stations) && places.length <= MOST_SHOWN) {
       places.forEach(([line, place]) => stations.addLayer(leaflet.circleMarker(place, {
         ...fixed, radius: Math.min(3.4, Math.max(1.3, apartPx(line) / 7)), stroke: false,
@@ -84,9 +89,8 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     if (places.length && places.length <= MOST_SHOWN && across * metrePx() > 6) {
       places.forEach(([line, place]) => footprints.addLayer(leaflet.polygon(aroundStation(line, place, outline), drawn)));
     } else {  /* the bands that they make */
-      inView.forEach((line) => footprints.addLayer(leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {
-        ...fixed, color: FOOTPRINT, weight: across * metrePx(), opacity: 0.16, lineCap: "butt",
-      })));
+      const band = {...fixed, color: FOOTPRINT, weight: across * metrePx(), opacity: 0.16, lineCap: "butt"};
+      inView.forEach(({n0, e0, n1, e1}) => footprints.addLayer(leaflet.polyline([[n0, e0], [n1, e1]], band)));
     }
   }
 
@@ -103,6 +107,7 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
 
   function hover({latlng: {lat: n, lng: e}}) {
     hovered.clearLayers();
+    if (map.getContainer().dataset.tool !== undefined) return;  /* the pointer means something else */
     const found = nearestStation(lines(), n, e, NEAR_PX / metrePx());
     if (!found) return;
     const {line, station} = found;
@@ -111,14 +116,14 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     hovered.addLayer(leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {...fixed, color: "#f1c40f", weight: 4, opacity: 0.75}));
     hovered.addLayer(leaflet.polygon(aroundStation(line, place, outline), {...drawn, fillOpacity: 0.18}));
     const content = document.createElement("span");
-    content.style.whiteSpace = "pre-line";
+    Object.assign(content.style, {display: "block", whiteSpace: "pre-line", width: "max-content", maxWidth: "230px"});
     content.textContent = [
       line.text,
       "Station " + (line.first + station) + ", " + (station + 1) + " of " + line.stations,
       place[0].toFixed(3) + " m N, " + place[1].toFixed(3) + " m E",
     ].join("\n");
     leaflet.circleMarker(place, {...drawn, radius: 5, fillOpacity: 1}).addTo(hovered)
-      .bindTooltip(content, {permanent: true, direction: "top", offset: [0, -8]});
+      .bindTooltip(content, {permanent: true, direction: "auto", offset: [8, 0]});
   }
 
   let pixels = null;

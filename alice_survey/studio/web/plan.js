@@ -42,7 +42,8 @@ export function tab(studio) {
   let settings = null;
 
   const panel = el("div", {},
-    el("div", {class: "buttons"}, back, forth, keep, button("Show survey.toml", showText)), note,
+    el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep, button("Text", showText, {title: "Show survey.toml as it would be saved"})),
+      results.key, note),
     results.top,
     el("h2", {}, "Area"), draw.panel,
     el("details", {}, el("summary", {}, "Import a file"),
@@ -181,12 +182,14 @@ export function tab(studio) {
     say(fault.message, "warn");
   }
 
-  const showText = () => attempt(async () => {
-    const text = await send("/api/plan/text", {...body(), token: file.token});
-    const box = dialog("survey.toml, as Save writes it",
-      el("div", {class: "plan-text", tabindex: "0", role: "region", "aria-label": "Text of survey.toml"}, text.survey_toml),
-      el("div", {class: "buttons"}, button("Close", () => box.close(), {class: "primary"})));
-  });
+  function showText() {
+    return attempt(async () => {
+      const text = await send("/api/plan/text", {...body(), token: file.token});
+      const box = dialog("survey.toml, as Save writes it",
+        el("div", {class: "plan-text", tabindex: "0", role: "region", "aria-label": "Text of survey.toml"}, text.survey_toml),
+        el("div", {class: "buttons"}, button("Close", () => box.close(), {class: "primary"})));
+    });
+  }
 
   /* ---- Precision and import ---- */
 

@@ -22,6 +22,8 @@ export function roundStep(length) {
 export function handles(map, {changed, moving, left}) {
   const pane = map.createPane("plan-handles");
   pane.classList.add("leaflet-zoom-hide");
+  /* Where a handle was replaced meanwhile, the click is the pane's. */
+  pane.addEventListener("click", (event) => event.stopPropagation());
   let [shapes, path, pressed] = [null, null, null];
 
   const place = ([n, e]) => map.latLngToLayerPoint([n, e]);
@@ -155,6 +157,7 @@ export function handles(map, {changed, moving, left}) {
       release();
       changed(does.remove());
     }, LONG_PRESS_MS);
+    map.getContainer().dataset.tool = "handle";
     window.addEventListener("pointermove", move);
     window.addEventListener("pointerup", drop);
     window.addEventListener("pointercancel", cancel);
@@ -170,6 +173,7 @@ export function handles(map, {changed, moving, left}) {
   function release() {
     clearTimeout(pressed?.timer);
     pressed = null;
+    delete map.getContainer().dataset.tool;
     window.removeEventListener("pointermove", move);
     window.removeEventListener("pointerup", drop);
     window.removeEventListener("pointercancel", cancel);

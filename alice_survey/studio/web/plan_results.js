@@ -2,10 +2,11 @@
    and the ways out. */
 
 import {button, el, table} from "./core.js";
-import {totalRows} from "./plan_words.js";
+import {keyFigures, totalRows} from "./plan_words.js";
 
 /* `apply(changes)` takes a way out. */
 export function resultsPanel(apply) {
+  const key = el("dl", {class: "plan-key plan-totals"});
   const totals = el("div", {class: "plan-totals"});
   const refused = el("div", {hidden: true});
   const warnings = el("ul", {class: "warn", hidden: true});
@@ -20,6 +21,7 @@ export function resultsPanel(apply) {
       refuse(preview);
       return;
     }
+    key.replaceChildren(...keyFigures(preview.totals).map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
     totals.replaceChildren(table("Totals", [], totalRows(preview.totals)));
     warnings.hidden = !preview.warnings.length;
     warnings.replaceChildren(...preview.warnings.map((text) => el("li", {}, text)));
@@ -48,5 +50,6 @@ export function resultsPanel(apply) {
     );
   }
 
-  return {top: el("div", {}, refused, totals, warnings), below: el("div", {}, limitsBox, rowsBox), show};
+  const totalsBox = el("details", {}, el("summary", {}, "All figures"), totals);
+  return {key, top: el("div", {}, refused, warnings), below: el("div", {}, totalsBox, limitsBox, rowsBox), show};
 }

@@ -8,6 +8,13 @@ const LINES = {survey: "#1b4f72", cross: "#6c3483", closing: "#117a65", fill: "#
 const [WAY, HOME, SWATH, MARK] = ["#7f8c8d", "#1e8449", "#2e86c1", "#8e44ad"];
 const GROUP = "The plan";
 const eastNorth = ([n, e]) => [e, n];
+const MOST_POINTS = 500;
+
+/* A way in pieces that join: Leaflet simplifies by recursion, as deep as a zigzag has points. */
+function pieces(way) {
+  const count = Math.ceil((way.length - 1) / MOST_POINTS);
+  return Array.from({length: count}, (_, i) => way.slice(i * MOST_POINTS, (i + 1) * MOST_POINTS + 1));
+}
 
 export function shown(studio) {
   const {map} = studio;
@@ -50,9 +57,7 @@ export function shown(studio) {
       });
     }
     const footprints = put({kind: "polygon", name: "plan-footprints", title: "Footprints", colour: SWATH, shapes: []});
-    put({
-      kind: "line", name: "plan-way", title: "Way between lines", colour: WAY, width: 1.1, shapes: routes.map((route) => route.map(eastNorth)),
-    });
+    putLines("plan-way", "Way between lines", WAY, routes.flatMap(pieces), 1.1);
     const drawn = lineLayers(preview.lines);
     const points = put({kind: "point", name: "plan-stations", title: "Stations", colour: LINES.survey, shapes: []});
     put({
@@ -67,6 +72,16 @@ export function shown(studio) {
     stations.refresh();
   }
 
+  /* Lines of one colour with a light rim: two shapes, however many lines there are. */
+  function putLines(name, title, colour, lines, weight) {
+    const group = put({kind: "line", name, title, colour, shapes: []});
+    const rim = leaflet.polyline(lines, {color: "#fff", weight: 5, opacity: 0.75, interactive: false});
+    const drawn = leaflet.polyline(lines, {color: colour, weight, interactive: false});
+    drawn.survey = {title, text: ""};
+    group.addLayer(rim).addLayer(drawn);
+    return group;
+  }
+
   function lineLayers(lines) {
     let first = 0;
     const numbered = lines.map((line, index) => {
@@ -78,10 +93,8 @@ export function shown(studio) {
     const groups = [];
     const drawn = kinds.flatMap((kind) => {
       const own = numbered.filter((line) => line.kind === kind);
-      const group = put({
-        kind: "line", name: "plan-" + kind, title: counted(own.length, kind + " line"), colour: LINES[kind], width: 1.7,
-        shapes: own.map(({from, to}) => [eastNorth(from), eastNorth(to)]),
-      });
+      const ends = own.map(({from, to}) => [from, to]);
+      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), LINES[kind], ends, 1.7);
       groups.push(group);
       return own.map((line) => {
         const made = stationLine(line.from, line.to, {

@@ -56,6 +56,14 @@ export function totalRows(totals) {
   return ROWS.map(([name, text]) => [name, text(totals)]).filter(([, text]) => text);
 }
 
+/* [name, text] of the six that say most. */
+export function keyFigures(t) {
+  return [
+    ["Time", durationOf(t.duration_s)], ["Dives", String(t.dives)], ["Energy", Math.round(t.energy_wh) + " Wh"],
+    ["Pictures", t.pictures.toLocaleString("en")], ["Data", rounded(t.data_gb, 3) + " GB"], ["Covered", shareOf(t.covered)],
+  ];
+}
+
 /* One sentence for those who hear the page. */
 export function summaryOf(preview) {
   if (!preview.ok) return "No plan: " + preview.error;
