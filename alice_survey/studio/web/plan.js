@@ -155,7 +155,8 @@ export function tab(studio) {
       const {changes, shapes} = body();
       await send("/api/plan/save", {changes, shapes, token: file.token});
       await restart();
-      await studio.refresh?.();
+      await studio.refresh();
+      view.alone();
       say("Saved: survey.toml, and the plan in plan/");
     } catch (fault) {
       if (fault.status === 409) conflict(fault);

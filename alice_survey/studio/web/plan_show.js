@@ -7,6 +7,7 @@ import {counted, paintCounts, COUNT_COLOURS, MISSED_COLOUR} from "./plan_words.j
 const LINES = {survey: "#1b4f72", cross: "#6c3483", closing: "#117a65", fill: "#b9770e", tie: "#c0392b"};
 const [WAY, HOME, SWATH, MARK] = ["#7f8c8d", "#1e8449", "#2e86c1", "#8e44ad"];
 const GROUP = "The plan";
+const MADE = ["area", "plan"];  /* layers of the shell */
 const eastNorth = ([n, e]) => [e, n];
 const MOST_POINTS = 500;
 
@@ -19,6 +20,7 @@ function pieces(way) {
 export function shown(studio) {
   const {map} = studio;
   const off = new Set(["plan-footprints"]);
+  const away = new Set();
   const marks = leaflet.featureGroup();
   let [names, stations, number, active, last, sigmaLayer] = [new Set(), null, 0, false, null, null];
   map.moreAt((place) => (active && stations ? stations.textAt(place) : ""));
@@ -174,9 +176,18 @@ export function shown(studio) {
     map.fit();
   }
 
+  /* The plan as it was made is put away while the one in work is shown. */
+  function alone() {
+    MADE.filter((name) => map.layers.has(name) && map.leaflet.hasLayer(map.layers.get(name))).forEach((name) => {
+      away.add(name);
+      map.show(name, false);
+    });
+  }
+
   function enter() {
     active = true;
     marks.addTo(map.leaflet);
+    alone();
     show(last);
   }
 
@@ -192,8 +203,10 @@ export function shown(studio) {
     stations = null;
     active = false;
     marks.remove();
+    away.forEach((name) => map.show(name, true));
+    away.clear();
   }
 
   const dim = (on) => { map.leaflet.getContainer().closest("main").toggleAttribute("data-planning", on); };
-  return {show, sigma, mark, fit, enter, leave, dim};
+  return {show, sigma, mark, fit, alone, enter, leave, dim};
 }

@@ -144,9 +144,8 @@ def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: 
             _press_long(plan, plan.corner(1))
             assert page.locator(".plan-handle.corner").count() == 3
             plan.press("Control+z")
-        for _ in range(3):
-            if plan.text() != drawn:
-                plan.press("Control+z")
+        for _ in range(2):  # what was removed, and what was inserted
+            plan.press("Control+z")
         assert plan.text() == drawn
 
         before = plan.altitude()
@@ -207,14 +206,20 @@ def _zone_by_keyboard(plan: PlanPage) -> None:
     shapes = page.locator(".plan-list li").count()
     page.get_by_role("button", name="No-go zone", exact=True).focus()
     page.keyboard.press("Enter")
-    for key in ("ArrowRight", "ArrowUp", "ArrowLeft"):
+    canvas = page.locator("#map-canvas")
+    for key, axis in (("ArrowRight", "east"), ("ArrowUp", "north"), ("ArrowLeft", "east")):
         page.keyboard.press("Enter")
+        stood = canvas.get_attribute(f"data-{axis}")
         page.keyboard.press(key)
-        page.wait_for_timeout(400)
+        page.wait_for_function(
+            "([axis, stood]) => document.getElementById('map-canvas').dataset[axis] !== stood"
+            " && !document.querySelector('.leaflet-pan-anim')",
+            arg=[axis, stood],
+        )
     page.keyboard.press("f")
     plan.settled(before)
     assert page.locator(".plan-list li").count() == shapes + 1
-    assert page.locator("#map-canvas").get_attribute("data-tool") is None
+    assert canvas.get_attribute("data-tool") is None
 
 
 def _save(plan: PlanPage) -> None:
@@ -252,7 +257,6 @@ def test_two_pages_do_not_overwrite_each_other(browser: Any, tmp_path: Path) -> 
 
         assert [text for text in other.heard.complaints if "409" not in text] == []
         assert one.heard.complaints == []
-        one.press("Control+z") if one.page.get_by_role("button", name="Undo").is_enabled() else None
         _leaving_is_asked(one)
 
 
