@@ -163,7 +163,7 @@ def drawing_of_file(
     role: Role = "survey",
     layer: str | None = None,
     crs: str | None = None,
-    at_datum: bool = True,
+    datum: Datum | None,
 ) -> AreaDrawing:
     """The shapes of a file, to be drawn.
 
@@ -173,13 +173,15 @@ def drawing_of_file(
         role: what the shapes are for.
         layer: of a file with several.
         crs: of a file that does not say.
-        at_datum: whether they count to the datum so far; else to the middle of the file.
+        datum: that they count to; None: the middle of the file, or the datum so far where the file
+            is in metres.
 
     Raises:
         PlanError: the file cannot be read, or lies too far from the datum.
     """
     raw = read_area_file(path, layer, crs, role=role)
-    datum = area_drawing(settings).datum if at_datum or not raw.geographic else middle(raw)
+    if datum is None:
+        datum = middle(raw) if raw.geographic else area_drawing(settings).datum
     frame = LocalFrame(datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True)
     given = GivenShapes(
         survey=raw if role == "survey" else replace(raw, polygons=(), lines=()),

@@ -19,7 +19,7 @@ from pydantic import Field
 from pydantic_core import to_json
 
 from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import Config, SurveyConfig, parse_settings, settings_in
+from alice_survey.base.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
 from alice_survey.base.errors import AliceError, ConfigError, PlanError, collected_by, heard
 from alice_survey.base.executor import local_executor
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
@@ -81,7 +81,7 @@ class _Settings:
 
 
 @dataclass(eq=False)
-class _Plan:
+class _PlanTab:
     studio: Studio
     newest: Newest = field(default_factory=Newest)
     saving: threading.Lock = field(default_factory=threading.Lock)
@@ -238,7 +238,7 @@ class _Plan:
                 drawing = drawing_of_file(
                     file, config.area, role=role, layer=call.query.get("layer"),
                     crs=call.query.get("crs"),
-                    at_datum=bool(found.token) and call.query.get("datum") != "middle",
+                    datum=_datum_asked(call, found.token, config),
                 )  # fmt: skip
             except PlanError as error:
                 text = str(error).replace(str(file), name).replace(file.name, name)
@@ -296,6 +296,25 @@ class _Plan:
             for path in paths:
                 archive.write(path, path.relative_to(folder / "exports"))
         return Content(data=packed.getvalue(), kind="application/zip", name=f"{name}.zip")
+
+
+def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:
+    """The datum that a dropped file is to count to; None for its own middle.
+
+    `datum` of the query is `middle`, or latitude and longitude with a comma between; where it is
+    left out that of the survey counts, and for a new survey the middle.
+    """
+    asked = call.query.get("datum", "" if token else "middle")
+    if asked == "middle":
+        return None
+    if not asked:
+        return area_drawing(config.area).datum
+    try:
+        latitude_deg, longitude_deg = map(float, asked.split(","))
+        area = AreaConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    except ValueError:
+        raise PlanError(f"datum {asked[:40]!r}: it is 'middle' or LATITUDE,LONGITUDE") from None
+    return Datum(area.latitude_deg, area.longitude_deg)
 
 
 @contextmanager
@@ -386,7 +405,7 @@ def _moments(
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """All of the tab Plan."""
-    plan = _Plan(studio)
+    plan = _PlanTab(studio)
 
     def post(name: str, answer: Callable[[Call], Any], **options: Any) -> Endpoint:
         return Endpoint(

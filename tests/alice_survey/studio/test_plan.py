@@ -235,6 +235,12 @@ def test_dropped_files_become_shapes(server: Server) -> None:
     assert post(server, "preview", {"shapes": found})["ok"]
     zone = post(server, "import?name=reef.geojson&role=no_go", text)
     assert zone["no_go"] == found["survey"] and zone["survey"] == []
+    there = post(server, "import?name=reef.geojson&datum=32.8237,34.9553", text)
+    assert there["datum"]["latitude_deg"] == 32.8237
+    assert there["survey"][0]["outer"][0] == pytest.approx((-11.09, 0.0), abs=0.01)
+    own = post(server, "import?name=reef.geojson&datum=middle", text)
+    assert own["datum"] == {"latitude_deg": 32.82365, "longitude_deg": 34.95535}
+    assert call(server, "/api/plan/import?name=reef.geojson&datum=x,1", text).status == 400
     for name, body in (("reef.kml", b"no"), ("reef.exe", text), ("", text), ("a.wkt", b"POINT (")):
         reply = call(server, f"/api/plan/import?name={name}", body)
         assert reply.status == 400 and len(reply.json["error"].splitlines()) == 1

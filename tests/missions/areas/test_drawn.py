@@ -171,10 +171,10 @@ def test_a_dropped_file_counts_to_the_datum_or_to_its_middle(tmp_path: Path) -> 
         '{"type": "Polygon", "coordinates": [[[35.0, 33.0], [35.001, 33.0], [35.001, 33.001]]]}'
     )
     with pytest.raises(PlanError, match="km from the datum"):
-        drawing_of_file(file, AreaConfig())
-    found = drawing_of_file(file, AreaConfig(), at_datum=False)
+        drawing_of_file(file, AreaConfig(), datum=area_drawing(AreaConfig()).datum)
+    found = drawing_of_file(file, AreaConfig(), datum=None)
     assert (found.datum.latitude_deg, found.datum.longitude_deg) == (33.0005, 35.0005)
     (polygon,) = found.shapes.survey
     assert np.abs(polygon.outer).max() < 60.0
-    zone = drawing_of_file(file, AreaConfig(), role="no_go", at_datum=False).shapes
+    zone = drawing_of_file(file, AreaConfig(), role="no_go", datum=found.datum).shapes
     assert zone.no_go == (polygon,) and not zone.survey
