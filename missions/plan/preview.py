@@ -190,8 +190,8 @@ def _limits(planned: Planned, config: SurveyConfig) -> Iterator[dict[str, Any]]:
         "blur out of focus at the ends of the relief",
     )  # fmt: skip
     yield most(
-        "light", imaging.light.needed_light, 1.0, "of it",
-        "light that is needed, of what strobes and water give",
+        "light", imaging.light.needed_light, 1.0, "",
+        "light that is needed, as a share of what strobes and water give",
     )  # fmt: skip
     yield least(
         "plan.least_clearance_m", wanted.altitude_m - wanted.relief_m, wanted.least_clearance_m,

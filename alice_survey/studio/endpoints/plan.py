@@ -7,7 +7,7 @@ import math
 import tempfile
 import threading
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -119,8 +119,11 @@ class _PlanTab:
         with _quiet():
             return drafted(self.settings().text, self.path, request.changes, request.shapes)
 
-    def overview(self, call: Call) -> dict[str, Any]:
+    def overview(self, call: Call) -> Content:
         """Settings, limits and shapes, and the plan that is saved."""
+        return _json(self._overview())
+
+    def _overview(self) -> dict[str, Any]:
         found = self.settings()
         common: dict[str, Any] = {
             "token": found.token,
@@ -168,7 +171,7 @@ class _PlanTab:
             found = self.newest.run(request.page, lambda: self._preview(request))
         except SupersededError as error:
             found = {**refusal_json(error), "superseded": True}
-        return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
+        return _json(found)
 
     def _preview(self, request: PlanRequest) -> dict[str, Any]:
         try:
@@ -250,7 +253,7 @@ class _PlanTab:
         """The settings file as it would be saved."""
         return {"survey_toml": self.draft(call.read(PlanRequest)).text}
 
-    def save(self, call: Call) -> dict[str, Any]:
+    def save(self, call: Call) -> Content:
         """Write the settings, and plan as the command line does."""
         request = call.read(PlanRequest)
         folder = self.studio.workspace.folder
@@ -273,7 +276,7 @@ class _PlanTab:
             shown = self.saved(token, config)
             if fault is not None and shown["ok"]:
                 shown = refusal_json(fault)
-        return {"token": token, "saved": shown}
+        return _json({"token": token, "saved": shown})
 
     def export(self, call: Call) -> Content:
         """A file of the saved plan; of one a dive all of them, zipped."""
@@ -296,6 +299,11 @@ class _PlanTab:
             for path in paths:
                 archive.write(path, path.relative_to(folder / "exports"))
         return Content(data=packed.getvalue(), kind="application/zip", name=f"{name}.zip")
+
+
+def _json(found: Mapping[str, Any]) -> Content:
+    """JSON, quicker than of the shell: plans have many thousand lines."""
+    return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
 
 
 def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from alice_survey.base.artefacts import read_json
@@ -19,7 +20,9 @@ from alice_survey.studio.newest import Newest, SupersededError
 from alice_survey.studio.server import Server
 from alice_survey.studio.setting_limits import setting_limits
 from alice_survey.survey import run, template_text
+from missions.values.plan_file import read_plan
 from tests.alice_survey.studio.client import ask, call, serving
+from tests.small_survey import settings_in
 
 SQUARE = [[0, 0], [6, 0], [6, 5], [0, 5]]
 DRAWN = {
@@ -267,6 +270,25 @@ def test_playback_and_exports_of_the_plan(workspace: Path, server: Server) -> No
     assert one.body == (workspace / "plan" / "exports" / "plan.kml").read_bytes()
     assert "plan.kml" in one.headers["content-disposition"]
     assert ask(server, "/api/plan/export?format=../plan").status == 400
+
+
+def test_a_dive_that_was_simulated_is_played_back(tmp_path: Path) -> None:
+    workspace = settings_in(tmp_path / "small")
+    with collected_by(lambda *_: None):
+        run(["plan", "fly"], workspace, None, executor=local_executor(1))
+    plan = read_json(workspace / "plan" / "plan.json")
+    with serving(workspace) as server:
+        flown = post(server, "play", {})
+        assert flown["what"] == "flown" and len(flown["pictures_s"]) == plan["stations"]
+        places = np.array([flown["n"], flown["e"]]).T
+        at = [np.interp(flown["pictures_s"], flown["t_s"], axis) for axis in places.T]
+        lines = read_plan(workspace / "plan" / "plan.json").lines
+        stations = np.vstack([line.stations_ne for line in lines])
+        off_m = np.linalg.norm(np.array(at).T - stations, axis=1)
+        assert 0.001 < np.median(off_m) < 0.3
+        assert 1.5 < np.interp(flown["pictures_s"][3], flown["t_s"], flown["altitude_m"]) < 2.5
+        changed = post(server, "play", {"changes": {"plan": {"altitude_m": 1.8}}})
+        assert changed["what"] == "planned" and set(changed["altitude_m"]) == {1.8}
 
 
 def test_precision_comes_with_a_layer(server: Server) -> None:
