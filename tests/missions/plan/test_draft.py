@@ -74,8 +74,8 @@ def test_any_edit_gives_the_same_bytes_each_time_or_one_line(edit: Any, drawn: A
                 default = getattr(getattr(SurveyConfig(), section), key)
                 assert getattr(getattr(draft.config, section), key) == default
     for line in TEMPLATE.splitlines():
-        if "#" in line:
-            assert line[line.index("#") :] in draft.text
+        # An example may come into use: what is said of it stays.
+        assert "#" not in line or line.rsplit("#", 1)[1] in draft.text
 
 
 @settings(max_examples=12, deadline=None)
