@@ -111,7 +111,7 @@ def planned_json(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, 
             )
         },
         "outline": np.round(footprint_outline(plan, rig), 4).tolist(),
-        "counts": counts_data(seen),
+        "counts": counts_data(seen, optimized=False),
         "certificate": {
             "cell_m": seen.grid.cell_m,
             "estimated": seen.estimated,
