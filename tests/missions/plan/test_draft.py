@@ -139,6 +139,11 @@ def test_files_elsewhere_are_refused_unless_they_are_named_already(
         assert drafted(text, PATH, {section: {key: name}}).text == text
 
 
+def test_a_section_that_is_none_is_refused() -> None:
+    with pytest.raises(ConfigError, match="section"):
+        drafted("area = 3\n", PATH, {"area": {"file": "reef.kml"}})
+
+
 def test_what_is_no_text_is_refused() -> None:
     with pytest.raises(ConfigError):
         drafted(TEMPLATE, PATH, {"area": {"layer": "\ud800"}})
