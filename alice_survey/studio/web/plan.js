@@ -41,7 +41,7 @@ export function tab(studio) {
   const dropped = el("input", {type: "file", onchange: () => { importFile(dropped.files[0]); dropped.value = ""; }});
   let settings = null;
 
-  const panel = el("div", {},
+  const content = el("div", {hidden: true},
     el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep, button("Text", showText, {title: "Show survey.toml as it would be saved"})),
       results.key, note),
     results.top,
@@ -55,6 +55,9 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Expected precision"), precision,
       el("div", {class: "buttons"}, button("Compute it", () => attempt(showPrecision)))),
     el("details", {}, el("summary", {}, "Export"), exports));
+  const missing = el("div", {hidden: true}, el("p", {}, "The settings cannot be read; the line below says why."),
+    el("div", {class: "buttons"}, button("Read them again", () => start())));
+  const panel = el("div", {}, missing, content);
 
   /* ---- Planning in the background ---- */
 
@@ -250,7 +253,12 @@ export function tab(studio) {
     active = true;
     view.enter();
     draw.enter();
-    if (!file) await attempt(() => restart());
+    if (!file) await start();
+  }
+
+  async function start() {
+    await attempt(() => restart());
+    [content.hidden, missing.hidden] = [!file, Boolean(file)];
   }
 
   function leave() {

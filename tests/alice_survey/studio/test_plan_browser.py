@@ -1,5 +1,7 @@
 """The Plan tab in Chromium: a survey is drawn, re-planned, undone, saved and kept from others."""
 
+import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 800), "phone": (400, 800)}
 AREA = ((2.0, 2.0), (12.0, 2.0), (14.0, 12.0), (3.0, 14.0))
 LONG_PRESS_MS = 800
+DROP = """(text) => {
+  const data = new DataTransfer();
+  data.items.add(new File([text], "reef.geojson"));
+  const about = {dataTransfer: data, bubbles: true, cancelable: true};
+  document.getElementById("map-canvas").dispatchEvent(new DragEvent("drop", about));
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -270,3 +278,69 @@ def _leaving_is_asked(plan: PlanPage) -> None:
     plan.page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.accept()))
     plan.page.reload()
     assert asked == ["beforeunload"]
+
+
+REEF = {
+    "type": "Polygon",
+    "coordinates": [
+        [[34.9553, 32.8236], [34.9554, 32.8236], [34.9554, 32.8237], [34.9553, 32.8236]]
+    ],
+}
+
+
+def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        plan = opened(browser, server.address)
+        page = plan.page
+        page.get_by_text("Current and swell").click()
+        page.get_by_role("slider", name="Current, direction").focus()
+        plan.press("ArrowRight")
+        assert "current_towards_deg = 95" in plan.text()
+        page.get_by_role("slider", name="Current, direction").focus()
+        plan.press("ArrowUp")
+        assert "current_mps = 0.06" in plan.text()
+
+        before = plan.plans
+        page.locator("input[type=file]").set_input_files(
+            {
+                "name": "reef.geojson",
+                "mimeType": "application/json",
+                "buffer": json.dumps(REEF).encode(),
+            }
+        )
+        plan.settled(before)
+        assert (
+            page.locator(".plan-list .choose")
+            .all_inner_texts()[0]
+            .startswith("Survey area\n3 corners")
+        )
+        page.evaluate(DROP, json.dumps(REEF))
+        plan.settled(before + 1)
+        plan.press("Control+z")
+
+        profile = page.get_by_role("slider", name="Place along the way")
+        profile.focus()
+        page.keyboard.press("End")
+        words = profile.get_attribute("aria-valuetext")
+        assert "dive 1" in words and "over the sea floor" in words
+        assert words == page.locator(".plan-profile .note").inner_text()
+
+        page.get_by_text("Play the dive").click()
+        page.get_by_role("button", name="Play", exact=True).click()
+        page.wait_for_function("() => / of .* pictures/.test(document.body.innerText)")
+        page.get_by_role("button", name="Pause", exact=True).click()
+        scrub = page.get_by_role("slider", name="Time")
+        scrub.focus()
+        page.keyboard.press("End")
+        shown = page.locator("#panel-plan").inner_text()
+        taken, of = re.search(r"([\d,]+) of ([\d,]+) pictures", shown).groups()
+        assert taken == of != "0"
+
+        page.get_by_text("Expected precision").click()
+        page.get_by_role("button", name="Compute it").click()
+        page.get_by_role("button", name="Compute it").scroll_into_view_if_needed()
+        page.wait_for_function("() => / mm/.test(document.body.innerText)", timeout=60_000)
+        page.screenshot(path=tmp_path / "more.png")
+        assert plan.violations() == []
+        assert plan.heard.complaints == []
+        page.close()
