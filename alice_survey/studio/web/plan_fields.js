@@ -52,6 +52,25 @@ export function slider(title, limits, changed, {percent = false} = {}) {
   return {element, set, enable};
 }
 
+/* A number, or none where it is left empty. */
+export function numberField(title, {low, high, step, unit, about}, changed) {
+  const input = el("input", {type: "number", min: low, max: high, step: "any", placeholder: "not set"});
+  input.addEventListener("change", () => {
+    const value = input.value === "" ? null : Number(input.value);
+    if (value === null || Number.isFinite(value)) changed(value);
+  });
+  input.addEventListener("keydown", (event) => {
+    const way = {ArrowUp: 1, ArrowDown: -1}[event.key];
+    if (!way) return;
+    event.preventDefault();
+    input.value = String(Number(Math.min(high ?? Infinity, Math.max(low ?? -Infinity, Number(input.value) + way * step)).toPrecision(9)));
+    changed(Number(input.value));
+  });
+  const element = field(title + (unit ? ", " + unit : ""), input, about);
+  const set = (value) => { if (document.activeElement !== input) input.value = value ?? ""; };
+  return {element, set};
+}
+
 /* One of several values; `options` are [value, text]. */
 export function choice(title, options, changed, hint = "") {
   const select = el("select", {}, options.map(([value, text]) => el("option", {value: String(value)}, text)));

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from alice_survey.base.config import load_config
+from alice_survey.base.config import SurveyConfig, load_config
+from missions.plan.preview import preview
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.studio.client import serving
 
@@ -28,6 +29,7 @@ DROP = """(text) => {
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
+    preview(SurveyConfig())  # kernels are compiled before a page waits for them
     with chromium() as started:
         yield started
 
@@ -116,9 +118,8 @@ def opened(browser: Any, address: str, size: str = "desk") -> PlanPage:
     heard = Heard()
     heard.listen(page)
     page.goto(f"{address}#plan")
-    found = PlanPage(page=page, heard=heard)
-    found.settled()
-    return found
+    page.wait_for_selector("#panel-plan[data-read]")
+    return PlanPage(page=page, heard=heard)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -196,10 +197,10 @@ def _press_long(plan: PlanPage, handle: Any) -> None:
 
 
 def _way_out(plan: PlanPage) -> None:
-    """An altitude that light does not allow is refused, and the first way out leads to a plan."""
+    """A speed that thrusters do not allow is refused, and the first way out leads to a plan."""
     page, before = plan.page, plan.plans
-    box = page.get_by_role("spinbutton", name="Altitude")
-    box.fill("9")
+    box = page.get_by_role("spinbutton", name="Speed").first
+    box.fill("3")
     box.press("Tab")
     plan.settled(before)
     assert page.get_by_text("No plan:").first.is_visible()
@@ -207,6 +208,7 @@ def _way_out(plan: PlanPage) -> None:
     page.locator(".plan-ways button").first.click()
     plan.settled(before)
     assert not page.locator(".plan-ways button").first.is_visible()
+    assert "speed_mps = 1.5" in plan.text()
 
 
 def _zone_by_keyboard(plan: PlanPage) -> None:
@@ -240,15 +242,16 @@ def _save(plan: PlanPage) -> None:
 def test_two_pages_do_not_overwrite_each_other(browser: Any, tmp_path: Path) -> None:
     with serving(tmp_path) as server:
         one, other = opened(browser, server.address), opened(browser, server.address)
-        one.draw("Survey area", AREA)
-        _save(one)
-        theirs = (tmp_path / "survey.toml").read_text(encoding="utf-8")
-
-        speed = other.page.get_by_role("spinbutton", name="Speed")
+        other.draw("Survey area", AREA)
+        speed = other.page.get_by_role("spinbutton", name="Speed").first
         before = other.plans
         speed.fill("0.25")
         speed.press("Tab")
         other.settled(before)
+        one.draw("Survey area", AREA)
+        _save(one)
+        theirs = (tmp_path / "survey.toml").read_text(encoding="utf-8")
+
         other.page.get_by_role("button", name="Save", exact=True).click()
         refused = other.page.get_by_role("dialog")
         refused.wait_for()
@@ -292,6 +295,7 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
     with serving(tmp_path) as server:
         plan = opened(browser, server.address)
         page = plan.page
+        plan.draw("Survey area", AREA)
         page.get_by_text("Current and swell").click()
         page.get_by_role("slider", name="Current, direction").focus()
         plan.press("ArrowRight")
