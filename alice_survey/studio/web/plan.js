@@ -1,6 +1,6 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
-import {attempt, button, el, get, number, say, send} from "./core.js";
+import {attempt, button, el, field, get, number, on, say, send} from "./core.js";
 import {drawing} from "./plan_draw.js";
 import {
   AS_IN_FILE, canRedo, canUndo, current, record, redo, same, startHistory, undo, withChange, withChanges,
@@ -15,11 +15,13 @@ import {shown} from "./plan_show.js";
 import {summaryOf} from "./plan_words.js";
 
 const QUIET_MS = 900;  /* after which the figures are said */
+const PAGE = crypto.randomUUID();
 const TOO_LARGE = 20e6;
-const AREA_KEYS = /^(polygon|corridor|file$|wkt$|length_m|width_m)/;
+const ROLES = {survey: "area to survey", no_go: "no-go zones", allowed: "allowed area"};
+const EMPTY = "Draw the area to survey on the map, or import a file with it.";
 
 export function tab(studio) {
-  let [file, history, active, preview, fitted, quiet] = [null, startHistory(), false, null, false, null];
+  let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(), false, null, false, null, false];
   const body = () => current(history);
   const isDirty = () => !same(body(), AS_IN_FILE);
   document.head.append(el("link", {rel: "stylesheet", href: new URL("plan.css", import.meta.url).href}));
@@ -39,15 +41,16 @@ export function tab(studio) {
   const keep = button("Save", save, {class: "primary"});
   const note = el("p", {class: "note"});
   const dropped = el("input", {type: "file", onchange: () => { importFile(dropped.files[0]); dropped.value = ""; }});
+  const role = el("select", {}, Object.entries(ROLES).map(([value, text]) => el("option", {value}, text)));
   let settings = null;
 
-  const panel = el("div", {},
+  const content = el("div", {hidden: true},
     el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep, button("Text", showText, {title: "Show survey.toml as it would be saved"})),
       results.key, note),
     results.top,
     el("h2", {}, "Area"), draw.panel,
-    el("details", {}, el("summary", {}, "Import a file"),
-      el("label", {class: "field"}, "GeoJSON, KML, GeoPackage, zipped shapefile, WKT; or drop it on the map", dropped)),
+    el("details", {}, el("summary", {}, "Import a file"), field("It is the", role),
+      field("File", dropped, "GeoJSON, KML, GeoPackage, zipped shapefile, WKT and others; or drop it on the map")),
     el("h2", {}, "How to fly"), controls,
     results.below,
     el("details", {open: true}, el("summary", {}, "Depth along the way"), along.element),
@@ -55,11 +58,14 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Expected precision"), precision,
       el("div", {class: "buttons"}, button("Compute it", () => attempt(showPrecision)))),
     el("details", {}, el("summary", {}, "Export"), exports));
+  const missing = el("div", {hidden: true}, el("p", {}, "The settings cannot be read; the line below says why."),
+    el("div", {class: "buttons"}, button("Read them again", () => start())));
+  const panel = el("div", {}, missing, content);
 
   /* ---- Planning in the background ---- */
 
   const planning = latest({
-    ask: (state, signal) => send("/api/plan/preview", state, {signal}),
+    ask: (state, signal) => send("/api/plan/preview", {...state, page: PAGE}, {signal}),
     shown: settled,
     failed: (fault) => say(fault.message, "error"),
     busy: view.dim,
@@ -68,7 +74,8 @@ export function tab(studio) {
   function plan(state, wait) {
     clearTimeout(quiet);
     draw.update(shapesOf(state));
-    planning.request(state, wait);
+    if (hasArea(state)) planning.request(state, wait);
+    else planning.stop();
   }
 
   function settled(answer) {
@@ -89,15 +96,12 @@ export function tab(studio) {
 
   /* ---- Edits ---- */
 
+  /* Of a new survey nothing is planned before something is drawn. */
+  const hasArea = (state) => Boolean(file.token) || ["survey", "corridors"].some((kind) => shapesOf(state)[kind].length);
   const shapesOf = (state) => ({...noShapes(), ...(state.shapes || file.shapes)});
 
-  /* What is drawn first takes the place of the rectangle that is surveyed where nothing is set. */
   function reshaped(shapes, tag = "") {
-    const isDefault = !body().shapes && !(file.written.area || []).some((key) => AREA_KEYS.test(key));
-    const added = (kind) => shapes[kind].slice(file.shapes[kind]?.length || 0);
-    const replaced = isDefault && (added("survey").length || added("corridors").length);
-    edit({...body(), shapes: replaced ? {...shapes, survey: added("survey")} : shapes}, tag);
-    if (replaced && added("survey").length) draw.choose({kind: "survey", index: 0, ring: 0});
+    edit({...body(), shapes}, tag);
   }
 
   function setting(values, tag) {
@@ -121,14 +125,15 @@ export function tab(studio) {
 
   function buttons() {
     [back.disabled, forth.disabled] = [!canUndo(history), !canRedo(history)];
-    keep.disabled = !studio.mayWrite();
-    note.textContent = isDirty() ? "Not saved." : file?.token ? "As in survey.toml." : "No survey.toml yet: these are the defaults.";
+    keep.disabled = !studio.mayWrite() || !file || !hasArea(body());
+    note.textContent = !hasArea(body()) ? EMPTY : isDirty() ? "Not saved." : "As in survey.toml.";
   }
 
   /* ---- The file ---- */
 
   async function load() {
     file = await get("/api/plan");
+    dropped.accept = file.suffixes.join(",");
     settings = settingsPanel(file, setting);
     controls.replaceChildren(settings.element);
     exports.replaceChildren(...(file.formats || []).map((name) => el("li", {}, el("a", {
@@ -146,24 +151,36 @@ export function tab(studio) {
     draw.update(shapesOf(body()));
     if (isDirty() || !file.saved) plan(body(), 0);
     else settled(file.saved);
+    if (file.error) say(file.error, "error");
+    panel.dataset.read = file.token || "new";
   }
 
   async function save() {
-    keep.disabled = true;
+    [keep.disabled, saving] = [true, true];
     say("Saving: the plan is made with all its files");
     try {
       const {changes, shapes} = body();
-      await send("/api/plan/save", {changes, shapes, token: file.token});
+      const {saved} = await send("/api/plan/save", {changes, shapes, token: file.token});
       await restart();
       await studio.refresh();
       view.alone();
-      say("Saved: survey.toml, and the plan in plan/");
+      clearTimeout(quiet);
+      if (saved.ok) say("Saved: survey.toml, and the plan in plan/");
+      else say("Saved survey.toml, but there is no plan of it: " + saved.error, "error");
     } catch (fault) {
       if (fault.status === 409) conflict(fault);
       else say(fault.message, "error");
     }
+    saving = false;
     buttons();
   }
+
+  /* Another page saved. */
+  on("plan", ({token}) => {
+    if (!file || saving || token === file.token) return;
+    if (isDirty()) say("survey.toml was changed by another page; what is changed here is kept", "warn");
+    else attempt(() => restart());
+  });
 
   function dialog(title, ...children) {
     const box = el("dialog", {"aria-label": title, onclose: () => box.remove()}, el("h2", {}, title), ...children);
@@ -211,13 +228,16 @@ export function tab(studio) {
       return;
     }
     attempt(async () => {
-      const found = await send("/api/plan/import", taken, {params: {name: taken.name}});
-      const count = paths({...noShapes(), ...found}).length;
+      const found = await send("/api/plan/import", taken, {params: {name: taken.name, role: role.value}});
+      const shapes = {...noShapes(), ...Object.fromEntries(Object.keys(noShapes()).map((kind) => [kind, found[kind] || []]))};
       fitted = false;
-      edit({...body(), shapes: withImported(shapesOf(body()), found)});
-      say(count + " shapes from " + taken.name);
+      edit({changes: withChanges(body().changes, file, moved(found.datum)), shapes: withImported(shapesOf(body()), shapes)});
+      say([paths(shapes).length + " shapes from " + taken.name, ...found.warnings].join("; "), found.warnings.length ? "warn" : "note");
     });
   }
+
+  /* The middle of a file is the datum of a new survey. */
+  const moved = (datum) => (same(datum, file.datum) ? {} : {area: datum});
 
   const side = studio.map.leaflet.getContainer();
   const dragged = (on) => side.classList.toggle("plan-drop", on);
@@ -250,7 +270,12 @@ export function tab(studio) {
     active = true;
     view.enter();
     draw.enter();
-    if (!file) await attempt(() => restart());
+    if (!file) await start();
+  }
+
+  async function start() {
+    await attempt(() => restart());
+    [content.hidden, missing.hidden] = [!file, Boolean(file)];
   }
 
   function leave() {

@@ -4,15 +4,14 @@ import {el, field} from "./core.js";
 
 let made = 0;
 const nextId = () => { made += 1; return "plan-field-" + made; };
-const digits = (step) => Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)));
 
 /* A slider and a number that hold one value. `limits` are {low, high, step, unit, about}; shares
-   without a unit are shown in per cent. `changed(value, settled)` is called while it moves, too. */
-export function slider(title, limits, changed, {percent = false, least = null} = {}) {
+   without a unit are shown in per cent. `changed(value)` is called while it moves, too. */
+export function slider(title, limits, changed, {percent = false} = {}) {
   const scale = percent ? 100 : 1;
   const {low, high, step} = limits;
   const bounds = {min: low * scale, max: high * scale, step: step * scale};
-  const shown = (value) => String(Number((value * scale).toFixed(digits(bounds.step))));
+  const shown = (value) => String(Number((value * scale).toPrecision(6)));
   const id = nextId();
   const range = el("input", {type: "range", ...bounds, "aria-label": title});
   const exact = el("input", {type: "number", id, inputmode: "decimal", ...bounds, step: "any"});
@@ -22,37 +21,54 @@ export function slider(title, limits, changed, {percent = false, least = null} =
   const element = el("div", {class: "field plan-number"}, el("label", {for: id}, title), range, exact,
     el("span", {class: "plan-unit"}, unit), about);
 
-  function taken(text, from) {
+  function taken(text) {
     const value = Number(text) / scale;
     if (text === "" || !Number.isFinite(value)) return;
-    const within = Math.min(high, Math.max(least ?? low, value));
-    if (from === range) exact.value = shown(within);
-    else range.value = within * scale;
-    range.setAttribute("aria-valuetext", shown(within) + " " + unit);
+    const within = Math.min(high, Math.max(low, value));
+    exact.value = shown(within);
+    set(within);
     changed(Number(within.toFixed(6)));
   }
-  range.addEventListener("input", () => taken(range.value, range));
-  exact.addEventListener("change", () => taken(exact.value, exact));
+  range.addEventListener("input", () => taken(range.value));
+  exact.addEventListener("change", () => taken(exact.value));
   /* The arrows of a number step as the slider does. */
   exact.addEventListener("keydown", (event) => {
     const way = {ArrowUp: 1, ArrowDown: -1}[event.key];
     if (!way) return;
     event.preventDefault();
-    exact.value = shown(Math.min(high, Math.max(low, Number(exact.value) / scale + way * step)));
-    taken(exact.value, exact);
+    taken(Number(exact.value) + way * bounds.step);
   });
 
+  /* What is being typed is left alone. */
   function set(value) {
-    element.hidden = value === undefined;
     const text = value === null || value === undefined ? "" : shown(value);
-    if (document.activeElement !== range || Number(range.value) !== Number(text)) range.value = text === "" ? bounds.min : text;
-    if (document.activeElement !== exact || Number(exact.value) !== Number(text)) exact.value = text;
+    range.value = text === "" ? bounds.min : text;
     range.setAttribute("aria-valuetext", text === "" ? "not set" : text + " " + unit);
+    if (document.activeElement !== exact) exact.value = text;
   }
   function enable(on) {
     [range.disabled, exact.disabled] = [!on, !on];
   }
   return {element, set, enable};
+}
+
+/* A number, or none where it is left empty. */
+export function numberField(title, {low, high, step, unit, about}, changed) {
+  const input = el("input", {type: "number", min: low, max: high, step: "any", placeholder: "not set"});
+  input.addEventListener("change", () => {
+    const value = input.value === "" ? null : Number(input.value);
+    if (value === null || Number.isFinite(value)) changed(value);
+  });
+  input.addEventListener("keydown", (event) => {
+    const way = {ArrowUp: 1, ArrowDown: -1}[event.key];
+    if (!way) return;
+    event.preventDefault();
+    input.value = String(Number(Math.min(high ?? Infinity, Math.max(low ?? -Infinity, Number(input.value) + way * step)).toPrecision(9)));
+    changed(Number(input.value));
+  });
+  const element = field(title + (unit ? ", " + unit : ""), input, about);
+  const set = (value) => { if (document.activeElement !== input) input.value = value ?? ""; };
+  return {element, set};
 }
 
 /* One of several values; `options` are [value, text]. */

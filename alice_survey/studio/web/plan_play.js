@@ -60,7 +60,7 @@ export function playback({ask, mark}) {
     const state = stateAt(dive, time);
     const taken = countUpTo(dive.pictures_s, time);
     const text = clockOf(time) + " of " + clockOf(Number(scrub.max)) + ", " + dive.what + ": depth " + state.depth.toFixed(2)
-      + " m, altitude " + state.altitude.toFixed(2) + " m, heading " + Math.round(state.heading) % 360 + "°, "
+      + " m" + (Number.isNaN(state.altitude) ? "" : ", altitude " + state.altitude.toFixed(2) + " m") + ", heading " + Math.round(state.heading) % 360 + "°, "
       + taken.toLocaleString("en") + " of " + dive.pictures_s.length.toLocaleString("en") + " pictures";
     scrub.value = time;
     scrub.setAttribute("aria-valuetext", clockOf(time));

@@ -1,7 +1,7 @@
 /* Sea floor and vehicle along the way, as a drawing whose pointer shows the place on the map. */
 
 import {el} from "./core.js";
-import {growing, nearestIndex, pathData, profilePlace} from "./plan_way.js";
+import {growing, pathData, profileAt} from "./plan_way.js";
 
 const [WIDE, HIGH, LEFT, BELOW, ABOVE] = [340, 150, 34, 20, 8];
 
@@ -10,7 +10,7 @@ export function profileView(pointed) {
   const svg = el("svg", {viewBox: `0 0 ${WIDE} ${HIGH}`, tabindex: "0", role: "slider", "aria-label": "Place along the way"});
   const readout = el("p", {class: "note"});
   const element = el("div", {class: "plan-profile"}, svg, readout);
-  let [held, routes, along, x, index] = [null, [], [], null, 0];
+  let [held, routes, along, x, at] = [null, [], [], null, 0];
 
   function show(profile, newRoutes) {
     [held, routes] = [profile && profile.s_m.length > 1 ? profile : null, newRoutes];
@@ -18,7 +18,7 @@ export function profileView(pointed) {
     element.hidden = !held;
     if (!held) return;
     along = growing(held.s_m);
-    index = Math.min(index, along.length - 1);
+    at = Math.min(Math.max(at, along[0]), along[along.length - 1]);
     draw();
     describe();
   }
@@ -48,24 +48,23 @@ export function profileView(pointed) {
   }
 
   function describe() {
-    const [floor, vehicle] = [held.floor_depth_m[index], held.vehicle_depth_m[index]];
-    const known = Number.isFinite(floor) && Number.isFinite(vehicle);
-    const text = Math.round(along[index]) + " m along, dive " + held.dive[index]
-      + (Number.isFinite(vehicle) ? ": vehicle at " + vehicle.toFixed(2) + " m" : "")
-      + (known ? ", " + (floor - vehicle).toFixed(2) + " m over the sea floor at " + floor.toFixed(2) + " m" : "");
+    const {dive, floor, vehicle} = profileAt(held, routes, along, at);
+    const text = Math.round(at) + " m along, dive " + dive
+      + (Number.isFinite(vehicle) ? ": camera at " + vehicle.toFixed(2) + " m" : "")
+      + (Number.isFinite(floor - vehicle) ? ", " + (floor - vehicle).toFixed(2) + " m over the sea floor at " + floor.toFixed(2) + " m" : "");
     readout.textContent = text;
     Object.entries({
-      "aria-valuemin": 0, "aria-valuemax": Math.round(along[along.length - 1]), "aria-valuenow": Math.round(along[index]), "aria-valuetext": text,
+      "aria-valuemin": 0, "aria-valuemax": Math.round(along[along.length - 1]), "aria-valuenow": Math.round(at), "aria-valuetext": text,
     }).forEach(([name, value]) => svg.setAttribute(name, String(value)));
   }
 
-  function point(i) {
-    index = Math.max(0, Math.min(along.length - 1, i));
+  function point(length) {
+    at = Math.max(along[0], Math.min(along[along.length - 1], length));
     const mark = svg.querySelector(".mark");
     mark.setAttribute("visibility", "visible");
-    ["x1", "x2"].forEach((name) => mark.setAttribute(name, x(along[index])));
+    ["x1", "x2"].forEach((name) => mark.setAttribute(name, x(at)));
     describe();
-    pointed(profilePlace(held, routes, index));
+    pointed(profileAt(held, routes, along, at).place);
   }
 
   function away() {
@@ -77,15 +76,15 @@ export function profileView(pointed) {
     const box = svg.getBoundingClientRect();
     const right = (event.clientX - box.left) / box.width * WIDE;
     const share = (right - LEFT) / (WIDE - LEFT - 4);
-    point(nearestIndex(along, along[0] + share * (along[along.length - 1] - along[0])));
+    point(along[0] + share * (along[along.length - 1] - along[0]));
   });
   svg.addEventListener("pointerleave", away);
   svg.addEventListener("blur", away);
   svg.addEventListener("keydown", (event) => {
-    const step = Math.max(1, Math.round(along.length / 100));
+    const step = (along[along.length - 1] - along[0]) / 100;
     const to = {
-      ArrowRight: index + step, ArrowUp: index + step, ArrowLeft: index - step, ArrowDown: index - step, Home: 0, End: along.length - 1,
-      PageUp: index + 10 * step, PageDown: index - 10 * step,
+      ArrowRight: at + step, ArrowUp: at + step, ArrowLeft: at - step, ArrowDown: at - step, Home: -Infinity, End: Infinity,
+      PageUp: at + 10 * step, PageDown: at - 10 * step,
     }[event.key];
     if (to === undefined) return;
     event.preventDefault();

@@ -29,21 +29,17 @@ export function resultsPanel(apply) {
     limitsBox.hidden = !preview.limits.length;
     limitsBox.querySelector("summary").textContent = "Limits: " + (binding.length
       ? binding.map((limit) => limit.name).join(", ") + (binding.length > 1 ? " bind" : " binds") : "none binds");
-    limits.replaceChildren(table("Limits", ["", "is", "limit"], preview.limits.map((limit) => [
-      el("span", limit.binds ? {class: "binds"} : {}, limit.name + (limit.binds ? " (binds)" : ""), limit.text ? el("small", {}, " " + limit.text) : null),
-      figure(limit.value), figure(limit.limit),
-    ])));
+    limits.replaceChildren(el("ul", {}, preview.limits.map((limit) => el("li", limit.binds ? {class: "binds"} : {},
+      (limit.binds ? "Binds: " : "") + limit.text, el("small", {}, limit.name)))));
     rowsBox.hidden = !preview.rows.length;
     rows.replaceChildren(table("Settings and why", ["setting", "value", "why"], preview.rows));
   }
 
-  const figure = (value) => (typeof value === "number" ? String(Number(value.toPrecision(4))) : value ?? "");
-
-  function refuse({error, ways, limits: between}) {
+  function refuse({error, ways}) {
     refused.replaceChildren(
       el("p", {class: "error"}, "No plan: " + error),
-      (between || []).length ? el("p", {class: "note"}, "Between " + between.join(" and ") + ". The map shows the last plan.") : null,
-      ways.length ? el("h3", {}, "Ways out") : "",
+      el("p", {class: "note"}, "The map shows the last plan."),
+      ...(ways.length ? [el("h3", {}, "Ways out")] : []),
       el("ul", {class: "plan-ways"}, ways.map((way) => el("li", {}, button(
         [way.change, way.price ? el("small", {}, way.price) : null], () => apply(way.changes),
       )))),

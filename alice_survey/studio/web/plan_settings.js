@@ -1,7 +1,7 @@
-/* The settings that are changed most, as sliders, choices and arrows; the others as sliders below. */
+/* The settings that are changed most, as sliders, choices and arrows; the others as numbers below. */
 
 import {el} from "./core.js";
-import {choice, compass, slider} from "./plan_fields.js";
+import {choice, compass, numberField, slider} from "./plan_fields.js";
 import {valueOf} from "./plan_history.js";
 
 const MAIN = [
@@ -9,7 +9,11 @@ const MAIN = [
   ["plan.speed_mps", "Speed"],
 ];
 const HEADING = "plan.line_heading_deg";
-const APART = "plan.altitude_m plan.line_spacing_m sea.current_mps sea.current_towards_deg sea.swell_m sea.swell_towards_deg";
+/* Those that are drawn, or set by an arrow or a choice. */
+const APART = new Set([
+  HEADING, "sea.current_mps", "sea.current_towards_deg", "sea.swell_m", "sea.swell_towards_deg", "camera.focal_mm",
+  "area.latitude_deg", "area.longitude_deg", "area.length_m", "area.width_m", "area.heading_deg",
+]);
 const titleOf = (key) => {
   const words = key.replace(/_(m|mps|deg|deg_s|s|px)$/, "").replaceAll("_", " ");
   return words[0].toUpperCase() + words.slice(1);
@@ -37,7 +41,7 @@ export function settingsPanel(file, changed) {
     controls.push((changes, preview) => {
       const spacing = now(changes, "plan.line_spacing_m");
       if (!spaced || spacing === null) made.set(now(changes, path));
-      else made.set(preview?.ok ? preview.totals.side_overlap : now(changes, path));
+      else made.set(preview?.ok ? Number(preview.totals.side_overlap.toFixed(3)) : now(changes, path));
       if (!spaced) return;
       spaced.hidden = spacing === null;
       spaced.textContent = "Follows from the lines, " + spacing + " m apart by line_spacing_m; moving it takes that out.";
@@ -53,9 +57,7 @@ export function settingsPanel(file, changed) {
     controls.push((changes, preview) => {
       const value = now(changes, HEADING);
       best.checked = value === null;
-      const [from, to] = preview?.ok && preview.lines.length ? [preview.lines[0].from, preview.lines[0].to] : [[0, 0], [1, 0]];
-      const flown = Math.round(Math.atan2(to[1] - from[1], to[0] - from[0]) * 180 / Math.PI);
-      made.value = value ?? (flown + 360) % 360;
+      made.value = value ?? (preview?.ok ? Math.round(preview.totals.heading_deg + 360) % 360 : 0);
       made.set(made.value);
       made.enable(!best.checked);
     });
@@ -76,11 +78,17 @@ export function settingsPanel(file, changed) {
     return made.element;
   }
 
+  function other(path) {
+    const made = numberField(titleOf(path.split(".")[1]), file.limits[path], (value) => one(path, value));
+    controls.push((changes) => made.set(now(changes, path)));
+    return made.element;
+  }
+
   const main = MAIN.map(([path, title]) => number(path, title));
-  const others = Object.keys(file.limits).filter(
-    (path) => path !== HEADING && !APART.includes(path) && !MAIN.some(([known]) => known === path),
-  );
-  const more = others.map((path) => number(path, titleOf(path.split(".")[1]))).filter(Boolean);
+  const others = Object.keys(file.limits).filter((path) => !APART.has(path) && !MAIN.some(([known]) => known === path));
+  const sections = [...new Set(others.map((path) => path.split(".")[0]))];
+  const more = sections.map((section) => el("details", {}, el("summary", {}, titleOf(section)),
+    others.filter((path) => path.startsWith(section + ".")).map(other)));
   const element = el("div", {}, main, heading(),
     el("div", {class: "row"},
       select("camera.focal_mm", "Lens", file.lenses_mm.map((mm) => [mm, mm + " mm"])),
@@ -88,7 +96,7 @@ export function settingsPanel(file, changed) {
     el("details", {}, el("summary", {}, "Current and swell"),
       arrow("Current", ["sea.current_mps", "sea.current_towards_deg"], {unit: "m/s", most: 0.5, step: 0.01, strengthTitle: "Speed"}),
       arrow("Swell", ["sea.swell_m", "sea.swell_towards_deg"], {unit: "m", most: 2, step: 0.05, strengthTitle: "Height"})),
-    more.length ? el("details", {}, el("summary", {}, "More settings"), more) : null);
+    el("details", {}, el("summary", {}, "More settings"), more));
 
   /* Show what is set, and where it follows from the plan, what the plan has. */
   const set = (changes, preview) => controls.forEach((control) => control(changes, preview));

@@ -5,7 +5,7 @@ import {counted, paintCounts, COUNT_COLOURS, MISSED_COLOUR} from "./plan_words.j
 
 /* Kinds of lines with their colours, as on the page of a plan. */
 const LINES = {survey: "#1b4f72", cross: "#6c3483", closing: "#117a65", fill: "#b9770e", tie: "#c0392b"};
-const [WAY, HOME, SWATH, MARK] = ["#7f8c8d", "#1e8449", "#2e86c1", "#8e44ad"];
+const [WAY, HOME, SWATH, MARK, ALLOWED] = ["#7f8c8d", "#1e8449", "#2e86c1", "#8e44ad", "#566573"];
 const GROUP = "The plan";
 const MADE = ["area", "plan"];  /* layers of the shell */
 const eastNorth = ([n, e]) => [e, n];
@@ -50,7 +50,11 @@ export function shown(studio) {
   }
 
   function putLayers(preview) {
-    const {totals, holes, homes, routes, outline} = preview;
+    const {totals, holes, homes, routes, outline, area} = preview;
+    put({
+      kind: "polygon", name: "plan-allowed", title: "The vehicle may be within", colour: ALLOWED, dashed: true, width: 1.2,
+      shapes: area.allowed.flat().map((ring) => [...ring, ring[0]].map(eastNorth)),
+    });
     if (holes.length) {
       put({
         kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"), colour: MISSED_COLOUR, fill: 0.25,
@@ -137,7 +141,7 @@ export function shown(studio) {
     const own = number;
     const pixels = await readPixels(layer.png);
     if (own !== number || !active) return;
-    putPicture("plan-sigma", "Expected sigma of the model", layer.png, {...layer, ...size(pixels)}, {scale: layer.scale});
+    putPicture("plan-sigma", layer.title || "Expected sigma of the model", layer.png, {...layer, ...size(pixels)}, {scale: layer.scale});
   }
 
   /* The expected sigma as a layer, until the plan is another one. */
@@ -167,8 +171,8 @@ export function shown(studio) {
 
   /* Show all of a plan, and let "Show all" mean it. */
   function fit(shapes) {
-    const ends = last?.ok ? last.lines.flatMap(({from, to}) => [from, to]) : [];
-    const bounds = boundsOf({...shapes, corridors: [...shapes.corridors, ends]});
+    const ways = last?.ok ? [...last.routes, ...last.area.allowed.flat()] : [];
+    const bounds = boundsOf({...shapes, corridors: [...shapes.corridors, ...ways]});
     if (!bounds) return;
     const [south, west, north, east] = bounds;
     const margin = 0.04 * Math.max(north - south, east - west, 1);

@@ -1,16 +1,5 @@
 /* Places and values along a way and in time, and the lines of a profile. */
 
-/* The index of the value nearest to one, in an ascending list. */
-export function nearestIndex(values, value) {
-  let [low, high] = [0, values.length - 1];
-  while (high - low > 1) {
-    const middle = (low + high) >> 1;
-    if (values[middle] <= value) low = middle;
-    else high = middle;
-  }
-  return value - values[low] <= values[high] - value ? low : high;
-}
-
 /* The place at a length along points; the ends where the length is beyond them. */
 export function placeAlong(points, length) {
   let left = length;
@@ -35,24 +24,39 @@ export function growing(lengths) {
   });
 }
 
-/* The place of a sample of a profile, on the route of its dive; dives count from 1. */
-export function profilePlace(profile, routes, i) {
-  const dive = profile.dive[i];
-  return placeAlong(routes[dive - 1] || [], profile.s_m[i] - profile.s_m[profile.dive.indexOf(dive)]);
+/* What a profile has at a length along all dives: the dive, depths between those of two samples, and
+   the place on the route of the dive; dives count from 1. */
+export function profileAt(profile, routes, along, length) {
+  let i = Math.min(Math.max(0, countUpTo(along, length) - 1), along.length - 1);
+  if (i === along.length - 1 && i > 0) i -= 1;
+  const span = along[i + 1] - along[i];
+  const t = span > 0 ? Math.min(1, Math.max(0, (length - along[i]) / span)) : 0;
+  const dive = profile.dive[t < 1 ? i : i + 1];
+  return {
+    dive,
+    floor: between(profile.floor_depth_m, i, t),
+    vehicle: between(profile.vehicle_depth_m, i, t),
+    place: placeAlong(routes[dive - 1] || [], length - along[profile.dive.indexOf(dive)]),
+  };
+}
+
+/* A value between that at i and the next; NaN where one of both is not known. */
+function between(values, i, t) {
+  const [start, end] = [values[i], values[Math.min(i + 1, values.length - 1)]];
+  return start === null || end === null ? NaN : start + t * (end - start);
 }
 
 /* State of a dive at a time: values between those of two samples, heading the shorter way round. */
 export function stateAt(dive, time) {
   const times = dive.t_s;
-  let i = nearestIndex(times, time);
-  if (times[i] > time && i > 0) i -= 1;
+  const i = Math.max(0, countUpTo(times, time) - 1);
   const next = Math.min(i + 1, times.length - 1);
   const span = times[next] - times[i];
   const t = span > 0 ? Math.min(1, Math.max(0, (time - times[i]) / span)) : 0;
-  const between = (values) => values[i] + t * (values[next] - values[i]);
+  const now = (values) => between(values, i, t);
   const turn = ((dive.heading_deg[next] - dive.heading_deg[i] + 540) % 360) - 180;
   return {
-    n: between(dive.n), e: between(dive.e), depth: between(dive.depth_m), altitude: between(dive.altitude_m),
+    n: now(dive.n), e: now(dive.e), depth: now(dive.depth_m), altitude: now(dive.altitude_m),
     heading: (dive.heading_deg[i] + t * turn + 360) % 360, index: i,
   };
 }

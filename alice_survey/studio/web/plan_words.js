@@ -32,11 +32,13 @@ export function shareOf(share, decimals = 2) {
 const ROWS = [
   ["Area", (t) => known(t.area_m2) && rounded(t.area_m2, 4) + " m²"],
   ["Covered", (t) => known(t.covered) && shareOf(t.covered)],
+  ["In stereo", (t) => known(t.stereo) && shareOf(t.stereo)],
   ["At the requested overlap", (t) => known(t.at_overlap) && shareOf(t.at_overlap)],
   ["Time", (t) => known(t.duration_s) && durationOf(t.duration_s)],
   ["Dives", (t) => known(t.dives) && String(t.dives)],
-  ["Energy", (t) => known(t.energy_wh) && Math.round(t.energy_wh) + " Wh"
-    + (known(t.usable_wh) ? " of " + Math.round(t.usable_wh) + " Wh usable a dive" : "")],
+  ["Energy", (t) => known(t.energy_wh) && Math.round(t.energy_wh) + " Wh"],
+  ["Longest dive", (t) => known(t.longest_dive_wh) && known(t.usable_wh)
+    && Math.round(t.longest_dive_wh) + " of " + Math.round(t.usable_wh) + " Wh usable"],
   ["Way", (t) => known(t.length_m) && Math.round(t.length_m).toLocaleString("en") + " m"],
   ["Lines", (t) => known(t.lines) && t.lines.toLocaleString("en")
     + (known(t.line_spacing_m) ? ", " + rounded(t.line_spacing_m, 3) + " m apart" : "")],
@@ -46,6 +48,8 @@ const ROWS = [
   ["Overlap forward, side", (t) => known(t.forward_overlap) && known(t.side_overlap)
     && Math.round(100 * t.forward_overlap) + " %, " + Math.round(100 * t.side_overlap) + " %"],
   ["Pixel on the sea floor", (t) => known(t.gsd_mm) && rounded(t.gsd_mm, 3) + " mm"],
+  ["Sharp", (t) => known(t.sharp_from_m) && rounded(t.sharp_from_m, 3) + " m"
+    + (known(t.sharp_to_m) ? " to " + rounded(t.sharp_to_m, 3) + " m" : " and beyond")],
   ["Exposure", (t) => known(t.exposure_s) && rounded(1000 * t.exposure_s, 3) + " ms"
     + (known(t.aperture) ? ", f/" + rounded(t.aperture, 2) : "")
     + (known(t.gain_db) ? ", gain " + rounded(t.gain_db, 2) + " dB" : "")],

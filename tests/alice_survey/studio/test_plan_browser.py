@@ -1,5 +1,7 @@
 """The Plan tab in Chromium: a survey is drawn, re-planned, undone, saved and kept from others."""
 
+import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +10,8 @@ from typing import Any
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from alice_survey.base.config import load_config
+from alice_survey.base.config import SurveyConfig, load_config
+from missions.plan.preview import preview
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.studio.client import serving
 
@@ -16,10 +19,17 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 800), "phone": (400, 800)}
 AREA = ((2.0, 2.0), (12.0, 2.0), (14.0, 12.0), (3.0, 14.0))
 LONG_PRESS_MS = 800
+DROP = """(text) => {
+  const data = new DataTransfer();
+  data.items.add(new File([text], "reef.geojson"));
+  const about = {dataTransfer: data, bubbles: true, cancelable: true};
+  document.getElementById("map-canvas").dispatchEvent(new DragEvent("drop", about));
+}"""
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
+    preview(SurveyConfig())  # kernels are compiled before a page waits for them
     with chromium() as started:
         yield started
 
@@ -108,9 +118,8 @@ def opened(browser: Any, address: str, size: str = "desk") -> PlanPage:
     heard = Heard()
     heard.listen(page)
     page.goto(f"{address}#plan")
-    found = PlanPage(page=page, heard=heard)
-    found.settled()
-    return found
+    page.wait_for_selector("#panel-plan[data-read]")
+    return PlanPage(page=page, heard=heard)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -188,10 +197,10 @@ def _press_long(plan: PlanPage, handle: Any) -> None:
 
 
 def _way_out(plan: PlanPage) -> None:
-    """An altitude that light does not allow is refused, and the first way out leads to a plan."""
+    """A speed that thrusters do not allow is refused, and the first way out leads to a plan."""
     page, before = plan.page, plan.plans
-    box = page.get_by_role("spinbutton", name="Altitude")
-    box.fill("9")
+    box = page.get_by_role("spinbutton", name="Speed").first
+    box.fill("3")
     box.press("Tab")
     plan.settled(before)
     assert page.get_by_text("No plan:").first.is_visible()
@@ -199,6 +208,7 @@ def _way_out(plan: PlanPage) -> None:
     page.locator(".plan-ways button").first.click()
     plan.settled(before)
     assert not page.locator(".plan-ways button").first.is_visible()
+    assert "speed_mps = 1.5" in plan.text()
 
 
 def _zone_by_keyboard(plan: PlanPage) -> None:
@@ -232,15 +242,16 @@ def _save(plan: PlanPage) -> None:
 def test_two_pages_do_not_overwrite_each_other(browser: Any, tmp_path: Path) -> None:
     with serving(tmp_path) as server:
         one, other = opened(browser, server.address), opened(browser, server.address)
-        one.draw("Survey area", AREA)
-        _save(one)
-        theirs = (tmp_path / "survey.toml").read_text(encoding="utf-8")
-
-        speed = other.page.get_by_role("spinbutton", name="Speed")
+        other.draw("Survey area", AREA)
+        speed = other.page.get_by_role("spinbutton", name="Speed").first
         before = other.plans
         speed.fill("0.25")
         speed.press("Tab")
         other.settled(before)
+        one.draw("Survey area", AREA)
+        _save(one)
+        theirs = (tmp_path / "survey.toml").read_text(encoding="utf-8")
+
         other.page.get_by_role("button", name="Save", exact=True).click()
         refused = other.page.get_by_role("dialog")
         refused.wait_for()
@@ -270,3 +281,70 @@ def _leaving_is_asked(plan: PlanPage) -> None:
     plan.page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.accept()))
     plan.page.reload()
     assert asked == ["beforeunload"]
+
+
+REEF = {
+    "type": "Polygon",
+    "coordinates": [
+        [[34.9553, 32.8236], [34.9554, 32.8236], [34.9554, 32.8237], [34.9553, 32.8236]]
+    ],
+}
+
+
+def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        plan = opened(browser, server.address)
+        page = plan.page
+        plan.draw("Survey area", AREA)
+        page.get_by_text("Current and swell").click()
+        page.get_by_role("slider", name="Current, direction").focus()
+        plan.press("ArrowRight")
+        assert "current_towards_deg = 95" in plan.text()
+        page.get_by_role("slider", name="Current, direction").focus()
+        plan.press("ArrowUp")
+        assert "current_mps = 0.06" in plan.text()
+
+        before = plan.plans
+        page.locator("input[type=file]").set_input_files(
+            {
+                "name": "reef.geojson",
+                "mimeType": "application/json",
+                "buffer": json.dumps(REEF).encode(),
+            }
+        )
+        plan.settled(before)
+        assert (
+            page.locator(".plan-list .choose")
+            .all_inner_texts()[0]
+            .startswith("Survey area\n3 corners")
+        )
+        page.evaluate(DROP, json.dumps(REEF))
+        plan.settled(before + 1)
+        plan.press("Control+z")
+
+        profile = page.get_by_role("slider", name="Place along the way")
+        profile.focus()
+        page.keyboard.press("End")
+        words = profile.get_attribute("aria-valuetext")
+        assert "dive 1" in words and "over the sea floor" in words
+        assert words == page.locator(".plan-profile .note").inner_text()
+
+        page.get_by_text("Play the dive").click()
+        page.get_by_role("button", name="Play", exact=True).click()
+        page.wait_for_function("() => / of .* pictures/.test(document.body.innerText)")
+        page.get_by_role("button", name="Pause", exact=True).click()
+        scrub = page.get_by_role("slider", name="Time")
+        scrub.focus()
+        page.keyboard.press("End")
+        shown = page.locator("#panel-plan").inner_text()
+        taken, of = re.search(r"([\d,]+) of ([\d,]+) pictures", shown).groups()
+        assert taken == of != "0"
+
+        page.get_by_text("Expected precision").click()
+        page.get_by_role("button", name="Compute it").click()
+        page.get_by_role("button", name="Compute it").scroll_into_view_if_needed()
+        page.wait_for_function("() => / mm/.test(document.body.innerText)", timeout=60_000)
+        page.screenshot(path=tmp_path / "more.png")
+        assert plan.violations() == []
+        assert plan.heard.complaints == []
+        page.close()

@@ -257,7 +257,8 @@ def test_no_answer_is_shown_after_that_of_a_newer_request(tmp_path: Path) -> Non
 def test_totals_as_words(tmp_path: Path) -> None:
     totals = {
         "area_m2": 255.0, "lines": 18, "stations": 612, "pictures": 1224, "length_m": 330.2,
-        "duration_s": 1690.0, "energy_wh": 61.3, "usable_wh": 1120.0, "dives": 1, "data_gb": 11.2,
+        "duration_s": 1690.0, "energy_wh": 61.3, "usable_wh": 1120.0, "longest_dive_wh": 61.3,
+        "dives": 1, "data_gb": 11.2,
         "interval_s": 1.21, "exposure_s": 0.00183, "gain_db": 0.0, "aperture": 4.0, "gsd_mm": 0.44,
         "line_spacing_m": 1.0, "forward_overlap": 0.63, "side_overlap": 0.281, "covered": 0.999996,
         "at_overlap": None, "speed_mps": 0.2,
@@ -271,7 +272,7 @@ def test_totals_as_words(tmp_path: Path) -> None:
     )  # fmt: skip
     assert dict(rows)["Covered"] == "99.99 %"
     assert dict(rows)["Exposure"] == "1.83 ms, f/4, gain 0 dB"
-    assert dict(rows)["Energy"] == "61 Wh of 1120 Wh usable a dive"
+    assert dict(rows)["Longest dive"] == "61 of 1120 Wh usable"
     assert "At the requested overlap" not in dict(rows)
     assert summary == "18 lines, 28 min, 1 dive, 1,224 pictures, 99.99 % covered, 1 hole"
     assert refused == "No plan: too steep"
@@ -308,17 +309,25 @@ def test_places_along_a_way_agree_with_shapely(tmp_path: Path) -> None:
 
 
 def test_a_profile_leads_to_its_place_whether_or_not_dives_begin_at_zero(tmp_path: Path) -> None:
+    """Halfway between two samples of each dive, at its ends, and beyond all."""
     routes = [[[0, 0], [10, 0]], [[5, 5], [5, 25]]]
-    ends = {"s_m": [0, 5, 10, 0, 8, 20], "dive": [1, 1, 1, 2, 2, 2]}
-    goes_on = {**ends, "s_m": [0, 5, 10, 10, 18, 30]}
-    places, along = run(
+    ends = {
+        "s_m": [0, 10, 0, 20], "dive": [1, 1, 2, 2],
+        "floor_depth_m": [14, 16, 15, None], "vehicle_depth_m": [12, 14, 13, 13],
+    }  # fmt: skip
+    goes_on = {**ends, "s_m": [0, 10, 10, 30]}
+    found, along = run(
         tmp_path, "plan_way",
-        "[both.map((p) => p.s_m.map((_, i) => m.profilePlace(p, routes, i))),"
+        "[both.map((p) => s.map((x) => m.profileAt(p, routes, m.growing(p.s_m), x))),"
         " both.map((p) => m.growing(p.s_m))]",
-        both=[ends, goes_on], routes=routes,
+        both=[ends, goes_on], routes=routes, s=[0, 5, 20, 30, 99],
     )  # fmt: skip
-    assert places == [[[0, 0], [5, 0], [10, 0], [5, 5], [5, 13], [5, 25]]] * 2
     assert along == [goes_on["s_m"]] * 2
+    for places in found:
+        assert [one["place"] for one in places] == [[0, 0], [5, 0], [5, 15], [5, 25], [5, 25]]
+        assert [one["dive"] for one in places] == [1, 1, 2, 2, 2]
+        assert [one["floor"] for one in places] == [14, 15, None, None, None]
+        assert [one["vehicle"] for one in places] == [12, 13, 13, 13, 13]
 
 
 def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> None:
@@ -326,19 +335,17 @@ def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> N
         "t_s": [0, 2, 4, 6], "n": [0, 1, 2, 3], "e": [0, 0, 0, 4], "depth_m": [0, 10, 10, 10],
         "altitude_m": [12, 2, 2, 2], "heading_deg": [350, 10, 10, 190],
     }  # fmt: skip
-    states, counts, near = run(
+    states, counts = run(
         tmp_path, "plan_way",
         "[[0, 1, 2, 3.5, 9, -1].map((t) => m.stateAt(d, t)),"
-        " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t)),"
-        " q.map((x) => m.nearestIndex([0, 1, 5, 9], x))]",
-        d=dive, q=[-3, 0.4, 0.6, 3.1, 7.1, 40],
+        " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t))]",
+        d=dive,
     )  # fmt: skip
     assert [state["heading"] for state in states] == [350, 0, 10, 10, 190, 350]
     assert [state["index"] for state in states] == [0, 0, 1, 1, 3, 0]
     assert states[3]["n"] == 1.75 and states[1]["depth"] == 5
     assert states[4]["e"] == 4 and states[5]["n"] == 0
     assert counts == [0, 1, 3, 4]
-    assert near == [0, 0, 1, 2, 3, 3]
 
 
 def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
