@@ -197,7 +197,9 @@ COMMANDS: Mapping[str, Startable] = {
     "run": Startable(title="Make all that is left", arguments=RenderingArguments, stages=names()),
     "plan": Startable(title="Plan the survey", arguments=PlanArguments, stages=names("plan")),
     "fly": Startable(title="Fly the plan", arguments=FlyArguments, stages=names("fly")),
-    "image": Startable(title="Render the pictures", arguments=RenderingArguments, stages=names("image")),
+    "image": Startable(
+        title="Render the pictures", arguments=RenderingArguments, stages=names("image")
+    ),
     "calibrate": Startable(
         title="Calibrate the cameras", arguments=WorkingArguments, stages=names("calibrate")
     ),
@@ -205,8 +207,12 @@ COMMANDS: Mapping[str, Startable] = {
         title="Reconstruct the sea floor", arguments=ReconstructArguments,
         stages=names("calibrate", "reconstruct"),
     ),
-    "evaluate": Startable(title="Score the survey", arguments=EvaluateArguments, stages=names("evaluate")),
-    "report": Startable(title="Write the report", arguments=WorkingArguments, stages=names("report")),
+    "evaluate": Startable(
+        title="Score the survey", arguments=EvaluateArguments, stages=names("evaluate")
+    ),
+    "report": Startable(
+        title="Write the report", arguments=WorkingArguments, stages=names("report")
+    ),
     "import-images": Startable(title="Import pictures", arguments=ImportImagesArguments),
     "import-log": Startable(title="Import a vehicle's log", arguments=ImportLogArguments),
     "control": Startable(title="Find coded markers", arguments=ControlArguments),

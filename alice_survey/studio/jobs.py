@@ -32,7 +32,8 @@ from alice_survey.studio.commands import COMMANDS, words_of
 from alice_survey.studio.heard import EventsTail, Heard
 from alice_survey.survey import is_locked
 
-RECORD = "job.json"
+RECORD, OUTPUT, ERRORS = "job.json", "output.txt", "errors.txt"
+"""Files of a job."""
 FOLDER = Path(".studio", "jobs")
 _KEPT_JOBS = 20
 _LOOK_EVERY_S = 0.1
@@ -125,9 +126,9 @@ class _Job:
         state = "killed" if code is None or code < 0 else "done" if code == 0 else "failed"
         if code in _CODES_OF_STOP or (self.stopping and state != "done"):
             state = "stopped"
-        line = heard.error or ("" if state == "done" else _last_line(self.folder / "output.txt"))
+        line = heard.error or ("" if state == "done" else _last_line(self.folder / ERRORS))
         if state == "done":
-            line = _told(heard.result or _output(self.folder / "output.txt"), heard.finished)
+            line = _told(heard.result or _output(self.folder / OUTPUT), heard.finished)
         elif state == "stopped":
             line = "stopped: the same command goes on from where it was"
         elif state == "killed" and not heard.error:
@@ -287,7 +288,7 @@ class Jobs:
                 raise FileNotFoundError(folder)
             heard, tail = Heard(), EventsTail(folder / "events.jsonl")
             heard.take(tail.read())
-            output = "" if heard.lines_n else _output(folder / "output.txt")
+            output = "" if heard.lines_n else _output(folder / ERRORS)
         return {"lines": heard.log(after), "total": heard.lines_n, "output": output}
 
     def _check_free(self) -> None:
@@ -312,9 +313,13 @@ class Jobs:
             *self._program, *words[: len(name.split())],
             f"--events={folder / 'events.jsonl'}", *words[len(name.split()) :],
         ]  # fmt: skip
-        with (folder / "output.txt").open("wb") as output, for_other_programs():
+        with (
+            (folder / OUTPUT).open("wb") as output,
+            (folder / ERRORS).open("wb") as errors,
+            for_other_programs(),
+        ):
             process = subprocess.Popen(  # noqa: S603 (of a fixed list)
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=errors,
                 start_new_session=True, env=_environment(),
             )  # fmt: skip
         try:

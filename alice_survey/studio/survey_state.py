@@ -28,6 +28,7 @@ from alice_survey.survey import settings, stage_states
 UP_TO_DATE = "up to date"
 _STALE = re.compile(r"stale \((.*)\)", re.DOTALL)
 _COMMAND = re.compile(r"'alice-survey ([a-z][a-z -]*[a-z])( [^']*)?'")
+_NOT_THERE = ("missing", "interrupted")
 _SIMULATED = ("run", "plan", "fly", "image", "calibrate", "evaluate")
 """Commands for simulated surveys."""
 
@@ -139,9 +140,11 @@ def _commands(
             continue
         left = [s for s in command.stages if states.get(s, UP_TO_DATE) != UP_TO_DATE]
         known = {stage: costs[stage] for stage in left if stage in costs}
+        needs = {n for s in left for n in spec(s).needs if n not in command.stages}
         found.append(
             {
                 "name": name, "title": command.title, "left": left,
+                "after": [n for n in states if n in needs and states[n] in _NOT_THERE],
                 "command": shlex.join(["alice-survey", name, "-w", str(workspace)]),
                 "cost": _taken(known) if known else None,
             }

@@ -50,7 +50,7 @@ if kind == "image":  # deaf
     tell(event="note", message="deaf")
     time.sleep(60)
 if kind == "report":
-    print("error: no such option: --nothing")
+    print("error: no such option: --nothing", file=sys.stderr)
     sys.exit(2)
 tell(event="stage_finished", stage="plan", took_s=1.0, cpu_s=1.0, peak_mib=1.0)
 tell(event="result", message="table" + chr(10) + "plan: 4 lines" + chr(10) + "image: about 17 s")
@@ -150,7 +150,7 @@ def test_a_deaf_job_is_ended_in_the_end(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_killed_job_says_so(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as jobs:
         jobs.start("plan")
-        until(lambda: jobs.log(1)["total"] > 1)
+        until(lambda: jobs.log(1)["total"] > 2)
         os.kill(JobRecord.read(folder_of(tmp_path) / "job.json").process, signal.SIGKILL)
         until(lambda: jobs.running() is None)
         (ended,) = jobs.history()
@@ -203,7 +203,7 @@ def test_a_command_elsewhere_is_seen_and_waited_for(
 def test_a_later_studio_finds_the_job_and_can_stop_it(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as killed:  # its threads go on; those of a killed studio would not
         killed.start("plan")
-        until(lambda: killed.log(1)["total"] > 1)
+        until(lambda: killed.log(1)["total"] > 2)
         told = Told()
         with jobs_in(tmp_path, told) as later:
             job = later.running()
@@ -240,7 +240,7 @@ def test_another_process_of_the_same_number_is_not_the_job(tmp_path: Path) -> No
 def test_the_studio_ends_its_job(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as jobs:
         jobs.start("plan")
-        until(lambda: jobs.log(1)["total"] > 1)
+        until(lambda: jobs.log(1)["total"] > 2)
         jobs.close()
         (ended,) = jobs.history()
     assert (ended["state"], ended["exit_code"]) == ("stopped", 130)
