@@ -199,6 +199,8 @@ export function tab(studio) {
         command.cost ? el("small", {}, costText(command.cost)) : null,
         el("ul", {}, own.map(row)));
     }).filter(Boolean);
+    const rest = known.stages.filter((stage) => !known.commands.some((one) => one.name === stage.command));
+    if (rest.length) groups.unshift(el("section", {class: "group", "aria-label": "Pictures"}, el("div", {class: "head"}, el("h3", {}, "Imported pictures")), el("ul", {}, rest.map(row))));
     stages.replaceChildren(...groups);
   }
 
@@ -284,10 +286,12 @@ export function tab(studio) {
       running = data.job;
       if (!known) return;
       const grown = running.finished.length !== finished || !known.job;
+      const moved = known.job?.stage !== running.stage;
       finished = running.finished.length;
       known.job = running;
       if (opened) showJob();
-      if (grown && opened) load();
+      if (opened && moved) showStages();
+      if (opened && grown) load();
       log.follow(running);
       return;
     }
@@ -304,6 +308,7 @@ export function tab(studio) {
     log.follow({number: ended.number});
     await attempt(() => studio.refresh());
     await load();
+    await history.show();
   }
 
   function notice(text) {
@@ -423,7 +428,7 @@ function logView() {
 function historyView() {
   const place = el("div", {});
   const element = el("details", {}, el("summary", {}, "Earlier runs"), place);
-  element.addEventListener("toggle", async () => {
+  async function show() {
     if (!element.open) return;
     const found = await attempt(() => get("/api/run/history"));
     if (!found) return;
@@ -435,6 +440,7 @@ function historyView() {
       const [icon, colour, words] = ENDS[one.state] || ENDS.killed;
       return [one.title, [el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon), " " + words], ago(one.ended_utc)];
     })));
-  });
-  return {element};
+  }
+  element.addEventListener("toggle", show);
+  return {element, show};
 }

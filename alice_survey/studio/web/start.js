@@ -165,12 +165,17 @@ function picturesForm(started, disk) {
     inside.checked = false;
     isRig = true;
     rigFolders = {};
-    const some = here.pictures + here.videos > 0;
-    if (some || seen.inside.some((one) => one.pictures)) look(!some);
-    else {
-      questions.hidden = true;
-      found.replaceChildren(el("p", {}, "No pictures are in this folder itself."));
+    if (here.pictures + here.videos > 0 || alike(seen.inside)) {
+      look();
+      return;
     }
+    asked += 1;
+    take.disabled = true;
+    questions.hidden = true;
+    const deeper = seen.inside.some((one) => one.pictures);
+    found.replaceChildren(deeper
+      ? el("p", {}, "No pictures are in this folder itself: choose one inside, or take all: ", button("Take the folders inside too", () => { inside.checked = true; look(); }))
+      : el("p", {}, "No pictures are in this folder itself."));
   }
 
   /* What `import-images` is to be given. */
@@ -185,7 +190,7 @@ function picturesForm(started, disk) {
     return {...common, folders: [here.path], recursive: inside.checked};
   }
 
-  async function look(quiet = false) {
+  async function look() {
     asked += 1;
     const mine = asked;
     take.disabled = true;
@@ -195,9 +200,7 @@ function picturesForm(started, disk) {
       seen = await send("/api/start/preview", given());
     } catch (fault) {
       if (mine !== asked) return;
-      if (quiet) found.replaceChildren(el("p", {}, "No pictures are in this folder itself: choose one inside, or take them all: ", button("Take the folders inside too", () => { inside.checked = true; look(); })));
-      else found.replaceChildren(el("p", {class: "error"}, fault.message));
-      questions.hidden = quiet;
+      found.replaceChildren(el("p", {class: "error"}, fault.message));
       return;
     }
     if (mine !== asked) return;
@@ -249,6 +252,12 @@ function picturesForm(started, disk) {
     await started();
   }
   return form;
+}
+
+/* Whether folders look like those of a rig's cameras, as the server judges it too. */
+function alike(folders) {
+  const counts = folders.map((one) => one.pictures).filter((n) => n);
+  return counts.length >= 2 && counts.length <= 8 && Math.max(...counts) - Math.min(...counts) <= 0.02 * Math.max(...counts);
 }
 
 function held(folder) {

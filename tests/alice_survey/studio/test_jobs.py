@@ -29,8 +29,8 @@ tell(event="stage_started", stage="plan", message="plan")
 kind = sys.argv[1]
 if kind == "plan":  # works until Ctrl-C, with a worker of its own
     worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    tell(event="note", message=f"worker {worker.pid}")
     try:
+        tell(event="note", message=f"worker {worker.pid}")
         for n in range(600):
             tell(event="step_progress", stage="plan", step="work", step_number=1, done=n, total=600,
                  elapsed_s=n / 10, remaining_s=60 - n / 10)
