@@ -128,7 +128,7 @@ class _Job:
             state = "stopped"
         line = heard.error or ("" if state == "done" else _last_line(self.folder / ERRORS))
         if state == "done":
-            line = _told(heard.result or _output(self.folder / OUTPUT), heard.finished)
+            line = _main_line(heard.result or _output(self.folder / OUTPUT), heard.finished)
         elif state == "stopped":
             line = "stopped: the same command goes on from where it was"
         elif state == "killed" and not heard.error:
@@ -415,7 +415,7 @@ def _output(path: Path) -> str:
         return ""
 
 
-def _told(result: str, finished: Sequence[str]) -> str:
+def _main_line(result: str, finished: Sequence[str]) -> str:
     """The line of a result that tells most: that of the last stage, else the first."""
     lines = result.splitlines() or [""]
     name = spec(finished[-1]).name if finished else ""

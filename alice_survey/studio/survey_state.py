@@ -48,7 +48,8 @@ def survey_state(workspace: Path) -> dict[str, Any]:
         "cores": default_threads(), "imported": False,
     }  # fmt: skip
     if is_new:
-        return found
+        inside = workspace.iterdir() if workspace.is_dir() else ()
+        return found | {"others": sum(not path.name.startswith(".") for path in inside)}
     try:
         imported = found["imported"] = is_imported(workspace)
         config = settings(workspace, None, needed=not imported)

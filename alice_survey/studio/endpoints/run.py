@@ -31,6 +31,10 @@ class _RunTab:
             found["new"] = found["new"] or last["state"] != "done"
         return found
 
+    def job(self, call: Call) -> dict[str, Any]:
+        """The job alone."""
+        return self.studio.jobs.state()
+
     def start(self, call: Call) -> dict[str, Any]:
         """Start a command of the list."""
         asked = call.read(_AskedCommand)
@@ -55,6 +59,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     run = _RunTab(studio)
     return (
         Endpoint(path="/api/run", answer=run.state),
+        Endpoint(path="/api/run/job", answer=run.job),
         Endpoint(path="/api/run/start", answer=run.start, method="POST", writes=True),
         Endpoint(path="/api/run/stop", answer=run.stop, method="POST", writes=True),
         Endpoint(path="/api/run/log", answer=run.log),

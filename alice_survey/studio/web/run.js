@@ -57,7 +57,7 @@ export function tab(studio) {
     first.hidden = !known.new || Boolean(running);
     work.hidden = !first.hidden;
     wide(!first.hidden && opened);
-    if (!first.hidden && !first.firstChild) first.append(startPage(studio, {started: load, disk: known.disk}));
+    if (!first.hidden && !first.firstChild) first.append(startPage(studio, {started: load, disk: known.disk, others: known.others}));
     if (!first.hidden) showLast(first.querySelector(".start-last"));
     if (work.hidden) return;
     showJob();
@@ -317,8 +317,14 @@ export function tab(studio) {
     window.addEventListener("focus", () => { document.title = title; }, {once: true});
   }
 
-  function watch() {
-    if ((running || known?.elsewhere) && Date.now() - heardAt > SILENT_MS) load();
+  /* Commands of a terminal, and what was missed while this page slept. */
+  async function watch() {
+    if (document.hidden || Date.now() - heardAt < SILENT_MS) return;
+    heardAt = Date.now();
+    const now = await attempt(() => get("/api/run/job"));
+    if (!now || !known) return;
+    const same = (key) => JSON.stringify(now[key]) === JSON.stringify(known[key]);
+    if (now.job?.number !== known.job?.number || !same("elsewhere")) load();
   }
 
   return {
@@ -415,12 +421,12 @@ function logView() {
       take(running.number);
       more();
     },
-    show(ended) {
+    async show(ended) {
       take(ended.number);
       element.open = true;
-      more();
-      element.scrollIntoView({block: "nearest"});
+      await more();
       lines.focus();
+      element.scrollIntoView({block: "end"});
     },
   };
 }

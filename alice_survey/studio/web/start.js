@@ -6,7 +6,7 @@ import {duration, gigabytes} from "./run_words.js";
 const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt,.plan";
 
 /* The page of an empty workspace; `started` is called where a job has begun. */
-export function startPage(studio, {started, disk}) {
+export function startPage(studio, {started, disk, others}) {
   const forms = {plan: planForm(studio), pictures: picturesForm(started, disk)};
   const choose = (name) => {
     Object.entries(forms).forEach(([key, form]) => { form.hidden = key !== name; });
@@ -18,7 +18,7 @@ export function startPage(studio, {started, disk}) {
     button(text, () => choose(name), {"data-choice": name, "aria-pressed": "false"}));
   return el("div", {class: "start"},
     el("h2", {}, "What do you want to do?"),
-    el("p", {}, "Nothing is in ", el("code", {}, studio.state.workspace), " yet. A survey is planned here and flown, in simulation or by a vehicle; or pictures that you have become a model of the sea floor."),
+    el("p", {}, el("code", {}, studio.state.workspace), others ? " holds no survey yet; what else is in it stays as it is." : " holds nothing yet.", " A survey is planned here and flown, in simulation or by a vehicle; or pictures that you have become a model of the sea floor."),
     el("div", {class: "buttons choices"}, choices),
     el("section", {class: "job start-last", "aria-label": "Last run", hidden: true}),
     forms.plan, forms.pictures);

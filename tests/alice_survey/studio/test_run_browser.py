@@ -15,7 +15,7 @@ from tests.alice_survey.report.tiny import tiny_workspace
 from tests.alice_survey.studio.client import serving
 from tests.alice_survey.studio.test_jobs import PROGRAM
 from tests.alice_survey.studio.test_run_tab import AREA
-from tests.reconstruct.pictures.test_preview import navigation, take
+from tests.reconstruct.pictures.dated import navigation, take
 from tests.small_survey import settings_in
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]

@@ -21,7 +21,7 @@ from alice_survey.studio.server import Server
 from alice_survey.studio.survey_state import ways_on
 from tests.alice_survey.studio.client import Reply, ask, call, serving
 from tests.alice_survey.studio.test_jobs import PROGRAM, until
-from tests.reconstruct.pictures.test_preview import navigation, take
+from tests.reconstruct.pictures.dated import navigation, take
 from tests.small_survey import settings_in
 
 AREA = {
