@@ -4,12 +4,11 @@ import contextlib
 import json
 import os
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from filelock import FileLock, Timeout
 
@@ -22,11 +21,15 @@ from alice_survey.base.config import (
     parse_config,
     parse_current,
     parse_health,
+    settings_in,
 )
 from alice_survey.base.errors import ConfigError, WorkspaceError, warn
 from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.run.progress import part
 from alice_survey.stages import is_imported, names, spec
+
+if TYPE_CHECKING:
+    from alice_survey.base.settings_text import Values
 
 _VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
 
@@ -236,7 +239,9 @@ def init_survey(
     folder: Path,
     template: str = "survey.toml",
     area: Path | None = None,
-    values: Mapping[str, str | float] | None = None,
+    *,
+    name: str | None = None,
+    values: "Values | None" = None,
 ) -> Path:
     """Write a commented settings file, never over one that is there.
 
@@ -244,7 +249,8 @@ def init_survey(
         folder: where to.
         template: which.
         area: a file with the area to survey instead of the template's.
-        values: instead of the template's, by dotted names such as `area.seafloor_depth_m`.
+        name: of the survey.
+        values: settings instead of the template's.
 
     Raises:
         WorkspaceError: the file exists, the folder cannot be written, or the area is missing.
@@ -255,11 +261,14 @@ def init_survey(
     path = folder / "survey.toml"
     if path.exists():
         raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
-    text = (resources.files("alice_survey") / template).read_text(encoding="utf-8")
-    for name, value in (values or {}).items():
-        text = _with_value(text, name, value)
+    from alice_survey.base.settings_text import with_settings_changed
+
+    text = template_text(template)
+    if name is not None:
+        text = re.sub(r'^name = ".*"', lambda _: f"name = {json.dumps(name)}", text, flags=re.M)
     if values:
-        parse_config(tomllib.loads(text), "the new survey")
+        text = with_settings_changed(text, values)
+    parse_config(settings_in(text, "the new survey"), "the new survey")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text if area is None else _with_area(text, area, folder), encoding="utf-8")
@@ -268,16 +277,9 @@ def init_survey(
     return path
 
 
-def _with_value(text: str, name: str, value: str | float) -> str:
-    """Settings with another value of a key that they name, which may be commented out."""
-    section, _, key = name.rpartition(".")
-    start = text.index(f"[{section}]") if section else 0
-    line = re.compile(rf"^(?:# )?{key} = (?:\"[^\"]*\"|[^#\n]*[^#\s])", re.MULTILINE)
-    found = line.search(text, start)
-    if found is None:
-        raise ConfigError(f"the settings name no {name}")
-    written = json.dumps(value, ensure_ascii=False)
-    return f"{text[: found.start()]}{key} = {written}{text[found.end() :]}"
+def template_text(template: str = "survey.toml") -> str:
+    """The commented settings that a new survey starts from."""
+    return (resources.files("alice_survey") / template).read_text(encoding="utf-8")
 
 
 def _with_area(text: str, area: Path, folder: Path) -> str:

@@ -12,6 +12,7 @@ from pydantic import Field
 from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import Config, load_config
 from alice_survey.base.errors import AliceError, WorkspaceError
+from alice_survey.base.settings_text import Values
 from alice_survey.studio.commands import ImportImagesArguments
 from alice_survey.studio.endpoints.base import Call, Endpoint, StaleError, Studio
 from alice_survey.studio.folders import Folders
@@ -82,27 +83,20 @@ class _StartPage:
         """Write the settings of a survey to plan."""
         asked = call.read(_NewSurvey)
         workspace = self.studio.workspace.folder
-        names = {
-            "name": "name", "latitude_deg": "area.latitude_deg",
-            "longitude_deg": "area.longitude_deg", "length_m": "area.length_m",
-            "width_m": "area.width_m", "seafloor_depth_m": "area.seafloor_depth_m",
-            "focal_mm": "camera.focal_mm",
-        }  # fmt: skip
-        values = {
-            name: value for key, name in names.items() if (value := getattr(asked, key)) is not None
-        }
+        area = ("latitude_deg", "longitude_deg", "length_m", "width_m", "seafloor_depth_m")
+        values = {"area": _given(asked, area), "camera": _given(asked, ("focal_mm",))}
         if (asked.latitude_deg is None) != (asked.longitude_deg is None):
             raise AliceError("latitude and longitude go together: give both, or neither")
         if (workspace / "survey.toml").exists():
             raise StaleError(f"{workspace} has a survey already: change it in the Plan tab")
         with self.studio.only_writer():
             if asked.area is None:
-                init_survey(workspace, values=values)
+                init_survey(workspace, name=asked.name, values=values)
             else:
-                self._with_area(asked.area, values)
+                self._with_area(asked.area, asked.name, values)
         return {"workspace": str(workspace)}
 
-    def _with_area(self, given: _DroppedArea, values: dict[str, str | float]) -> None:
+    def _with_area(self, given: _DroppedArea, name: str, values: Values) -> None:
         """Write an area file that was dropped, and the settings that name it; both or neither."""
         suffix = Path(given.name).suffix.lower()
         if suffix not in _SINGLE:
@@ -120,7 +114,7 @@ class _StartPage:
             raise StaleError(f"{area} exists already: remove it first")
         try:
             area.write_bytes(content)
-            init_survey(folder, area=area, values=values)
+            init_survey(folder, area=area, name=name, values=values)
             config = load_config(toml)
             survey_area(config.area, turn_margin_m=3.0)
         except BaseException:
@@ -152,6 +146,10 @@ class _StartPage:
                 toml.write_text(text, encoding="utf-8")
             else:
                 toml.unlink()
+
+
+def _given(asked: _NewSurvey, names: Sequence[str]) -> dict[str, float]:
+    return {name: value for name in names if (value := getattr(asked, name)) is not None}
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
