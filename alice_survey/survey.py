@@ -8,17 +8,28 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from filelock import FileLock, Timeout
 
 from alice_survey import stages as survey_stages
 from alice_survey.base.artefacts import read_json, read_stage
-from alice_survey.base.config import SurveyConfig, changed, load_config, parse_current, parse_health
+from alice_survey.base.config import (
+    SurveyConfig,
+    changed,
+    load_config,
+    parse_config,
+    parse_current,
+    parse_health,
+    settings_in,
+)
 from alice_survey.base.errors import ConfigError, WorkspaceError, warn
 from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.run.progress import part
 from alice_survey.stages import is_imported, names, spec
+
+if TYPE_CHECKING:
+    from alice_survey.base.settings_text import Values
 
 _VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
 
@@ -224,25 +235,42 @@ def _holds_pictures(folder: Path) -> bool:
     return any(path.suffix.lower() in suffixes for path in folder.rglob("*"))
 
 
-def init_survey(folder: Path, template: str = "survey.toml", area: Path | None = None) -> Path:
+def init_survey(
+    folder: Path,
+    template: str = "survey.toml",
+    area: Path | None = None,
+    *,
+    name: str | None = None,
+    values: "Values | None" = None,
+) -> Path:
     """Write a commented settings file, never over one that is there.
 
     Args:
         folder: where to.
         template: which.
         area: a file with the area to survey instead of the template's.
+        name: of the survey.
+        values: settings instead of the template's.
 
     Raises:
         WorkspaceError: the file exists, the folder cannot be written, or the area is missing.
+        ConfigError: a value is not one that a survey may have.
     """
     if area is not None and not area.is_file():
         raise WorkspaceError(f"{area}: no such file")
     path = folder / "survey.toml"
     if path.exists():
         raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
+    from alice_survey.base.settings_text import with_settings_changed
+
+    text = template_text(template)
+    if name is not None:
+        text = re.sub(r'^name = ".*"', lambda _: f"name = {json.dumps(name)}", text, flags=re.M)
+    if values:
+        text = with_settings_changed(text, values)
+    parse_config(settings_in(text, "the new survey"), "the new survey")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        text = template_text(template)
         path.write_text(text if area is None else _with_area(text, area, folder), encoding="utf-8")
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
@@ -285,21 +313,28 @@ def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str,
     return "\n".join([text, "", "To look at:", *rows, page]), found
 
 
+def stage_states(workspace: Path, config: SurveyConfig) -> dict[str, str]:
+    """State of each stage that the survey of a workspace has, as `StageSpec.state` gives it."""
+    imported = is_imported(workspace)
+    states: dict[str, str] = {}
+    for stage in survey_stages.STAGES:
+        if not (imported and stage.simulated and stage.name != "image"):
+            states[stage.name] = stage.state(workspace, config, states)
+    return states
+
+
 def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
     """State of a workspace, stage by stage, and the next command."""
     if not workspace.is_dir():
         raise WorkspaceError(f"{workspace}: no such folder; 'alice-survey init' makes one")
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)
-    states: dict[str, str] = {}
+    states = stage_states(workspace, config)
     rows = []
-    for stage in survey_stages.STAGES:
-        if imported and stage.simulated and stage.name != "image":
-            continue
-        state = states[stage.name] = stage.state(workspace, config, states)
+    for stage in map(spec, states):
         record = read_stage(workspace / stage.folder)
         took = f"{record.took_s:8.1f} s" if record else " " * 10
-        rows.append(f"{stage.name:10} {stage.folder + '/':13} {state:32} {took}")
+        rows.append(f"{stage.name:10} {stage.folder + '/':13} {states[stage.name]:32} {took}")
     pending = [name for name, state in states.items() if state != "up to date"]
     command = f"alice-survey {spec(pending[0]).command} -w {workspace}" if pending else None
     after = f"next: {command}" if command else "nothing is left to do"
@@ -326,6 +361,20 @@ def status_report(
     done = [name for name, state in states.items() if state == "up to date"]
     cost, found["cost"] = _predicted(workspace, survey, {"left": left}, workers, done)
     return "\n".join(filter(None, (text, cost))), found
+
+
+def is_locked(workspace: Path) -> bool:
+    """Whether a command is working in a workspace now."""
+    lock = workspace / ".lock"
+    if not lock.is_file():
+        return False
+    try:
+        with FileLock(lock, timeout=0):
+            return False
+    except Timeout:
+        return True
+    except OSError:  # of a workspace that cannot be written, where nothing works either
+        return False
 
 
 @contextlib.contextmanager

@@ -75,6 +75,7 @@ def import_images(
     GPS from EXIF, or nothing at all.
     """
     from alice_survey.base.errors import ImageError
+    from alice_survey.survey import only_one
     from camera_calib.picture_files import places_of_cameras
     from reconstruct.pictures.importing import import_images as work
 
@@ -85,14 +86,15 @@ def import_images(
     pair = {name: side for name, side in (("left", left), ("right", right)) if side is not None}
     named = places_of_cameras(camera or ())
     folders_of = {} if bag is not None else {name: Path(place) for name, place in named.items()}
-    found = work(
-        workspace, folders or [], cameras=pair | folders_of, bag=bag,
-        topics={} if bag is None else named, videos=video or (), overlap=overlap,
-        every_s=every, recursive=recursive,
-        navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
-        vertical_datum=vertical_datum, rig=rig, masks=masks, triggers=triggers,
-        executor=executor_of(threads),
-    )  # fmt: skip
+    with only_one(workspace):
+        found = work(
+            workspace, folders or [], cameras=pair | folders_of, bag=bag,
+            topics={} if bag is None else named, videos=video or (), overlap=overlap,
+            every_s=every, recursive=recursive,
+            navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
+            vertical_datum=vertical_datum, rig=rig, masks=masks, triggers=triggers,
+            executor=executor_of(threads),
+        )  # fmt: skip
     typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
 
 

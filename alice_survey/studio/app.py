@@ -27,6 +27,7 @@ from alice_survey.studio.endpoints.base import (
 from alice_survey.studio.endpoints.shell import all_endpoints
 from alice_survey.studio.files import PAGE, POLICY, REVALIDATE, content_type, opened
 from alice_survey.studio.guard import API, Guard, line
+from alice_survey.studio.jobs import BusyError
 from alice_survey.studio.layers import FILES, ChangedError
 from alice_survey.studio.page import MeshCopies, listing
 from alice_survey.studio.paths import RefusedError, names_of
@@ -100,7 +101,7 @@ def _answered(endpoint: Endpoint, call: Call, request: Request) -> Response:
         return _fault(400, str(fault))
     except ChangedError:
         return _fault(409, _CHANGED)
-    except StaleError as fault:
+    except (StaleError, BusyError) as fault:
         return _fault(409, str(fault))
     except FileNotFoundError:
         return _fault(404, "nothing is here")

@@ -163,9 +163,10 @@ class Server:
         self._uvicorn.should_exit = True
 
     def close(self) -> None:
-        """Stop listening, and wait briefly for what is being read."""
+        """Stop listening, end the job, and wait briefly for what is being read."""
         with contextlib.suppress(OSError):
             self.socket.close()
+        self.studio.jobs.close()
         self.studio.layers.close()
 
 

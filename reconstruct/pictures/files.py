@@ -219,6 +219,21 @@ def inspect(path: Path) -> PictureFacts:
     return facts
 
 
+def read_header(path: Path) -> PictureFacts:
+    """What a picture states, without decoding it; size 0 where only decoding can tell."""
+    heic = path.suffix.lower() in HEIC and can_read_heic()  # which makes Pillow know them
+    facts = PictureFacts(path=path)
+    try:
+        with _pillow(path) as image:
+            facts = PictureFacts(path=path, width_px=image.width, height_px=image.height)
+    except ImageError as error:
+        fault = "" if path.suffix.lower() in RAW and not heic else str(error)
+        return PictureFacts(path=path, fault=fault)
+    if path.suffix.lower() in RAW:  # Pillow sees the small picture inside
+        facts = PictureFacts(path=path)
+    return _with_exif(facts)
+
+
 def decode(path: Path) -> NDArray[Any]:
     """All pixels of a picture, (H, W) or (H, W, 3) BGR, 8 or 16 bits.
 

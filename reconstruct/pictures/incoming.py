@@ -114,16 +114,17 @@ def by_camera(entries: Sequence[Incoming], name: str) -> list[Incoming]:
 
     The camera of most pictures has the name that is given; the next ones a number more.
     """
-    counts = Counter(_camera_key(entry) for entry in entries)
+    counts = Counter(camera_key(entry.facts) for entry in entries)
     names = {
         key: name if number == 1 else f"{name}-{number}"
         for number, (key, _) in enumerate(counts.most_common(), 1)
     }
-    return [replace(entry, camera=names[_camera_key(entry)]) for entry in entries]
+    return [replace(entry, camera=names[camera_key(entry.facts)]) for entry in entries]
 
 
-def _camera_key(entry: Incoming) -> tuple[str, int, int]:
-    return entry.facts.device, entry.facts.width_px, entry.facts.height_px
+def camera_key(facts: PictureFacts) -> tuple[str, int, int]:
+    """What tells the pictures of one camera from those of another: device, width, height."""
+    return facts.device, facts.width_px, facts.height_px
 
 
 def check_entries(entries: Sequence[Incoming], rig: Rig | None) -> None:

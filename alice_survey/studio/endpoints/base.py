@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import json
 import math
 import threading
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import AliceError
+from alice_survey.studio.jobs import Jobs
 from alice_survey.studio.layers import Layers
 from alice_survey.studio.paths import Workspace
 
@@ -113,6 +115,11 @@ class Studio:
     def publish(self, event: str, data: Any) -> None:
         """Send an event to every page; any thread may."""
         self.events.publish(event, data)
+
+    @functools.cached_property
+    def jobs(self) -> Jobs:
+        """The commands that run in the workspace."""
+        return Jobs(self.workspace.folder, self.publish)
 
     @contextlib.contextmanager
     def only_writer(self) -> Iterator[None]:

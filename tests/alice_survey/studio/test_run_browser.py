@@ -1,0 +1,206 @@
+"""The first start and the Run tab in Chromium: a survey flown, pictures imported."""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from alice_survey.studio.jobs import Jobs
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.report.tiny import tiny_workspace
+from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.test_jobs import PROGRAM
+from tests.alice_survey.studio.test_run_tab import AREA
+from tests.reconstruct.pictures.dated import navigation, take
+from tests.small_survey import settings_in
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+WIDE, NARROW = {"width": 1280, "height": 900}, {"width": 400, "height": 900}
+LONG_MS = 200_000
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """One Chromium for all."""
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """A page that complains about nothing but requests that were refused."""
+    page = browser.new_page(viewport=WIDE, reduced_motion="reduce")
+    heard = Heard()
+    heard.listen(page)
+    yield page
+    assert [one for one in heard.complaints if "status of 400" not in one] == []
+    page.close()
+
+
+def is_accessible(page: Any) -> None:
+    """No violations that axe knows, wide and narrow, and nothing wider than the screen."""
+    for size in (NARROW, WIDE):
+        page.set_viewport_size(size)
+        found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
+        assert [(one["id"], one["nodes"][0]["target"]) for one in found] == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+
+
+def named(page: Any, name: str) -> Any:
+    return page.get_by_role("button", name=name, exact=True)
+
+
+def test_a_survey_from_an_empty_folder_is_planned_and_flown(page: Any, tmp_path: Path) -> None:
+    reef = tmp_path / "reef"
+    with serving(reef) as server:
+        page.goto(server.address)
+        page.wait_for_selector(".start")
+        is_accessible(page)
+        named(page, "Plan a survey").click()
+        assert page.get_by_label("Its name").input_value() == "reef"
+        page.get_by_label("Latitude, degrees").fill("43.05")
+        page.get_by_label("Longitude, degrees").fill("5.92")
+        page.get_by_label("Depth of the sea floor, m").fill("12")
+        page.get_by_text("Size and camera").click()
+        page.get_by_label("Length, m").fill("1.3")
+        page.get_by_label("Width, m").fill("1.5")
+        is_accessible(page)
+        assert not (reef / "survey.toml").exists()
+        with page.expect_navigation():
+            named(page, "Make the survey").click()
+        page.goto(server.url + "#run")
+        page.wait_for_selector("[data-stage=plan][data-state=missing]")
+        assert page.get_by_label("Start: Fly the plan").count() == 0
+        page.get_by_label("Start: Plan the survey").click()
+        page.wait_for_selector(".step progress", timeout=LONG_MS)
+        assert "running for" in page.locator(".job .what").first.inner_text()
+        page.wait_for_selector("[data-stage=plan][data-state=working]")
+        page.wait_for_selector("[data-stage=plan][data-state='up to date']", timeout=LONG_MS)
+        page.get_by_role("heading", name="Plan the survey: done").wait_for()
+        page.get_by_label("Start: Fly the plan").click()
+        page.wait_for_selector("[data-stage=fly][data-state='up to date']", timeout=LONG_MS)
+        page.get_by_text("Log", exact=True).click()
+        page.get_by_text("run finished: exit code 0").wait_for()
+        page.get_by_text("Earlier runs").click()
+        page.get_by_role("row").nth(2).wait_for()
+        assert "of disk" in page.locator("section[aria-label=Start]").inner_text()
+        is_accessible(page)
+        with page.expect_popup() as popup:
+            page.get_by_role("link", name="the plan as a page").click()
+        popup.value.wait_for_load_state()
+        assert popup.value.title().startswith("reef")
+        popup.value.close()
+    assert json.loads((reef / "plan" / "plan.json").read_text())["stations"] > 3
+
+
+def test_a_job_is_seen_again_and_stopped(page: Any, tmp_path: Path) -> None:
+    with serving(settings_in(tmp_path / "reef")) as server:
+        studio = server.studio
+        vars(studio)["jobs"] = Jobs(
+            studio.workspace.folder, studio.publish, [sys.executable, "-c", PROGRAM]
+        )
+        page.goto(server.address + "#run")
+        page.get_by_label("Start: Plan the survey").click()
+        page.get_by_text("of 600, about").wait_for()
+        bar = page.get_by_role("progressbar")
+        first = float(bar.get_attribute("value"))
+        page.wait_for_function(
+            "(first) => document.querySelector('.step progress').value > first", arg=first
+        )
+        assert page.get_by_role("button", name="Start: Plan the survey").is_disabled()
+        is_accessible(page)
+        page.reload()
+        page.get_by_text("of 600, about").wait_for()
+        named(page, "Stop").click()
+        page.get_by_role("heading", name="Plan the survey: stopped").wait_for()
+        named(page, "Go on").click()
+        page.get_by_text("of 600, about").wait_for()
+        named(page, "Stop").click()
+        page.get_by_role("heading", name="Plan the survey: stopped").wait_for()
+        is_accessible(page)
+
+
+def test_a_map_file_is_dropped(page: Any, tmp_path: Path) -> None:
+    with serving(tmp_path / "reef") as server:
+        page.goto(server.address)
+        named(page, "Plan a survey").click()
+        page.evaluate(
+            """(text) => {
+              const carried = new DataTransfer();
+              carried.items.add(new File([text], "bay.geojson"));
+              const place = document.querySelector("fieldset.drop");
+              const about = {dataTransfer: carried, bubbles: true, cancelable: true};
+              place.dispatchEvent(new DragEvent("drop", about));
+            }""",
+            json.dumps(AREA),
+        )
+        assert page.get_by_label("Latitude, degrees").is_disabled()
+        with page.expect_navigation():
+            named(page, "Make the survey").click()
+        page.wait_for_selector("[data-ready]")
+    assert json.loads((tmp_path / "reef" / "area.geojson").read_text()) == AREA
+
+
+def test_pictures_are_looked_at_and_imported(page: Any, tmp_path: Path) -> None:
+    for n in range(5):
+        take(tmp_path / "dive" / "left" / f"{n}.jpg", n, model="Manta")
+        take(tmp_path / "dive" / "right" / f"{n}.jpg", n, model="Manta", px=64)
+        take(tmp_path / "dive" / "right" / f"{n}.jpg", 40 + n, model="Manta")
+    log = navigation(tmp_path / "dive" / "left" / "nav.csv", 60)
+    with serving(tmp_path / "w") as server:
+        page.goto(server.address)
+        named(page, "I have pictures").click()
+        page.get_by_label("Folder of the pictures").fill(str(tmp_path / "dive"))
+        named(page, "Look into it").click()
+        page.get_by_text("Found: 10 pictures").wait_for()
+        page.get_by_label("one camera, or several").check()
+        page.get_by_text("camera 10 pictures of 64").wait_for()
+        is_accessible(page)
+        named(page, "left").click()
+        page.get_by_text("Found: 5 pictures").wait_for()
+        page.get_by_label("Navigation").fill(str(tmp_path / "none.csv"))
+        page.get_by_label("Navigation").blur()
+        page.locator(".found .error").wait_for()
+        assert named(page, "Import them").is_disabled()
+        page.get_by_label("Navigation").fill(str(log))
+        page.get_by_label("Navigation").blur()
+        page.get_by_text("5 of 5 picture times").wait_for()
+        named(page, "Import them").click()
+        page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
+        page.wait_for_selector("[data-stage=image][data-state='up to date']")
+        assert named(page, "Reconstruct the sea floor").is_enabled()
+        is_accessible(page)
+    assert len(list((tmp_path / "w" / "images" / "camera").iterdir())) == 5
+
+
+def test_a_fault_and_the_report_inside(page: Any, tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    (workspace / "survey.toml").write_text('name = "tiny"\n')
+    report = workspace / "report"
+    report.mkdir(exist_ok=True)
+    (report / "report.html").write_text("<title>T</title><h1>What was mapped</h1>")
+    (report / "stage.json").write_text(json.dumps({"stage": "report", "took_s": 1.0}))
+    with serving(workspace) as server:
+        page.goto(server.address + "#run")
+        named(page, "Open the report").click()
+        page.frame_locator("iframe").get_by_text("What was mapped").wait_for()
+        is_accessible(page)
+        page.keyboard.press("Escape")
+        page.wait_for_selector("dialog.report", state="detached")
+        page.get_by_text("Further commands").click()
+        page.get_by_label("Folder of an earlier survey").fill(str(workspace / "dense"))
+        named(page, "Find what has changed").click()
+        page.get_by_role("heading", name="Score the survey: failed").wait_for(timeout=LONG_MS)
+        line = page.locator("section[aria-label='Last run'] .error").inner_text()
+        assert line and "Traceback" not in line
+        assert named(page, "Try again").is_enabled()
+        is_accessible(page)
+        page.goto(server.url + "?#run")  # without the token nothing can be started
+        page.evaluate("sessionStorage.clear()")
+        page.reload()
+        named(page, "Try again").wait_for()
+        assert named(page, "Try again").is_disabled()
