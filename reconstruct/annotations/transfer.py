@@ -1,5 +1,6 @@
 """Annotations of other tools into a workspace, and out of it."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,14 @@ from alice_survey.base.errors import AliceError, WorkspaceError, why
 from reconstruct.annotations.formats.common import Files
 from reconstruct.annotations.formats.registry import format_named
 from reconstruct.annotations.sheets import Sheets, sheets_of
-from reconstruct.annotations.store import change_annotations, read_annotations
+from reconstruct.annotations.store import change_annotations, geojson, read_annotations
 from reconstruct.annotations.values import AnnotationSet
 from reconstruct.views.model import WorldFrame, read_frame
 
 MOST_BYTES = 500 << 20
 """Of a file that is read."""
+GEOJSON = "geojson"
+"""Written for a GIS, not read."""
 _NO_PIXEL = 1e-3
 
 
@@ -89,7 +92,14 @@ def import_data(
 
 def exported(workspace: Path, format_name: str, sheets: Sheets) -> Files:
     """The files of a tool with all annotations of a workspace."""
-    values = read_annotations(workspace, frame_of(workspace))
+    frame = frame_of(workspace)
+    values = read_annotations(workspace, frame)
+    if format_name == GEOJSON:
+        found = geojson(values, None if frame is None else frame.datum)
+        count = len(found["features"])
+        left = len(values.annotations) - count
+        lines = (f"{left} left out: they are in pictures, not on the mosaic",) if left else ()
+        return Files(texts={"": json.dumps(found) + "\n"}, written=count, left_out=lines)
     return format_named(format_name).write(values, sheets)
 
 
@@ -101,7 +111,7 @@ def export_file(
     Args:
         workspace: folder of the survey.
         path: of the file; others go next to it.
-        format_name: of `FORMATS`.
+        format_name: of `FORMATS`, or "geojson".
         tiles: folder of `mosaic-tiles` whose tiles the tool shows in place of the mosaic.
 
     Returns:

@@ -22,7 +22,8 @@ from shapely.geometry.base import BaseGeometry
 from alice_survey.base.frames import Array
 
 Kind = Literal["point", "polyline", "polygon", "rectangle", "circle"]
-Place = tuple[float, float]
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+Place = tuple[Coordinate, Coordinate]
 Value = str | float | int | bool | None
 Name = Annotated[str, Field(min_length=1, max_length=500)]
 Text = Annotated[str, Field(max_length=10_000)]
@@ -93,7 +94,7 @@ class Shape(_Value):
     repeated), the four corners in order, the middle of the circle."""
     holes: tuple[tuple[Place, ...], ...] = ()
     """Rings of a polygon within which it is not; they turn the other way round than the outer."""
-    radius: float | None = Field(None, gt=0)
+    radius: float | None = Field(None, gt=0, le=1e9)
     """Of a circle."""
 
     @field_validator("holes")

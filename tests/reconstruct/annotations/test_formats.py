@@ -16,6 +16,7 @@ from alice_survey.base.errors import AliceError
 from reconstruct.annotations.formats.registry import FORMATS
 from reconstruct.annotations.formats.rle import decoded, encoded, outlines, packed, unpacked
 from reconstruct.annotations.keyhole import joined, parted
+from reconstruct.annotations.sheets import Sheets
 from reconstruct.annotations.values import AnnotationSet, Shape, signed_area
 from tests.reconstruct.annotations.marks import (
     LABELS,
@@ -35,7 +36,7 @@ LACKS = {"taglab": {"polyline"}, "coco": {"polyline"}, "biigle": set()}
 @pytest.mark.parametrize("name", FORMATS)
 @given(some=sets)
 @settings(max_examples=15)
-def test_what_is_written_is_read_as_it_was(name: str, sheets: object, some: AnnotationSet) -> None:
+def test_what_is_written_is_read_as_it_was(name: str, sheets: Sheets, some: AnnotationSet) -> None:
     files = FORMATS[name].write(some, sheets)
     kept = [one for one in some.annotations if one.shape.kind not in LACKS[name]]
     assert files.written == len(kept)
