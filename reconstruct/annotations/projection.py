@@ -69,6 +69,17 @@ class OnPlane:
         found: Array = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2))
         return found
 
+    @classmethod
+    def drawn(cls, ring: Sequence[Place], sigma: float) -> "OnPlane":
+        """Vertices that were set on the mosaic, each with a sigma; their heights are unknown."""
+        count = len(ring)
+        east, north = np.array(ring, dtype=np.float64).T
+        return cls(
+            points=np.column_stack([north, east, np.full(count, np.nan)]),
+            own=np.broadcast_to(sigma**2 * np.eye(2), (count, 2, 2)),
+            shared=np.zeros((count, 2, 1)),
+        )
+
     def parts(self, lengths: Sequence[int]) -> list["OnPlane"]:
         """Rings of these lengths, one after the other."""
         ends = np.cumsum(lengths)[:-1]
@@ -87,6 +98,8 @@ class InPicture:
     """(N, 2, 2), px squared."""
     seen: NDArray[np.bool_]
     """(N,) within the frame, with nothing between."""
+    size_px: tuple[int, int]
+    """Width and height of the picture."""
 
     @property
     def sigma(self) -> Array:
@@ -237,8 +250,9 @@ class Projector:
             short = np.linalg.norm(spots.points[seen] - met, axis=1)
             seen[seen] = ~(short > clear[seen])
         return InPicture(
-            image=image, pixels=pixels, covariance=slopes @ total @ slopes.swapaxes(1, 2), seen=seen
-        )
+            image=image, pixels=pixels, covariance=slopes @ total @ slopes.swapaxes(1, 2),
+            seen=seen, size_px=posed.warp.size_px,
+        )  # fmt: skip
 
     def shown_in(self, spots: OnPlane, most: int = 12) -> list[InPicture]:
         """Pictures that show most of some places, the one that shows them nearest its middle first.
@@ -270,32 +284,29 @@ class Projector:
     def on_plane(
         self, annotation: Annotation, sigma_px: float = PIXEL_SIGMA_PX
     ) -> tuple[Shape, list[OnPlane]]:
-        """An annotation on the mosaic, whose vertices are projected where it is in a picture.
+        """An annotation in a picture on the mosaic.
 
         Args:
-            annotation: on the mosaic or in a picture.
-            sigma_px: with which its vertices were set, in pixels of either.
+            annotation: in a picture.
+            sigma_px: with which its vertices were set.
 
         Returns:
-            The shape, which of an area in a picture is a polygon, and its vertices ring by ring.
+            The shape, which of an area is a polygon, and its vertices ring by ring.
 
         Raises:
             ReconstructionError: a vertex meets no known surface, or the picture is not registered.
         """
-        shape = annotation.shape
+        shape, image = annotation.shape, annotation.image or ""
         rings = [np.array(ring, dtype=np.float64) for ring in shape.rings]
         lengths, whole = [len(ring) for ring in rings], np.concatenate(rings)
-        if annotation.image is None:
-            spots = self.on_surface(whole, sigma_px * self._mosaic_pixel)
-            return shape, spots.parts(lengths)
-        spots = self.to_plane(annotation.image, whole, sigma_px)
+        spots = self.to_plane(image, whole, sigma_px)
         lost = np.flatnonzero(~np.isfinite(spots.points).all(axis=1))
         if len(lost):
             x, y = whole[lost[0]]
             raise ReconstructionError(
                 f"annotation {annotation.id}: {len(lost)} of {len(whole)} vertices meet no known "
-                f"surface, the first at {annotation.image}:{x:.1f},{y:.1f}: draw it within what "
-                "the model knows, or on the mosaic"
+                f"surface, the first at {image}:{x:.1f},{y:.1f}: draw it within what the model "
+                "knows, or on the mosaic"
             )
         outer, *holes = (_places(part.places) for part in spots.parts(lengths))
         kind: Kind = "polygon" if shape.is_area else shape.kind

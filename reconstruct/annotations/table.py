@@ -6,9 +6,9 @@ Areas are those of the plan, as the mosaic shows them.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,8 @@ class Ground:
 
     known: NDArray[np.bool_]
     transform: Affine
+    pixel: float
+    """Side of a pixel of the mosaic itself."""
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -127,26 +129,37 @@ def ground_of(workspace: Path) -> Ground:
         shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
         mask = raster.dataset_mask(out_shape=shape, resampling=Resampling.average)
         scale = Affine.scale(raster.width / shape[1], raster.height / shape[0])
-        return Ground(known=mask >= _OPAQUE, transform=raster.transform * scale)
+        return Ground(
+            known=mask >= _OPAQUE, transform=raster.transform * scale,
+            pixel=float(raster.transform.a),
+        )  # fmt: skip
 
 
 def measured(
-    projector: Projector, annotations: Sequence[Annotation], sigma_px: float = PIXEL_SIGMA_PX
+    annotations: Sequence[Annotation],
+    pixel: float,
+    projector: Callable[[], Projector],
+    sigma_px: float = PIXEL_SIGMA_PX,
 ) -> tuple[list[Measured], list[str]]:
     """Annotations on the mosaic with their areas, and why others are not.
 
     Args:
-        projector: of the workspace.
         annotations: on the mosaic and in pictures.
-        sigma_px: with which vertices were set.
+        pixel: side of a pixel of the mosaic.
+        projector: of the workspace; used where annotations are in pictures.
+        sigma_px: with which vertices were set, in pixels of the mosaic or of the picture.
     """
     found, lost = [], []
     for one in annotations:
-        try:
-            shape, rings = projector.on_plane(one, sigma_px)
-        except ReconstructionError as error:
-            lost.append(str(error))
-            continue
+        shape, rings = one.shape, []
+        if one.image is None:
+            rings = [OnPlane.drawn(ring, sigma_px * pixel) for ring in shape.rings]
+        else:
+            try:
+                shape, rings = projector().on_plane(one, sigma_px)
+            except ReconstructionError as error:
+                lost.append(str(error))
+                continue
         area, sigma, length = math.nan, math.nan, math.nan
         if shape.is_area:
             area, sigma = shape.area, sigma_of_area(one.shape, rings)
@@ -286,15 +299,18 @@ def table(
     Raises:
         WorkspaceError: there are no annotations, or no mosaic.
     """
-    values = read_annotations(workspace, frame_of(workspace))
+    frame = frame_of(workspace)
+    values = read_annotations(workspace, frame)
     if not values.annotations:
         raise WorkspaceError(
             f"{workspace} has no annotations: draw some in the studio, or 'annotations import'"
         )
-    projector = Projector(workspace)
-    marks, lost = measured(projector, values.annotations, sigma_px)
-    found = quadrats(values, marks, ground_of(workspace), side)
-    rows = [cells(one, row, projector.unit) for one in found for row in one.rows]
+    ground = ground_of(workspace)
+    unit = "m" if frame is None else frame.unit
+    opened = cache(lambda: Projector(workspace))
+    marks, lost = measured(values.annotations, ground.pixel, opened, sigma_px)
+    found = quadrats(values, marks, ground, side)
+    rows = [cells(one, row, unit) for one in found for row in one.rows]
     if csv_file is not None:
         write_csv(csv_file, HEADER, rows)
     lines = [_line(row) for row in rows]

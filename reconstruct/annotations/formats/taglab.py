@@ -112,7 +112,8 @@ def _marks(image: Mapping[str, Any], n: int) -> tuple[list[Any], list[Any]]:
 
 def _sheet(image: Mapping[str, Any], n: int, sheets: Sheets) -> Sheet:
     channels = image.get("channels")
-    files = [one.get("filename") for one in channels or () if isinstance(one, dict)]
+    listed = channels if isinstance(channels, list) else []
+    files = [one.get("filename") for one in listed if isinstance(one, dict)]
     names = [one for one in (*files, image.get("name"), image.get("id")) if isinstance(one, str)]
     if not names:
         raise WorkspaceError(f"image {n}: neither a file of a channel, nor a name")

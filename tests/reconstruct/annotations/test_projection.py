@@ -87,7 +87,7 @@ def test_picked_vertices_lie_within_their_sigma_on_the_true_sea_floor(truth: Tru
         sigmas.append(noisy.sigma)
         sure = truth.projector.to_plane(image, pixels, 0.0)
         exact.append(np.linalg.norm((sure.points - true)[:, :2], axis=1))
-        assert np.nanmax(sure.sigma) < np.nanmax(noisy.sigma)
+        assert np.nanmedian(sure.sigma) < 0.5 * np.nanmedian(noisy.sigma)
     ratio = over_sigma(np.concatenate(misses), np.concatenate(sigmas))
     assert 0.7 < ratio < 1.4
     assert np.nanmedian(np.concatenate(exact)) < 3e-4  # without noise of picks: 0.3 mm of 2.7 a px
@@ -129,7 +129,8 @@ def test_the_sigma_of_a_pose_is_what_moved_poses_do(truth: Truth) -> None:
     by_pose = still.shared[:, :, :6]
     expected = np.sqrt(np.einsum("nik,nik->n", by_pose, by_pose))
     spread = np.sqrt((np.array(found) ** 2).sum(axis=2).mean(axis=0))
-    ratio = spread / expected
+    ratio = (spread / expected)[np.isfinite(spread / expected)]
+    assert len(ratio) > 10
     assert 0.8 < np.median(ratio) < 1.25
 
 
