@@ -54,6 +54,12 @@ def studio(
         Path | None,
         typer.Option(help="GeoTIFF, BAG or other raster, to lie under the survey."),
     ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="Tiles of a web map under it, with {z}, {x} and {y}: network."
+        ),
+    ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
@@ -66,4 +72,6 @@ def studio(
     """
     from alice_survey.studio.server import run_studio
 
-    run_studio(workspace, port, browser=browser, show=typer.echo, chart=chart)
+    run_studio(
+        workspace, port, browser=browser, show=typer.echo, chart=chart, background=background
+    )
