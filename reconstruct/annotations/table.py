@@ -128,9 +128,9 @@ def ground_of(workspace: Path) -> Ground:
         shrink = max(1.0, max(raster.width, raster.height) / _LONGEST_PX)
         shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
         mask = raster.dataset_mask(out_shape=shape, resampling=Resampling.average)
-        scale = Affine.scale(raster.width / shape[1], raster.height / shape[0])
+        t, wide, high = raster.transform, raster.width / shape[1], raster.height / shape[0]
         return Ground(
-            known=mask >= _OPAQUE, transform=raster.transform * scale,
+            known=mask >= _OPAQUE, transform=Affine(t.a * wide, 0.0, t.c, 0.0, t.e * high, t.f),
             pixel=float(raster.transform.a),
         )  # fmt: skip
 

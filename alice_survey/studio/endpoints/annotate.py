@@ -96,6 +96,8 @@ class _Annotate:
             kept = [one for one in values.annotations if one.id not in gone]
             new = sorted(wanted.put, key=lambda one: where.get(one.id, len(where)))
             labels = values.labels if wanted.labels is None else with_labels((), wanted.labels)
+            if wanted.labels is not None and len(labels) < len(wanted.labels):
+                raise AliceError("the change: a label stands twice in the list")
             try:
                 return AnnotationSet(labels=labels, annotations=(*kept, *new))
             except ValueError as error:
