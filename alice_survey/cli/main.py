@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from alice_survey.base.errors import known_fault
+from alice_survey.cli.annotations import app as annotations_app
 from alice_survey.cli.camera import app as camera_app
 from alice_survey.cli.intake import app as import_app
 from alice_survey.cli.live import app as live_app
@@ -49,6 +50,7 @@ app.add_typer(import_app)
 app.add_typer(live_app)
 app.add_typer(reconstruct_app, name="reconstruct")
 app.add_typer(model_app)
+app.add_typer(annotations_app, name="annotations")
 app.add_typer(report_app)
 app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")

@@ -188,14 +188,25 @@ class ChangedError(Exception):
 class Layers:
     """Layers of a map of a workspace; threads may share it."""
 
-    def __init__(self, workspace: Workspace, chart: Path | None = None) -> None:
+    def __init__(
+        self,
+        workspace: Workspace,
+        chart: Path | None = None,
+        *,
+        overlays: Sequence[Numbers] = (),
+        address: str = "/tiles",
+    ) -> None:
         """Take a workspace.
 
         Args:
             workspace: whose rasters are shown.
             chart: a raster of the user's own that lies under them.
+            overlays: rasters to show over a map, in place of those of the stages.
+            address: where their tiles are.
         """
-        self._workspace, self._chart = workspace, chart
+        self._workspace, self._chart, self._address = workspace, chart, address
+        self._overlays = {one.name: one for one in overlays}
+        self._files = {name: one.file for name, one in self._overlays.items()} or FILES
         self._most_renderers = min(_MOST_RENDERERS, os.cpu_count() or 1)
         self._renderers = threading.BoundedSemaphore(self._most_renderers)
         # By the token of the file, so that a changed raster is read again.
@@ -205,9 +216,9 @@ class Layers:
     def picture_layers(self) -> Sequence[PictureLayer]:
         """The layers that are there, for a page that requests their tiles."""
         found: list[PictureLayer] = []
-        for name in (*FILES, CHART):
+        for name in (*self._files, CHART):
             try:
-                shown = not found or name == CHART
+                shown = not self._overlays and (not found or name == CHART)
                 found.append(self._picture_layer(name, shown=shown))
             except FileNotFoundError:
                 continue
@@ -219,9 +230,13 @@ class Layers:
         Raises:
             FileNotFoundError: there is none.
         """
-        if name != CHART:
-            return self._workspace.file(FILES[name].split("/"))
-        if self._chart is None or Held.of(self._workspace.folder).frame.datum is None:
+        if name in self._files:
+            return self._workspace.file(self._files[name].split("/"))
+        if (
+            name != CHART
+            or self._chart is None
+            or Held.of(self._workspace.folder).frame.datum is None
+        ):
             raise FileNotFoundError(name)
         return self._chart
 
@@ -234,13 +249,13 @@ class Layers:
             name=name,
             title=title if numbers is None else numbers.title,
             about=about if numbers is None else numbers.about,
-            base=name != CHART,
+            base=name != CHART and not self._overlays,
             west_m=pyramid.west, north_m=pyramid.north, pixel_m=pyramid.pixel,
             width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
             levels=len(pyramid.levels), tiles={}, shown=shown,
             scale=None if numbers is None or limits is None else scale_of(numbers, limits),
             sizes=[(s.columns, s.rows, s.east, s.north) for s in pyramid.levels],
-            address=f"/tiles/{name}/{{}}.webp?v={token}",
+            address=f"{self._address}/{name}/{{}}.webp?v={token}",
         )  # fmt: skip
 
     def tile(self, name: str, level: int, x: int, y: int, token: str | None) -> tuple[bytes, str]:
@@ -290,6 +305,8 @@ class Layers:
             if place is None:
                 raise FileNotFoundError(name)
             return Pyramid(path, chart_numbers(path), chart_crs(place))
+        if name in self._overlays:
+            return Pyramid(self._path(name), self._overlays[name])
         unit = Held.of(self._workspace.folder).unit
         numbers = next((one for one in number_rasters(unit) if one.name == name), None)
         return Pyramid(self._path(name), numbers)

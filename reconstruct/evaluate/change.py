@@ -9,7 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from rasterio.features import shapes
+from rasterio.transform import Affine
 from scipy.ndimage import find_objects
 
 from alice_survey.base.frames import Array
@@ -45,6 +48,8 @@ class Region:
     sigma_m3: float
     most_m: float
     """Largest change of height (95 % of the cells are below)."""
+    outlines: tuple[tuple[tuple[float, float], ...], ...]
+    """Rings of east and north around its cells, the outer one of each part and its holes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -252,7 +257,25 @@ def _measure(
         volume_m3=float(values.sum()) * now.cell**2,
         sigma_m3=float(np.hypot(random, shared)),
         most_m=float(sign * np.percentile(sign * values, 95)),
+        outlines=_outlines(inside, window, now),
     )
+
+
+def _outlines(
+    inside: NDArray[np.bool_], window: tuple[slice, slice], now: Elevation
+) -> tuple[tuple[tuple[float, float], ...], ...]:
+    """Rings around cells, corners of single cells cut off."""
+    west = now.west + window[1].start * now.cell
+    north = now.north - window[0].start * now.cell
+    to_plane = Affine(now.cell, 0.0, west, 0.0, -now.cell, north)
+    found = []
+    for part, value in shapes(inside.astype(np.uint8), transform=to_plane):
+        if value == 1:
+            outer, *holes = part["coordinates"]
+            outline = shapely.simplify(shapely.Polygon(outer, holes), now.cell)
+            rings = (outline.exterior, *outline.interiors)
+            found += [tuple((x, y) for x, y in ring.coords[:-1]) for ring in rings]
+    return tuple(found)
 
 
 def _total(regions: list[Region]) -> dict[str, float]:
@@ -264,7 +287,7 @@ def _total(regions: list[Region]) -> dict[str, float]:
     }
 
 
-def _region(region: Region) -> dict[str, float]:
+def _region(region: Region) -> dict[str, Any]:
     return {
         "east_m": round(region.east_m, 3),
         "north_m": round(region.north_m, 3),
@@ -272,4 +295,5 @@ def _region(region: Region) -> dict[str, float]:
         "volume_l": round(1e3 * region.volume_m3, 4),
         "sigma_l": round(1e3 * region.sigma_m3, 4),
         "most_mm": round(1e3 * region.most_m, 2),
+        "outlines": [[[round(e, 4), round(n, 4)] for e, n in ring] for ring in region.outlines],
     }

@@ -10,6 +10,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
+from shapely import Point, Polygon
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, heard
@@ -60,6 +61,9 @@ def test_a_mound_is_measured_within_its_sigma_and_nothing_else_changes() -> None
         (region,) = change.regions
         assert (region.east_m, region.north_m) == pytest.approx(AT, abs=0.03)
         assert region.volume_m3 == pytest.approx(MOUND_M3, rel=0.05)
+        outer, *holes = (Polygon(ring) for ring in region.outlines)
+        assert outer.area - sum(one.area for one in holes) == pytest.approx(region.area_m2, rel=0.1)
+        assert outer.contains(Point(AT))
         ratios.append((region.volume_m3 - MOUND_M3) / region.sigma_m3)
         figures = change.to_json()
         # Heights between cells are means of noisy cells: fewer than 5 % exceed what cells would.

@@ -1,0 +1,263 @@
+"""The Annotate tab: labels and annotations, their areas, other tools' files, and pictures."""
+
+import io
+import threading
+import zipfile
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from alice_survey.base.errors import AliceError
+from alice_survey.base.frames import Array
+from alice_survey.report.colours import MOSAIC_FILE
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from reconstruct.annotations.formats.registry import FORMATS
+from reconstruct.annotations.projection import PIXEL_SIGMA_PX, InPicture, OnPlane, Projector
+from reconstruct.annotations.sheets import sheets_of
+from reconstruct.annotations.store import (
+    OtherVersionError,
+    change_annotations,
+    read_annotations,
+    token_of,
+)
+from reconstruct.annotations.table import HEADER as COLUMNS
+from reconstruct.annotations.table import Ground, Measured, cells, ground_of, measured, quadrats
+from reconstruct.annotations.transfer import GEOJSON, exported, frame_of, import_data
+from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, Label, with_labels
+from reconstruct.pictures.undistorted import Pictures
+
+_MOST_BYTES = 64 << 20
+_MOST_PICTURES = 8
+_CROP_PX = 420
+"""Longer side of a part of a picture that is sent."""
+_AROUND = 0.6
+"""Of an outline's extent that is shown around it."""
+_LEAST_AROUND_PX = 40
+_KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8",
+          ".zip": "application/zip"}  # fmt: skip
+
+
+class _Change(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    token: str
+    put: list[Annotation] = Field(default_factory=list)
+    """Annotations that are new, or take the place of others of their ids."""
+    delete: list[str] = Field(default_factory=list)
+    labels: list[Label] | None = None
+    """All labels; None where they stay."""
+
+
+class _Annotate:
+    def __init__(self, studio: Studio) -> None:
+        self._studio, self._folder = studio, studio.workspace.folder
+        self._lock = threading.Lock()
+        self._projector = lru_cache(1)(lambda tokens: Projector(self._folder))
+        self._ground = lru_cache(1)(lambda token: ground_of(self._folder))
+
+    def projector(self) -> Projector:
+        """The model as it is now."""
+        with self._lock:
+            return self._projector(self._studio.workspace.state(()))
+
+    def ground(self) -> Ground:
+        """The known ground of the mosaic as it is now."""
+        if not self._studio.workspace.has(MOSAIC_FILE):
+            raise AliceError("there is no mosaic yet: run 'alice-survey reconstruct' first")
+        with self._lock:
+            return self._ground(self._studio.workspace.token(MOSAIC_FILE))
+
+    def _values(self) -> AnnotationSet:
+        return read_annotations(self._folder, frame_of(self._folder))
+
+    def all(self, call: Call) -> dict[str, Any]:
+        """Labels and annotations, and the token of both."""
+        token = token_of(self._folder)
+        values = self._values()
+        return {
+            "token": token,
+            **values.model_dump(mode="json"),
+            "colours": COLOURS,
+            "formats": [{"name": f.name, "title": f.title} for f in FORMATS.values()],
+            "pixel": self.ground().pixel if self._studio.workspace.has(MOSAIC_FILE) else 0,
+        }
+
+    def change(self, call: Call) -> dict[str, Any]:
+        """Put and delete some, if nobody else did meanwhile."""
+        wanted = call.read(_Change)
+
+        def made(values: AnnotationSet) -> AnnotationSet:
+            gone = {*wanted.delete, *(one.id for one in wanted.put)}
+            where = {one.id: n for n, one in enumerate(values.annotations)}
+            kept = [one for one in values.annotations if one.id not in gone]
+            new = sorted(wanted.put, key=lambda one: where.get(one.id, len(where)))
+            labels = values.labels if wanted.labels is None else with_labels((), wanted.labels)
+            if wanted.labels is not None and len(labels) < len(wanted.labels):
+                raise AliceError("the change: a label stands twice in the list")
+            try:
+                return AnnotationSet(labels=labels, annotations=(*kept, *new))
+            except ValueError as error:
+                raise AliceError(f"the change: {_reason(error)}") from None
+
+        return self._changed(
+            lambda: (change_annotations(self._folder, frame_of(self._folder), made, wanted.token),)
+        )
+
+    def take(self, call: Call) -> dict[str, Any]:
+        """Add the annotations of a tool's file."""
+        format_name, token = call.query.get("format", ""), call.query.get("token", "")
+        sheets = sheets_of(self._folder)
+        return self._changed(
+            lambda: import_data(self._folder, call.body, format_name, sheets, token)
+        )
+
+    def _changed(self, work: Any) -> dict[str, Any]:
+        try:
+            token, *more = work()
+        except OtherVersionError as error:
+            raise StaleError(str(error)) from None
+        self._studio.publish("annotations", {"token": token})
+        return {"token": token, "text": more[0] if more else ""}
+
+    def give(self, call: Call) -> Content:
+        """The annotations as a file of a tool; several files as a ZIP."""
+        name = call.path["format"]
+        files = exported(self._folder, name, sheets_of(self._folder))
+        suffix = ".json" if name == GEOJSON else FORMATS[name].suffix
+        texts = {f"{name}{end}{suffix}": text.encode() for end, text in files.texts.items()}
+        if not files.written:
+            reasons = "".join(f"; {line}" for line in files.left_out)
+            raise AliceError(f"there are no annotations to write{reasons}")
+        if len(texts) > 1:
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+                for file, data in texts.items():
+                    archive.writestr(zipfile.ZipInfo(file), data)
+            texts, suffix = {f"{name}.zip": packed.getvalue()}, ".zip"
+        ((file, data),) = texts.items()
+        return Content(data=data, kind=_KINDS[suffix], name=file)
+
+    def table(self, call: Call) -> dict[str, Any]:
+        """Area of each annotation, and what labels cover."""
+        side = call.number("quadrat") if call.query.get("quadrat") else None
+        values, ground = self._values(), self.ground()
+        marks, lost = measured(values.annotations, ground.pixel, self.projector)
+        frame = frame_of(self._folder)
+        unit = "m" if frame is None else frame.unit
+        rows = [
+            cells(q, row, unit) for q in quadrats(values, marks, ground, side) for row in q.rows
+        ]
+        return {
+            "marks": [_mark(mark) for mark in marks],
+            "rows": [dict(zip(COLUMNS, row, strict=True)) for row in rows],
+            "known": ground.area,
+            "not_counted": lost,
+            "sigma_px": PIXEL_SIGMA_PX,
+        }
+
+    def pictures(self, call: Call) -> dict[str, Any]:
+        """The pictures that show an annotation, with its outline in a part of each."""
+        one = self._annotation(call.path["id"])
+        projector = self.projector()
+        rings = [np.array(ring, dtype=np.float64) for ring in one.shape.rings]
+        lengths = [len(ring) for ring in rings]
+        whole = np.concatenate(rings)
+        if one.image is None:
+            spots = projector.on_surface(whole)
+        else:
+            spots = projector.to_plane(one.image, whole)
+        _check(spots, one)
+        shown = projector.shown_in(spots, _MOST_PICTURES)
+        return {
+            "pictures": [_described(here, lengths) for here in shown],
+            "sigma": float(np.median(spots.sigma)),
+        }
+
+    def _annotation(self, name: str) -> Annotation:
+        found = next((one for one in self._values().annotations if one.id == name), None)
+        if found is None:
+            raise FileNotFoundError(name)
+        return found
+
+    def crop(self, call: Call) -> Content:
+        """A part of a picture as taken."""
+        image = call.query.get("image", "")
+        left, top, width, height = (int(call.number(n)) for n in ("x", "y", "width", "height"))
+        token = self._studio.workspace.token(f"images/{image}")
+        pictures = Pictures.open(self._folder)
+        wide, high = pictures.warp(image).size_px
+        if not (0 <= left < left + width <= wide and 0 <= top < top + height <= high):
+            raise AliceError(f"a part of {image} beyond its {wide} x {high} pixels")
+        part = pictures.taken(image)[top : top + height, left : left + width]
+        shrink = min(1.0, _CROP_PX / max(width, height))
+        if shrink < 1.0:
+            size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+            part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA))
+        data = cv2.imencode(".webp", part, [cv2.IMWRITE_WEBP_QUALITY, 90])[1].tobytes()
+        return Content(data=data, kind="image/webp", tag=f"{token}-{left}-{top}-{width}-{height}")
+
+
+def _mark(mark: Measured) -> dict[str, Any]:
+    middle = mark.geometry.centroid
+    shape = mark.shape.model_dump(mode="json") if mark.annotation.image is not None else None
+    return {
+        "id": mark.annotation.id, "east": middle.x, "north": middle.y, "area": mark.area,
+        "sigma": mark.sigma, "length": mark.length, "shape": shape,
+    }  # fmt: skip
+
+
+def _described(here: InPicture, lengths: Sequence[int]) -> dict[str, Any]:
+    """A picture, the part of it around the outline, and the outline in it."""
+    known: Array = here.pixels[np.isfinite(here.pixels).all(axis=1)]
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = max(_LEAST_AROUND_PX, _AROUND * float((high - low).max()))
+    size = np.array(here.size_px)
+    corner = np.clip(np.floor(low - margin), 0, size - 1).astype(int)
+    end = np.clip(np.ceil(high + margin), corner + 1, size).astype(int)
+    rings = np.split(here.pixels, np.cumsum(lengths)[:-1])
+    return {
+        "image": here.image,
+        "crop": [*corner.tolist(), *(end - corner).tolist()],
+        "rings": [ring.tolist() for ring in rings],
+        "sigma_px": float(np.nanmedian(here.sigma)),
+        "seen": float(here.seen.mean()),
+    }
+
+
+def _check(spots: OnPlane, one: Annotation) -> None:
+    lost = int((~np.isfinite(spots.points).all(axis=1)).sum())
+    if lost == len(spots.points):
+        raise AliceError(
+            f"none of the {lost} vertices of {one.label!r} meets a known surface: no picture can "
+            "be shown"
+        )
+
+
+def _reason(error: ValueError) -> str:
+    lines = str(error).splitlines()
+    text = next((line for line in lines if "Value error" in line), lines[0]).strip()
+    return text.removeprefix("Value error, ").partition(" [type")[0]
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """What the tab asks."""
+    tab = _Annotate(studio)
+    return (
+        Endpoint(path="/api/annotations", answer=tab.all),
+        Endpoint(path="/api/annotations/table", answer=tab.table),
+        Endpoint(path="/api/annotations/crop", answer=tab.crop),
+        Endpoint(path="/api/annotations/export/{format}", answer=tab.give),
+        Endpoint(path="/api/annotations/{id}/pictures", answer=tab.pictures),
+        Endpoint(
+            path="/api/annotations/change", answer=tab.change, method="POST", writes=True,
+            most_bytes=_MOST_BYTES,
+        ),
+        Endpoint(
+            path="/api/annotations/import", answer=tab.take, method="POST", writes=True,
+            most_bytes=_MOST_BYTES,
+        ),
+    )  # fmt: skip

@@ -1,0 +1,278 @@
+"""The Compare tab: another survey over this one, and what has changed between them.
+
+The other workspace is opened read-only and by the same rules as the studio's own: files of its
+products alone, no links. It is named by a page that has the token, and reached by a name that
+nobody can guess.
+"""
+
+import os
+import secrets
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+import alice_survey
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import AliceError
+from alice_survey.base.frames import Datum
+from alice_survey.base.run.interrupts import for_other_programs
+from alice_survey.kit.document import PictureLayer
+from alice_survey.report.colours import change_rasters
+from alice_survey.report.held import Held
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.layers import ChangedError, Layers
+from alice_survey.studio.paths import Workspace
+from reconstruct.evaluate.elevation import enu_from_enu
+from reconstruct.views.model import datum_of
+
+_MOST_OPEN = 4
+_MOST_SIBLINGS = 200
+_MOST_SHOWN = 100
+_ROOT = Path(alice_survey.__file__).parents[1]
+"""Where a program that is started finds the package."""
+_CHANGED = "the survey was worked on meanwhile: choose it again"
+
+
+class _Named(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    path: str = Field(min_length=1, max_length=4000)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Other:
+    """Another survey that a page named."""
+
+    workspace: Workspace
+    layers: Layers
+    name: str
+
+
+class _Compare:
+    def __init__(self, studio: Studio) -> None:
+        self._studio, self._folder = studio, studio.workspace.folder
+        self._lock = threading.Lock()
+        self._others: dict[str, _Other] = {}
+        self._process: subprocess.Popen[bytes] | None = None
+        self._results = lru_cache(_MOST_OPEN)(self._layers_of)
+
+    def near(self, call: Call) -> dict[str, Any]:
+        """Workspaces next to this one."""
+        try:
+            with os.scandir(self._folder.parent) as entries:
+                folders = sorted(e.path for e in entries if e.is_dir(follow_symlinks=False))
+        except OSError:
+            folders = []
+        surveys = [
+            {"name": path.name, "path": str(path)}
+            for path in map(Path, folders[:_MOST_SIBLINGS])
+            if path != self._folder and _is_survey(path)
+        ]
+        return {"folder": str(self._folder.parent), "surveys": surveys}
+
+    def open(self, call: Call) -> dict[str, Any]:
+        """Open another survey, and describe its rasters in this one's coordinates."""
+        path = Path(call.read(_Named).path).expanduser()
+        path = path if path.is_absolute() else self._folder.parent / path
+        try:
+            is_there = path.is_dir() and _is_survey(path)
+        except (OSError, ValueError):  # too long a name, a NUL, no permission
+            is_there = False
+        if not is_there:
+            raise AliceError(
+                f"{shown(str(path))} holds no surface and no mosaic of a survey: name the folder "
+                "of a reconstructed workspace"
+            )
+        name = secrets.token_hex(12)
+        workspace = Workspace(path)
+        layers = Layers(workspace, address=f"/api/compare/{name}/tiles")
+        other = _Other(workspace=workspace, layers=layers, name=Held.of(path).name)
+        with self._lock:
+            self._others[name] = other
+            for old in list(self._others)[:-_MOST_OPEN]:
+                del self._others[old]
+        return {"id": name, **self._described(other)}
+
+    def _described(self, other: _Other) -> dict[str, Any]:
+        here, there = Held.of(self._folder), Held.of(other.workspace.folder)
+        shift, note = _shift(here, there)
+        pictures = [_picture(layer, shift) for layer in other.layers.picture_layers()]
+        return {
+            "name": other.name, "path": str(other.workspace.folder), "layers": pictures,
+            "note": note, "comparable": not note,
+        }  # fmt: skip
+
+    def tile(self, call: Call) -> Content:
+        """A tile of another survey."""
+        return _tile(self._other(call).layers, call)
+
+    def _other(self, call: Call) -> _Other:
+        with self._lock:
+            found = self._others.get(call.path["id"])
+        if found is None:
+            raise StaleError("the other survey is no longer open: choose it again")
+        return found
+
+    def results(self, call: Call) -> dict[str, Any]:
+        """Comparisons that were made, the changed places of each, and its maps."""
+        found = []
+        for name, record in Held.of(self._folder).earlier:
+            change = record.to_json()
+            with self._lock:
+                layers = self._results(name)
+            found.append({
+                "name": name,
+                "earlier": change.get("earlier"),
+                **{key: change.get(key) for key in ("gained", "lost", "area_m2", "changed_m2",
+                                                    "unchanged", "registration")},
+                "regions": _regions(change),
+                "layers": [_picture(layer, (0.0, 0.0)) for layer in layers.picture_layers()],
+            })  # fmt: skip
+        with self._lock:
+            running = self._process is not None
+        return {"results": found, "running": running}
+
+    def _layers_of(self, name: str) -> Layers:
+        return Layers(
+            self._studio.workspace, overlays=change_rasters(name),
+            address=f"/api/compare/results/{name}/tiles",
+        )  # fmt: skip
+
+    def change_tile(self, call: Call) -> Content:
+        """A tile of a map of changes."""
+        name = call.path["name"]
+        self._studio.workspace.file(("against", name, "change.json"))
+        with self._lock:
+            layers = self._results(name)
+        return _tile(layers, call)
+
+    def evaluate(self, call: Call) -> dict[str, Any]:
+        """Begin to find what has changed since another survey."""
+        other = self._other(call)
+        command = [
+            sys.executable, "-m", "alice_survey", "evaluate", "-w", str(self._folder), "--against",
+            str(other.workspace.folder), "--quiet",
+        ]  # fmt: skip
+        with self._lock:
+            if self._process is not None:
+                raise StaleError("a comparison is being made already: wait for it")
+            with for_other_programs():
+                self._process = subprocess.Popen(  # noqa: S603 (of a fixed list)
+                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE, start_new_session=True, cwd=_ROOT,
+                )  # fmt: skip
+        threading.Thread(target=self._wait, args=(other.name,), daemon=True).start()
+        return {"running": True}
+
+    def _wait(self, name: str) -> None:
+        """Wait for the comparison, or for the studio's end; publish how it went."""
+        process = self._process
+        assert process is not None  # noqa: S101 - set before this thread starts
+        while True:
+            try:
+                output, errors = process.communicate(timeout=0.5)
+                break
+            except subprocess.TimeoutExpired:
+                if self._studio.ending.is_set():
+                    process.terminate()
+        with self._lock:
+            self._process = None
+        lines = errors.decode("utf-8", "replace").splitlines()
+        fault = next((one for one in reversed(lines) if one.startswith("error: ")), "")
+        ok = process.returncode == 0
+        text = output.decode("utf-8", "replace").splitlines()[:1] if ok else [fault or "it ended"]
+        line = " ".join(text).removeprefix("error: ")
+        self._studio.publish("compare", {"ok": ok, "name": name, "text": shown(line)})
+
+
+def _is_survey(folder: Path) -> bool:
+    """Whether a folder holds a finished surface or mosaic."""
+    workspace = Workspace(folder)
+    return any(
+        workspace.has(f"{stage}/stage.json") and workspace.has(f"{stage}/{file}")
+        for stage, file in (("dense", "dem.tif"), ("mosaic", "mosaic.tif"))
+    )
+
+
+def _shift(here: Held, there: Held) -> tuple[tuple[float, float], str]:
+    """East and north from another survey's coordinates to this one's, and why that is not known."""
+    if here.plane is not None or there.plane is not None:
+        return (0.0, 0.0), "a survey is on a plane that is not level: they may not lie as shown"
+    mine, other = here.frame, there.frame
+    if mine.datum is None or other.datum is None:
+        return (0.0, 0.0), "a survey has no datum: each lies in its own model's coordinates"
+    first: Datum = datum_of(mine.datum)
+    if first == datum_of(other.datum):
+        return (0.0, 0.0), ""
+    moved = enu_from_enu(first, datum_of(other.datum)).apply(np.zeros((1, 3)))[0]
+    return (float(moved[0]), float(moved[1])), ""
+
+
+def _picture(layer: PictureLayer, shift: tuple[float, float]) -> dict[str, Any]:
+    """A raster as the map's script takes it."""
+    scale = layer.scale
+    return {
+        "kind": "picture", "name": layer.name, "title": layer.title, "about": layer.about,
+        "west": layer.west_m + shift[0], "north": layer.north_m + shift[1],
+        "pixel": layer.pixel_m, "width": layer.width_px, "height": layer.height_px,
+        "tile": layer.tile_px, "levels": layer.levels, "sizes": layer.sizes,
+        "address": layer.address, "base": layer.base,
+        "scale": None if scale is None else {
+            "label": scale.label, "low": scale.low, "high": scale.high,
+            "colours": list(scale.colours),
+        },
+    }  # fmt: skip
+
+
+def _tile(layers: Layers, call: Call) -> Content:
+    level, x, y = (_whole(call.path[part]) for part in ("level", "x", "y"))
+    try:
+        data, token = layers.tile(call.path["layer"], level, x, y, call.query.get("v"))
+    except ChangedError:
+        raise StaleError(_CHANGED) from None
+    return Content(data=data, kind="image/webp", tag=f"{token}-{level}-{x}-{y}")
+
+
+def _whole(text: str) -> int:
+    digits = text.removesuffix(".webp")
+    if not (digits.isascii() and digits.isdigit() and len(digits) < 7):
+        raise FileNotFoundError(text)
+    return int(digits)
+
+
+def _regions(change: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Places that changed, the largest first; those of older files have no outlines."""
+    regions = change.get("regions")
+    if not isinstance(regions, list):
+        return []
+    keys = ("east_m", "north_m", "area_m2", "volume_l", "sigma_l", "most_mm")
+    return [
+        {**{key: one.get(key) for key in keys}, "outlines": one.get("outlines") or []}
+        for one in regions[:_MOST_SHOWN]
+        if isinstance(one, dict)
+    ]
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """What the tab asks."""
+    tab = _Compare(studio)
+    post: dict[str, Any] = {"method": "POST", "writes": True}
+    return (
+        Endpoint(path="/api/compare/near", answer=tab.near, **post),
+        Endpoint(path="/api/compare/open", answer=tab.open, **post),
+        Endpoint(path="/api/compare/results", answer=tab.results),
+        Endpoint(
+            path="/api/compare/results/{name}/tiles/{layer}/{level}/{x}/{y}",
+            answer=tab.change_tile,
+        ),
+        Endpoint(path="/api/compare/{id}/tiles/{layer}/{level}/{x}/{y}", answer=tab.tile),
+        Endpoint(path="/api/compare/{id}/evaluate", answer=tab.evaluate, **post),
+    )

@@ -1,0 +1,1 @@
+"""What people mark on a mosaic or in pictures: colonies, animals, damages, by label."""

@@ -1,0 +1,1 @@
+"""Files of annotation tools: one module each, read and written."""

@@ -1,0 +1,196 @@
+"""`annotations.json` of a workspace: read, changed by one writer at a time, seen by a GIS."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from filelock import FileLock, Timeout
+from pydantic import Field
+
+from alice_survey.base.artefacts import JsonRecord, json_values
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array, Datum
+from alice_survey.base.records import PlaceRecord
+from reconstruct.annotations.values import Annotation, AnnotationSet, Label
+from reconstruct.views.model import WorldFrame, datum_of
+
+FILE = "annotations.json"
+_WAIT_S = 10.0
+_SAME_DEG = 1e-9
+
+
+class OtherVersionError(WorkspaceError):
+    """The file was changed by another writer since it was read."""
+
+
+class AnnotationsRecord(JsonRecord):
+    """`annotations.json`: labels, and what carries them."""
+
+    path: ClassVar = FILE
+    format: Literal["alice-survey annotations"] = "alice-survey annotations"
+    version: Literal[1] = 1
+    frame: str = "ned"
+    """That the plane of the mosaic is in: `ned` (east and north of the datum) or `model`."""
+    datum: PlaceRecord | None = None
+    labels: tuple[Label, ...] = ()
+    annotations: tuple[Annotation, ...] = Field(default=())
+
+    @property
+    def values(self) -> AnnotationSet:
+        """Its labels and annotations."""
+        return AnnotationSet(labels=self.labels, annotations=self.annotations)
+
+
+def token_of(workspace: Path) -> str:
+    """A token of what the file holds; empty where there is none."""
+    try:
+        content = (workspace / FILE).read_bytes()
+    except FileNotFoundError:
+        return ""
+    return hashlib.blake2b(content, digest_size=12).hexdigest()
+
+
+def read_annotations(workspace: Path, frame: WorldFrame | None = None) -> AnnotationSet:
+    """The annotations of a workspace; none where there is no file.
+
+    Args:
+        workspace: folder of the survey.
+        frame: of its model; those on the mosaic must be in it.
+
+    Raises:
+        WorkspaceError: the file is damaged, or its places are of another frame.
+    """
+    record = AnnotationsRecord.made(workspace / FILE)
+    if record is None:
+        return AnnotationSet()
+    if frame is not None and any(one.image is None for one in record.annotations):
+        _check_frame(workspace / FILE, record, frame)
+    try:
+        return record.values
+    except ValueError as error:
+        raise WorkspaceError(f"{workspace / FILE}: {_first_line(error)}") from None
+
+
+def change_annotations(
+    workspace: Path,
+    frame: WorldFrame | None,
+    change: Callable[[AnnotationSet], AnnotationSet],
+    token: str | None = None,
+) -> str:
+    """Replace the annotations of a workspace, whole or not at all.
+
+    Args:
+        workspace: folder of the survey.
+        frame: of its model; None while there is none.
+        change: from what is there to what shall be.
+        token: of what the writer has read; None for whatever is there.
+
+    Returns:
+        The token of what was written.
+
+    Raises:
+        OtherVersionError: another writer came first.
+        WorkspaceError: the file is damaged, cannot be written, or is being written too long.
+    """
+    try:
+        with FileLock(workspace / f".{FILE}.lock", timeout=_WAIT_S):
+            if token is not None and token != token_of(workspace):
+                raise OtherVersionError(
+                    f"{FILE} was changed by another writer meanwhile: load the page again"
+                )
+            values = change(read_annotations(workspace, frame))
+            AnnotationsRecord(
+                frame="ned" if frame is None else frame.name,
+                datum=_place(frame),
+                labels=values.labels,
+                annotations=values.annotations,
+            ).write(workspace / FILE)
+            return token_of(workspace)
+    except Timeout:
+        raise WorkspaceError(f"{workspace / FILE} is being written; try again") from None
+    except OSError as error:
+        raise WorkspaceError(f"{workspace / FILE}: cannot be written: {error.strerror}") from None
+
+
+def geojson(values: AnnotationSet, datum: Datum | None) -> dict[str, Any]:
+    """The annotations on the mosaic for a GIS (RFC 7946).
+
+    Args:
+        values: annotations; those in pictures are left out.
+        datum: of the frame; without one coordinates stay east and north of the model, which no
+            GIS can place, and the file says so.
+    """
+    features = []
+    for one in values.annotations:
+        if one.image is not None:
+            continue
+        label, shape = values.by_label[one.label], one.shape
+        rings = [_lon_lat(np.array(ring), datum) for ring in shape.rings]
+        closed = [[*ring, ring[0]] for ring in rings]
+        kinds: dict[str, tuple[str, Any]] = {
+            "point": ("Point", rings[0][0]),
+            "polyline": ("LineString", rings[0]),
+        }
+        kind, coordinates = kinds.get(shape.kind, ("Polygon", closed))
+        features.append({
+            "type": "Feature",
+            "id": one.id,
+            "geometry": {"type": kind, "coordinates": coordinates},
+            "properties": {
+                "label": label.id, "aphia_id": label.aphia_id, "colour": label.colour,
+                "kind": shape.kind, "radius": shape.radius, "author": one.author,
+                "time_utc": one.time_utc, "note": one.note, **one.attributes,
+            },
+        })  # fmt: skip
+    about = {} if datum is not None else {"about": "coordinates are those of the model: no datum"}
+    found: dict[str, Any] = json_values(
+        {"type": "FeatureCollection", **about, "features": features}
+    )
+    return found
+
+
+def _lon_lat(places: Array, datum: Datum | None) -> list[list[float]]:
+    if datum is None:
+        return [[float(east), float(north)] for east, north in places]
+    ned = np.column_stack([places[:, 1], places[:, 0], np.zeros(len(places))])
+    return [[round(float(lon), 10), round(float(lat), 10)]
+            for lat, lon, _ in datum.geodetic_from_ned(ned)]  # fmt: skip
+
+
+def _place(frame: WorldFrame | None) -> PlaceRecord | None:
+    if frame is None or frame.datum is None:
+        return None
+    datum = frame.datum
+    return PlaceRecord(
+        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
+    )
+
+
+def _check_frame(path: Path, record: AnnotationsRecord, frame: WorldFrame) -> None:
+    was = None if record.datum is None else datum_of(record.datum)
+    now = frame.datum
+    same = record.frame == frame.name and (was is None) == (now is None)
+    if same and was is not None and now is not None:
+        same = (
+            abs(was.latitude_deg - now.latitude_deg) < _SAME_DEG
+            and abs(was.longitude_deg - now.longitude_deg) < _SAME_DEG
+        )
+    if not same:
+        raise WorkspaceError(
+            f"{path}: its places are of the frame {record.frame!r} with another datum than the "
+            f"model now has ({frame.name!r}): move the file away, or give the survey the datum back"
+        )
+
+
+def _first_line(error: ValueError) -> str:
+    lines = [line.strip() for line in str(error).splitlines()]
+    line = next((line for line in lines if line.startswith("Value error")), lines[0])
+    return line.removeprefix("Value error, ").partition(" [type")[0]
+
+
+def dumped(values: AnnotationSet) -> str:
+    """As JSON text, for a page."""
+    return json.dumps(values.model_dump(mode="json"), allow_nan=False)

@@ -1,0 +1,177 @@
+"""The Annotate and Compare tabs in Chromium, by pointer and by keyboard."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.report.tiny import tiny_workspace
+from tests.alice_survey.studio.client import serving
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+MAP = "#map-canvas"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tiny_workspace(tmp_path / "reef")
+
+
+def opened(browser: Any, server: Any, tab: str, width: int = 1280) -> tuple[Any, Heard]:
+    page = browser.new_page(
+        viewport={"width": width, "height": 900}, reduced_motion="reduce", accept_downloads=True
+    )
+    heard = Heard()
+    heard.listen(page)
+    page.goto(server.address)
+    page.wait_for_selector("body[data-ready]", timeout=20_000)
+    page.get_by_role("tab", name=tab, exact=True).click()
+    return page, heard
+
+
+def add_label(page: Any, name: str) -> None:
+    if not page.get_by_label("Name", exact=True).is_visible():
+        page.get_by_text("Add a label", exact=True).click()
+    page.get_by_label("Name", exact=True).fill(name)
+    page.get_by_role("button", name="Add the label").click()
+    page.get_by_role("radio", name=name).wait_for()
+
+
+def click(page: Any, x: float, y: float) -> None:
+    box = page.locator(MAP).bounding_box()
+    page.mouse.click(box["x"] + box["width"] * x, box["y"] + box["height"] * y)
+
+
+def stored(folder: Path) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads((folder / "annotations.json").read_text())[
+        "annotations"
+    ]
+    return found
+
+
+def accessible(page: Any) -> None:
+    found = Axe().run(page)
+    assert found.violations_count == 0, found.generate_report()
+
+
+def test_a_polygon_is_drawn_edited_taken_back_and_exported(folder: Path) -> None:
+    with serving(folder) as server, chromium() as browser:
+        page, heard = opened(browser, server, "Annotate")
+        add_label(page, "Porifera > Axinella")
+        page.get_by_role("button", name="Polygon").click()
+        for x, y in ((0.4, 0.4), (0.6, 0.4), (0.6, 0.6), (0.4, 0.6)):
+            click(page, x, y)
+        page.get_by_role("button", name="Finish").click()
+        page.get_by_text("1 annotations").wait_for()
+        page.get_by_role("button", name="Polygon").click()  # puts the tool down
+        (one,) = stored(folder)
+        assert one["label"] == "Porifera > Axinella" and len(one["shape"]["points"]) == 4
+
+        vertex = page.get_by_role("button", name="Vertex 1 of 4")
+        vertex.focus()
+        page.keyboard.press("Shift+ArrowLeft")
+        page.wait_for_function("() => !document.querySelector('button:disabled[data-x]')")
+        page.get_by_role("button", name="Vertex 1 of 4").wait_for()
+        page.wait_for_timeout(500)
+        (moved,) = stored(folder)
+        assert moved["shape"]["points"][0][0] == pytest.approx(
+            one["shape"]["points"][0][0] - 10 * 0.002, abs=1e-9
+        )
+        page.get_by_role("button", name="Undo").click()
+        page.wait_for_timeout(500)
+        assert stored(folder)[0]["shape"] == one["shape"]
+
+        page.get_by_text("Files of other tools").click()
+        with page.expect_download() as downloading:
+            page.get_by_role("button", name="COCO").click()
+        coco = json.loads(Path(downloading.value.path()).read_text())
+        assert coco["categories"][0]["name"] == "Axinella"
+        assert coco["annotations"][0]["area"] == pytest.approx(
+            shoelace(one["shape"]["points"]) / 0.002**2, rel=1e-6
+        )
+        page.get_by_role("button", name="Delete", exact=True).click()
+        page.get_by_text("Nothing is annotated yet.").wait_for()
+        page.get_by_label("Tool").select_option("coco")
+        page.get_by_label("File", exact=True).set_input_files(downloading.value.path())
+        page.get_by_role("button", name="Import").click()
+        page.get_by_text("1 annotations and 0 labels added").wait_for()
+        assert stored(folder)[0]["shape"]["points"] == pytest.approx(one["shape"]["points"])
+        accessible(page)
+        assert heard.complaints == []
+        page.close()
+
+
+def shoelace(points: list[list[float]]) -> float:
+    pairs = zip(points, points[1:] + points[:1], strict=True)
+    return 0.5 * abs(sum(a[0] * b[1] - b[0] * a[1] for a, b in pairs))
+
+
+def test_points_are_set_by_the_keyboard_alone_at_400_px(folder: Path) -> None:
+    with serving(folder) as server, chromium() as browser:
+        page, heard = opened(browser, server, "Annotate", 400)
+        add_label(page, "Sepia")
+        page.get_by_role("button", name="Point").focus()
+        page.keyboard.press("Enter")
+        page.locator(MAP).focus()
+        page.keyboard.press("Enter")
+        page.get_by_text("1 annotations").wait_for()
+        for _ in range(3):
+            page.keyboard.press("ArrowRight")
+        page.wait_for_timeout(400)
+        page.keyboard.press("Enter")
+        page.get_by_text("2 annotations").wait_for()
+        page.keyboard.press("Escape")
+        first, second = (one["shape"]["points"][0] for one in stored(folder))
+        assert second[0] > first[0] and second[1] == pytest.approx(first[1], abs=1e-3)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        accessible(page)
+        assert heard.complaints == []
+        page.close()
+
+
+def test_a_second_page_follows_the_first(folder: Path) -> None:
+    with serving(folder) as server, chromium() as browser:
+        first, _ = opened(browser, server, "Annotate")
+        second, heard = opened(browser, server, "Annotate")
+        add_label(first, "Sepia")
+        second.get_by_role("radio", name="Sepia").wait_for()
+        assert heard.complaints == []
+        first.close()
+        second.close()
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_a_survey_is_compared_with_a_copy_of_itself(folder: Path, width: int) -> None:
+    shutil.copytree(folder, folder.parent / "copy")
+    with serving(folder) as server, chromium() as browser:
+        page, heard = opened(browser, server, "Compare", width)
+        page.get_by_label("Next to this one").select_option(label="copy")
+        page.get_by_role("button", name="Open", exact=True).click()
+        pane = page.locator(".leaflet-compare-pane")
+        pane.locator("img").first.wait_for(state="attached", timeout=20_000)
+        swipe = page.get_by_label("Where the two meet, %")
+        swipe.focus()
+        clips = [pane.evaluate("e => e.style.clip")]
+        for _ in range(5):
+            page.keyboard.press("ArrowLeft")
+        clips.append(pane.evaluate("e => e.style.clip"))
+        assert swipe.input_value() == "45" and clips[0] != clips[1]
+        left = [float(clip.split(",")[3].removesuffix("px)")) for clip in clips]
+        wide = page.locator(MAP).bounding_box()["width"]
+        assert left[0] - left[1] == pytest.approx(0.05 * wide, abs=1.5)
+
+        page.get_by_role("radio", name="Side by side").check()
+        other = page.get_by_role("application", name="moves with the other")
+        other.locator("img").first.wait_for(state="attached", timeout=20_000)
+        assert page.locator(MAP).bounding_box()["width"] == pytest.approx(wide / 2, abs=3)
+        accessible(page)
+        page.get_by_role("radio", name="This survey alone").check()
+        assert page.locator(MAP).bounding_box()["width"] == pytest.approx(wide, abs=1)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        accessible(page)
+        assert heard.complaints == []
+        page.close()
