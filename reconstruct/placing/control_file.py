@@ -13,8 +13,10 @@
 - a marker's `length_m` (side of the black square) and `sigma_m`.
 
 Points are picked in `picks.csv`: `image, point, x, y` in pixels of the picture as taken, counted
-from 0 at the middle of the first pixel as viewers show them, and `sigma_px` (0.5 if empty). A coded
-marker `7` has the corners `7.0` to `7.3`, clockwise from its own upper left, and `7` is its middle.
+from 0 at the middle of the first pixel as viewers show them, and `sigma_px` (0.5 if empty). Where
+`matched_to` names a picture, the pick was not made by eye: the neighbourhood of the pick in that
+picture was found again, and `sigma_px` says how well, relative to it. A coded marker `7` has the
+corners `7.0` to `7.3`, clockwise from its own upper left, and `7` is its middle.
 """
 
 import math
@@ -110,6 +112,9 @@ class Pick:
     x_px: float
     y_px: float
     sigma_px: float
+    """Of one coordinate; of a matched pick, relative to the pick that it was matched to."""
+    matched_to: str = ""
+    """Picture whose pick of the point was found again in this one; empty of a pick by itself."""
 
 
 def read_control(path: Path) -> Control:
@@ -167,6 +172,7 @@ def read_picks(path: Path) -> list[Pick]:
                 x_px=x + 0.5,
                 y_px=y + 0.5,
                 sigma_px=PICK_SIGMA_PX if math.isnan(sigma) else sigma,
+                matched_to=row.get("matched_to", ""),
             )
         )
     return picks
