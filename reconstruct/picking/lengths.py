@@ -181,7 +181,7 @@ class Block:
             by_rig: (K, G) by the rig, the stations held.
         """
         shape = np.stack([self.gauge.shape_weights(one) for one in by_poses], axis=-1)
-        poses = np.einsum("fik,fil->kl", shape, self.equations.covariance_times(shape))
+        poses = np.einsum("fik,fil->kl", shape, self.equations.undamped.solve(shape))
         along = np.einsum("fik,fig->kg", shape, self._response) + by_rig
         return poses, along @ self.covariance @ along.T
 

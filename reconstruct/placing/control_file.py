@@ -1,6 +1,7 @@
 """What a person knows of a site: `control.csv`, and where pictures show it: `picks.csv`.
 
-`control.csv`, one row each, columns in any order, those not needed left out or empty:
+`control.csv`, one row each, columns in any order, those not needed left out or empty; a row whose
+first cell starts with `#` and a space is a comment, in both files:
 
 - `kind`: `point` (known coordinates), `bar` (known distance of two points) or `marker` (known side
   of a coded marker).
@@ -125,6 +126,8 @@ def read_control(path: Path) -> Control:
     """
     points, lengths = [], []
     for line, row in read_csv(path, ("kind", "name", "use"), fault=WorkspaceError)[1]:
+        if _is_comment(row):
+            continue
         kind, name, use = row["kind"], row["name"], row["use"]
         if use not in ("control", "check"):
             raise WorkspaceError(f"{path} line {line}: use is {use!r}, not control or check")
@@ -159,7 +162,7 @@ def read_picks(path: Path) -> list[Pick]:
     """
     picks = []
     for line, row in read_csv(path, ("image", "point", "x", "y"), fault=WorkspaceError)[1]:
-        if not row["x"] and not row["y"]:
+        if _is_comment(row) or (not row["x"] and not row["y"]):
             continue
         x, y = _number(path, line, row, "x"), _number(path, line, row, "y")
         sigma = _number(path, line, row, "sigma_px")
@@ -176,6 +179,10 @@ def read_picks(path: Path) -> list[Pick]:
             )
         )
     return picks
+
+
+def _is_comment(row: dict[str, str]) -> bool:
+    return next(iter(row.values()), "").startswith("# ")
 
 
 def _point(
