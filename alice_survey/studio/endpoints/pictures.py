@@ -11,7 +11,7 @@ from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import AliceError, ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import ControlRecord
+from alice_survey.base.records import ControlRecord, MappingRecord
 from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
 from alice_survey.studio.taken_pictures import TILE_PX, TakenPictures, levels_of
 from reconstruct.picking.lengths import Lengths, spot_residuals
@@ -84,6 +84,10 @@ class _SaveControl(_Asked):
     token: str
     rows: Annotated[list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)]
     names: Annotated[list[tuple[Name, Name]], Field(max_length=5000)] = []
+
+
+class _Spot(_Asked):
+    picks: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
 
 
 class _Ends(_Asked):
@@ -269,6 +273,7 @@ class _Tab:
                 }
             )
         record = ControlRecord.made(folder / ControlRecord.path)
+        mapped = MappingRecord.made(folder / MappingRecord.path)
         return {
             "token": table_token(folder / PICKS_FILE),
             "points": list(points.values()),
@@ -276,6 +281,7 @@ class _Tab:
             else preview_control(control, spots, lost, model.pictures.frame),
             "last": None if record is None else record.to_json(),
             "unit": "m" if model is None else model.pictures.frame.unit,
+            "scaled_by_rig": mapped is not None and mapped.scaled,
         }  # fmt: skip
 
     def save(self, call: Call) -> dict[str, Any]:
@@ -312,7 +318,24 @@ class _Tab:
             CONTROL_FILE, lambda path: save_control(path, asked.token, asked.rows, asked.names)
         )
 
-    # ---- Lengths ----
+    # ---- Spots and lengths ----
+
+    def spot(self, call: Call) -> dict[str, Any]:
+        """The spot that picks show and how far each misses it; nothing is written."""
+        asked, model = call.read(_Spot), self._read_model()
+        picks = [p.pick for p in asked.picks]
+        found = model.lengths.spot(picks)
+        off = spot_residuals({p.point: found for p in picks}, picks, model.pictures)
+        return {
+            "spot": _spot_json(found),
+            "residuals": [
+                {
+                    "image": pick.image, "left_out": pick.image in found.left_out,
+                    "residual": None if miss is None else miss.tolist(),
+                }
+                for pick, miss in zip(picks, off, strict=True)
+            ],
+        }  # fmt: skip
 
     def length(self, call: Call) -> dict[str, Any]:
         """The distance between two spots and its sigma; nothing is written."""
@@ -418,6 +441,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/picks/refine", answer=tab.refine, method="POST"),
         Endpoint(path="/api/picks/save", answer=tab.save, method="POST", writes=True,
                  most_bytes=8 << 20),
+        Endpoint(path="/api/picks/spot", answer=tab.spot, method="POST"),
         Endpoint(path="/api/picks/length", answer=tab.length, method="POST"),
         Endpoint(path="/api/control", answer=tab.control),
         Endpoint(path="/api/control/save", answer=tab.save_control, method="POST", writes=True,
