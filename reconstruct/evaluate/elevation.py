@@ -15,6 +15,9 @@ from reconstruct.planes import read_plane
 from reconstruct.raster import opened_raster
 from reconstruct.views.model import WorldFrame, read_frame
 
+_CELL_STEPS = 0.5
+"""Steps of a ray's march over the grid, in cells."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Elevation:
@@ -66,6 +69,30 @@ class Elevation:
         lower = (1 - x) * field[down, column] + x * field[down, right]
         between: Array = np.where(inside, (1 - y) * upper + y * lower, np.nan)
         return between
+
+    def hit(self, start: Array, direction: Array, lift: float = 0.0) -> Array | None:
+        """Where a ray first meets the surface, (3,) in the world; None where it does not.
+
+        Args:
+            start: (3,) north, east, down.
+            direction: (3,) unit vector.
+            lift: height by which the surface is raised.
+        """
+        down, known = float(direction[2]), self.height[self.known]
+        if down <= 1e-6 or not len(known):
+            return None
+        first = max(0.0, (-known.max() - lift - self.cell - start[2]) / down)
+        last = (-known.min() - lift + self.cell - start[2]) / down
+        along = np.arange(first, last + self.cell, _CELL_STEPS * self.cell)
+        points = start + along[:, None] * direction
+        over = -points[:, 2] - self.at(self.height, points[:, [1, 0]]) - lift
+        crossed = np.flatnonzero((over[:-1] > 0) & (over[1:] <= 0))
+        if not len(crossed):
+            return None
+        n = crossed[0]
+        share = over[n] / (over[n] - over[n + 1])
+        met: Array = points[n] + share * (points[n + 1] - points[n])
+        return met
 
 
 def read_elevation(workspace: Path) -> tuple[Elevation, WorldFrame]:

@@ -189,12 +189,6 @@ class ControlFit:
         """
         points = [_score_point(tie, place) for tie in self.ties] if located else []
         bars = [_score_bar(bar, place.scale) for bar in self.bars]
-        for row in (*points, *bars):
-            if row["use"] == "control" and row["misfit_sigmas"] > _CONTRADICTED_SIGMAS:
-                warn(
-                    f"control {row['name']} is {row['misfit_sigmas']:.1f} sigmas off the model: "
-                    "check its coordinates and picks, or set use to check"
-                )
         return {
             "format": "alice-survey control",
             "version": 1,
@@ -256,6 +250,16 @@ def tie_control(
 def _sides(marker: str) -> list[tuple[str, str]]:
     """The corners at the ends of a marker's four sides."""
     return [(f"{marker}.{k}", f"{marker}.{(k + 1) % 4}") for k in range(4)]
+
+
+def warn_of_contradictions(score: Mapping[str, Any]) -> None:
+    """Warn of control that the model contradicts, by what `ControlFit.score` says."""
+    for row in (*score["points"], *score["bars"]):
+        if row["use"] == "control" and row["misfit_sigmas"] > _CONTRADICTED_SIGMAS:
+            warn(
+                f"control {row['name']} is {row['misfit_sigmas']:.1f} sigmas off the model: "
+                "check its coordinates and picks, or set use to check"
+            )
 
 
 def describe(score: Mapping[str, Any]) -> str:

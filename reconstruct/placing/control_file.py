@@ -1,6 +1,7 @@
 """What a person knows of a site: `control.csv`, and where pictures show it: `picks.csv`.
 
-`control.csv`, one row each, columns in any order, those not needed left out or empty:
+`control.csv`, one row each, columns in any order, those not needed left out or empty; a row whose
+first cell starts with `#` and a space is a comment, in both files:
 
 - `kind`: `point` (known coordinates), `bar` (known distance of two points) or `marker` (known side
   of a coded marker).
@@ -13,8 +14,10 @@
 - a marker's `length_m` (side of the black square) and `sigma_m`.
 
 Points are picked in `picks.csv`: `image, point, x, y` in pixels of the picture as taken, counted
-from 0 at the middle of the first pixel as viewers show them, and `sigma_px` (0.5 if empty). A coded
-marker `7` has the corners `7.0` to `7.3`, clockwise from its own upper left, and `7` is its middle.
+from 0 at the middle of the first pixel as viewers show them, and `sigma_px` (0.5 if empty). Where
+`matched_to` names a picture, the pick was not made by eye: the neighbourhood of the pick in that
+picture was found again, and `sigma_px` says how well, relative to it. A coded marker `7` has the
+corners `7.0` to `7.3`, clockwise from its own upper left, and `7` is its middle.
 """
 
 import math
@@ -110,6 +113,9 @@ class Pick:
     x_px: float
     y_px: float
     sigma_px: float
+    """Of one coordinate; of a matched pick, relative to the pick that it was matched to."""
+    matched_to: str = ""
+    """Picture whose pick of the point was found again in this one; empty of a pick by itself."""
 
 
 def read_control(path: Path) -> Control:
@@ -120,6 +126,8 @@ def read_control(path: Path) -> Control:
     """
     points, lengths = [], []
     for line, row in read_csv(path, ("kind", "name", "use"), fault=WorkspaceError)[1]:
+        if _is_comment(row):
+            continue
         kind, name, use = row["kind"], row["name"], row["use"]
         if use not in ("control", "check"):
             raise WorkspaceError(f"{path} line {line}: use is {use!r}, not control or check")
@@ -154,7 +162,7 @@ def read_picks(path: Path) -> list[Pick]:
     """
     picks = []
     for line, row in read_csv(path, ("image", "point", "x", "y"), fault=WorkspaceError)[1]:
-        if not row["x"] and not row["y"]:
+        if _is_comment(row) or (not row["x"] and not row["y"]):
             continue
         x, y = _number(path, line, row, "x"), _number(path, line, row, "y")
         sigma = _number(path, line, row, "sigma_px")
@@ -167,9 +175,14 @@ def read_picks(path: Path) -> list[Pick]:
                 x_px=x + 0.5,
                 y_px=y + 0.5,
                 sigma_px=PICK_SIGMA_PX if math.isnan(sigma) else sigma,
+                matched_to=row.get("matched_to", ""),
             )
         )
     return picks
+
+
+def _is_comment(row: dict[str, str]) -> bool:
+    return next(iter(row.values()), "").startswith("# ")
 
 
 def _point(

@@ -1,4 +1,10 @@
-"""Points picked in pictures, found in space through the exact lenses of their cameras."""
+"""Points picked in pictures, found in space through the exact lenses of their cameras.
+
+Picks that were matched to another one err together with it: what a person meant is as far from the
+mark in the first picture as the hand was unsteady, and all that was found again is off the same
+way. The noise of the matches alone says how well they agree; the covariance of the point holds
+both (see `covariance_of_picks`).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +17,7 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.triangulate import nearest_to_rays
-from reconstruct.placing.control_file import Pick
+from reconstruct.placing.control_file import PICK_SIGMA_PX, Pick
 
 _ROBUST_PX = 1.0
 _WRONG_SIGMAS = 5.0
@@ -33,17 +39,17 @@ class RegisteredPicture:
 
     def project(self, point: Array) -> Array:
         """(2,) pixel of the picture as taken at which a point (3,) of the model is seen."""
-        seen = self._model_from_cam.inv().apply(point[None])
+        seen = self.model_from_cam.inv().apply(point[None])
         return np.asarray(self.warp.camera.project(seen)[0])
 
     def ray(self, pixel: Array) -> tuple[Array, Array]:
         """Start and unit direction, (3,) each, in the model, of a pixel of the picture as taken."""
         start, way = self.warp.camera.unproject(pixel)
-        there = self._model_from_cam
+        there = self.model_from_cam
         return there.apply(start), there.rotation.apply(way)
 
     @property
-    def _model_from_cam(self) -> RigidTransform:
+    def model_from_cam(self) -> RigidTransform:
         return self.model_from_pinhole * self.warp.pinhole_from_cam
 
 
@@ -148,10 +154,10 @@ def _triangulate(
             return f"its picks are {miss_px:.1f} px off one common point"
         kept = _without_one(point, kept, off, cameras)
     miss_px = np.linalg.norm(off, axis=1)
-    sigma = np.repeat([p.sigma_px for p in kept], 2)
-    weighted = jacobian / sigma[:, None]
+    sigma = np.repeat(own_sigmas(kept), 2)
     chi = float(((off.ravel() / sigma) ** 2).sum()) / (2 * len(kept) - 3)
-    covariance = np.linalg.inv(weighted.T @ weighted) * max(1.0, chi)
+    gain = gain_of(jacobian, sigma)
+    covariance = gain @ covariance_of_picks(kept, jacobian, max(1.0, chi)) @ gain.T
     names = {p.image for p in kept}
     return Spot(
         name=name,
@@ -161,6 +167,71 @@ def _triangulate(
         left_out=tuple(p.image for p in picks if p.image not in names),
         rms_px=float(np.sqrt((miss_px**2).mean())),
     )
+
+
+def own_sigmas(picks: Sequence[Pick]) -> Array:
+    """(N,) noise of one coordinate of each pick apart from what picks share, px.
+
+    A match errs by the noise of both pictures, which is half its variance in either: with the first
+    picture's half the pick that others were matched to takes part.
+    """
+    of: dict[str, list[float]] = {}
+    for pick in picks:
+        if pick.matched_to:
+            of.setdefault(pick.matched_to, []).append(pick.sigma_px / np.sqrt(2.0))
+    return np.array(
+        [
+            pick.sigma_px / np.sqrt(2.0) if pick.matched_to
+            else float(np.median(of[pick.image])) if pick.image in of
+            else pick.sigma_px
+            for pick in picks
+        ]
+    )  # fmt: skip
+
+
+def gain_of(jacobian: Array, sigma: Array) -> Array:
+    """(3, 2 N) how the point moves with pixels of these sigmas (2 N,) and slopes (2 N, 3)."""
+    weighted = jacobian / (sigma**2)[:, None]
+    gain: Array = np.linalg.solve(jacobian.T @ weighted, weighted.T)
+    return gain
+
+
+def covariance_of_picks(picks: Sequence[Pick], jacobian: Array, factor: float = 1.0) -> Array:
+    """(2 N, 2 N) covariance of the pixels of picks of one point, as readings of what was meant.
+
+    Matched picks follow the error of the mark in their first picture and the noise of the patch
+    around it, along the surface, which is taken as square to the mean direction of the pictures.
+
+    Args:
+        picks: of the point.
+        jacobian: (2 N, 3) slopes of their pixels by the point.
+        factor: by which the variances of own noise are larger than stated.
+    """
+    own, slopes = own_sigmas(picks), jacobian.reshape(-1, 2, 3)
+    found = np.diag(np.repeat(factor * own**2, 2))
+    along = np.linalg.svd(jacobian)[2][:2].T
+    in_plane = slopes @ along
+    row = {pick.image: n for n, pick in enumerate(picks)}
+    for image in sorted({pick.matched_to for pick in picks} - {""}):
+        matched = [n for n, pick in enumerate(picks) if pick.matched_to == image]
+        first = row.get(image, matched[0])
+        marked = picks[first].sigma_px if image in row else PICK_SIGMA_PX
+        follow = in_plane[matched] @ np.linalg.inv(in_plane[first])
+        noise = factor * float(np.median(own[matched])) ** 2
+        rows = [2 * n + k for n in matched for k in range(2)]
+        together = follow.reshape(-1, 2) @ follow.reshape(-1, 2).T
+        found[np.ix_(rows, rows)] += (marked**2 + noise) * together
+        if image in row:
+            at = [2 * first, 2 * first + 1]
+            found[np.ix_(at, at)] = marked**2 * np.eye(2)
+            found[np.ix_(rows, at)] = marked**2 * follow.reshape(-1, 2)
+            found[np.ix_(at, rows)] = found[np.ix_(rows, at)].T
+    return found
+
+
+def residuals(point: Array, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> Array:
+    """(N, 2) pixels at which pictures see a point minus where it was picked."""
+    return np.stack([cameras[p.image].project(point) - [p.x_px, p.y_px] for p in picks])
 
 
 def _worst(off: Array, picks: Sequence[Pick]) -> float:
@@ -197,7 +268,10 @@ def _fit(
 ) -> tuple[Array, Array, Array]:
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
     picked = np.array([[p.x_px, p.y_px] for p in picks])
-    near_px = max(_ROBUST_PX, 2.0 * float(np.median([p.sigma_px for p in picks])))
+    own = own_sigmas(picks)
+    usual = float(np.median(own))
+    near_px = max(_ROBUST_PX, 2.0 * usual)
+    weight = np.repeat(usual / own, 2)
     unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))
 
     def misses(x: Array) -> Array:
@@ -206,7 +280,7 @@ def _fit(
         return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
 
     found = least_squares(
-        misses, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12, ftol=1e-12, gtol=1e-12,
+        lambda x: weight * misses(x), np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12, ftol=1e-12, gtol=1e-12,
         jac="3-point",
     )  # fmt: skip
     jacobian = np.empty((2 * len(picks), 3))

@@ -39,6 +39,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import read_inputs
 from reconstruct.mapping.unregistered import UNREGISTERED
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
+from reconstruct.placing.control import warn_of_contradictions
 from reconstruct.placing.groups import join_groups, joints_of
 from reconstruct.placing.navigation_equations import PLACE, Installation
 from reconstruct.placing.place import Placed, Placing, find_place
@@ -165,6 +166,7 @@ def run_sparse(
         GeoreferenceRecord.save(folder / "georeference.json", placed.fit.to_json())
     if placed.control is not None:
         score = placed.control.score(move, located=placed.located)
+        warn_of_contradictions(score)
         ControlRecord.save(folder / "control.json", score)
     doming = accepted = None
     if rig is not None and adjusted.mapped.scaled:

@@ -17,7 +17,7 @@ from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRe
 from alice_survey.stages import SCALE_FILE
 from camera_calib.triangulate import nearest_to_rays
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.views.model import SparseModel, View, read_model
+from reconstruct.views.model import SparseModel, View, read_frame, read_model
 
 _NEIGHBOURS = 15
 """Model points from which the surface at a pixel is taken."""
@@ -45,38 +45,60 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
         ReconstructionError: the points cannot be understood or found, or the scale is known from
             the rig already.
     """
+    tokens = points.split()
+    if len(tokens) != 2:
+        raise ReconstructionError(
+            f"--points needs two points separated by a space, got {len(tokens)}: {points!r}"
+        )
+    sparse = need_stage(workspace, "sparse", "reconstruct")
+    model = read_model(sparse)
+    pictures = Pictures.open(workspace)
+    first, second = (find_point(token, model, pictures) for token in tokens)
+    return note_scale(workspace, (tokens[0], tokens[1]), first, second, length_m)
+
+
+def note_scale(
+    workspace: Path, names: tuple[str, str], first: Array, second: Array, length_m: float
+) -> str:
+    """Note the true distance between two places of a model in `scale.json`.
+
+    Args:
+        workspace: folder with a finished `sparse/`.
+        names: of the places, for the file.
+        first: (3,) in the coordinates of the model.
+        second: (3,).
+        length_m: their true distance.
+
+    Returns:
+        What was found, in one line.
+
+    Raises:
+        ReconstructionError: the scale is known from the rig already, or there is no such length.
+    """
     if not (math.isfinite(length_m) and length_m > 0):
         raise ReconstructionError(f"--length {length_m}: the true distance must be more than 0 m")
     sparse = need_stage(workspace, "sparse", "reconstruct")
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
     if mapping.scaled:
         raise ReconstructionError("the calibrated rig has scaled this model already")
-    tokens = points.split()
-    if len(tokens) != 2:
-        raise ReconstructionError(
-            f"--points needs two points separated by a space, got {len(tokens)}: {points!r}"
-        )
-    model = read_model(sparse)
-    pictures = Pictures.open(workspace)
-    first, second = (find_point(token, model, pictures) for token in tokens)
     world_from_mapping = RegistrationRecord.read(sparse / "registration.json").world_from_mapping
     distance = float(np.linalg.norm(second - first))
     if not distance > 0:
-        raise ReconstructionError(f"the two points are one and the same: {points!r}")
-    metres_per_unit = length_m * world_from_mapping.scale / distance
+        raise ReconstructionError(f"the two points are one and the same: {' '.join(names)!r}")
     ScaleRecord.save(
         workspace / SCALE_FILE,
         {
             "format": "alice-survey scale",
             "version": 1,
-            "points": tokens,
+            "points": list(names),
             "length_m": length_m,
-            "metres_per_unit": metres_per_unit,
+            "metres_per_unit": length_m * world_from_mapping.scale / distance,
             "gauge": mapping.gauge,
         },
     )
+    unit = read_frame(sparse / "frame.json").unit
     return (
-        f"{distance:.6g} {model.frame.unit} between the points are {length_m:g} m: multiply by "
+        f"{distance:.6g} {unit} between the points are {length_m:g} m: multiply by "
         f"{length_m / distance:.6g}; run 'alice-survey reconstruct' to do so"
     )
 

@@ -23,7 +23,7 @@ from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.rig import Rig, read_rig
 from camera_calib.triangulate import nearest_to_rays
-from reconstruct.evaluate.elevation import read_elevation
+from reconstruct.evaluate.elevation import Elevation, read_elevation
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.placing.picked_points import RegisteredPicture
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
@@ -35,8 +35,6 @@ _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")
 _TWO_PICTURES_SIGMA_PX = 0.5
 """Sigma of a spot picked in two pictures, where no sigma of picking is given."""
-_CELL_STEPS = 0.5
-"""Steps of a ray's march over the DEM, in cells."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,7 +304,7 @@ def _in_workspace(
         if len(rays) == 2:
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
-            surface = surface or _Surface(workspace)
+            surface = surface or read_elevation(workspace)[0]
             point, covariance = _on_surface(surface, *rays[0], pick_sigma_px)
         points.append(point)
         own.append(covariance)
@@ -354,34 +352,8 @@ def _crossed(rays: list[tuple[View, PinholeWarp, Array]], sigma_px: float) -> tu
     return point, covariance
 
 
-class _Surface:
-    """The DEM of a workspace, and its lowest and highest cell."""
-
-    def __init__(self, workspace: Path) -> None:
-        self.dem, _ = read_elevation(workspace)
-        self.low, self.high = float(np.nanmin(self.dem.height)), float(np.nanmax(self.dem.height))
-
-    def hit(self, start: Array, direction: Array, lift: float = 0.0) -> Array | None:
-        """Where a ray first meets the surface, raised by a height; None where it does not."""
-        down, cell = float(direction[2]), self.dem.cell
-        if down <= 1e-6:
-            return None
-        first = max(0.0, (-self.high - lift - cell - start[2]) / down)
-        last = (-self.low - lift + cell - start[2]) / down
-        along = np.arange(first, last + cell, _CELL_STEPS * cell)
-        points = start + along[:, None] * direction
-        over = -points[:, 2] - self.dem.at(self.dem.height, points[:, [1, 0]]) - lift
-        crossed = np.flatnonzero((over[:-1] > 0) & (over[1:] <= 0))
-        if not len(crossed):
-            return None
-        n = crossed[0]
-        share = over[n] / (over[n] - over[n + 1])
-        met: Array = points[n] + share * (points[n + 1] - points[n])
-        return met
-
-
 def _on_surface(
-    surface: _Surface, view: View, warp: PinholeWarp, taken: Array, sigma_px: float
+    surface: Elevation, view: View, warp: PinholeWarp, taken: Array, sigma_px: float
 ) -> tuple[Array, Array]:
     start, direction = _ray(view, warp, taken)
     point = surface.hit(start, direction)
@@ -390,7 +362,7 @@ def _on_surface(
             f"{view.image}:{taken[0] - 0.5:g},{taken[1] - 0.5:g}: its ray meets no known "
             "surface; pick another pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
         )
-    sigma = float(surface.dem.at(surface.dem.sigma, point[None, [1, 0]])[0])
+    sigma = float(surface.at(surface.sigma, point[None, [1, 0]])[0])
     raised = surface.hit(start, direction, lift=sigma)
     moves = [raised - point if raised is not None else sigma * direction]
     for axis in range(2):

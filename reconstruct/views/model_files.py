@@ -7,6 +7,7 @@ on reading what is not there. The layout is that of COLMAP 4 (scene/reconstructi
 """
 
 import errno
+import mmap
 import struct
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -29,12 +30,15 @@ _PARAMS = {
     14: 3, 15: 4, 16: 6, 17: 2,
 }  # fmt: skip
 """Numbers of parameters by COLMAP's number of a camera model."""
+Content = bytes | mmap.mmap
+"""Bytes of a file."""
 KEYPOINT = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
 """Place of a keypoint, and the id of its point: -1 where it has none."""
 _SENSOR, _POSE = struct.calcsize("<iI"), 7 * 8
 _NO_ROOM = "no room for a temporary copy of the model"
 _POINT_HEAD, _TRACK_LENGTH = 32, 43
 """Bytes of a point's id and place, and where the length of its track is."""
+_POINTS_AT_A_TIME = 100_000
 
 
 def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
@@ -101,7 +105,7 @@ def stored_of(model: pycolmap.Reconstruction) -> StoredModel:
     """
     with tempfile.TemporaryDirectory() as folder:
         model.write_binary(folder)
-        point_ids, points = _all_points(Path(folder) / "points3D.bin")
+        point_ids, points = all_points(Path(folder))
         return StoredModel(
             keypoints=dict(_all_keypoints(Path(folder) / "images.bin")),
             point_ids=point_ids,
@@ -109,7 +113,82 @@ def stored_of(model: pycolmap.Reconstruction) -> StoredModel:
         )
 
 
-def _all_points(path: Path) -> tuple[NDArray[np.int64], Array]:
+@dataclass(frozen=True, kw_only=True)
+class PosedPicture:
+    """A registered picture in a model's `images.bin`."""
+
+    number: int
+    name: str
+    cam_from_world: Array
+    """(7,) quaternion wxyz, then translation."""
+    first: int
+    count: int
+    """Where its keypoints start in the file, bytes, and how many there are."""
+
+
+class ImagesFile:
+    """A model's `images.bin`, of which only what is asked for is read."""
+
+    def __init__(self, folder: Path) -> None:
+        """Look through the pictures of the model in a folder.
+
+        Raises:
+            ReconstructionError: the file is missing, cut short or damaged.
+        """
+        path = folder / "images.bin"
+        _check(path, _image)
+        self._content = _mapped(path)
+        self.pictures = tuple(self._walked())
+
+    def _walked(self) -> Iterator[PosedPicture]:
+        content, at = self._content, 8
+        (pictures,) = struct.unpack_from("<Q", content)
+        for _ in range(pictures):
+            (number,) = struct.unpack_from("<I", content, at)
+            first, count = _keypoints(content, at)
+            yield PosedPicture(
+                number=number,
+                name=content[at + 4 + _POSE + 4 : first - 9].decode(),
+                cam_from_world=np.frombuffer(content[at + 4 : at + 4 + _POSE], "<f8"),
+                first=first,
+                count=count,
+            )
+            at = first + KEYPOINT.itemsize * count
+
+    def keypoints(self, picture: PosedPicture) -> NDArray[np.void]:
+        """(N,) of `KEYPOINT`."""
+        end = picture.first + KEYPOINT.itemsize * picture.count
+        return np.frombuffer(self._content[picture.first : end], KEYPOINT)
+
+
+def points_of(folder: Path, ids: NDArray[np.int64]) -> Array:
+    """Places (N, 3) of points of the model in a folder by their ids; NaN of those not in it.
+
+    Raises:
+        ReconstructionError: the file is missing, cut short or damaged.
+    """
+    path = folder / "points3D.bin"
+    _check(path, _point)
+    content = np.asarray(np.memmap(path, np.uint8, "r"))
+    starts, _ = _point_starts(content)
+    wanted, at = np.unique(ids, return_inverse=True)
+    found = np.full((len(wanted) + 1, 3), np.nan)
+    for first in range(0, len(starts), _POINTS_AT_A_TIME):
+        head = content[starts[first : first + _POINTS_AT_A_TIME, None] + np.arange(_POINT_HEAD)]
+        numbers = head[:, :8].copy().view("<i8")[:, 0]
+        rows = np.searchsorted(wanted, numbers)
+        known = np.flatnonzero(np.append(wanted, -1)[rows] == numbers)
+        found[rows[known]] = head[known, 8:].copy().view("<f8")
+    return found[at]
+
+
+def all_points(folder: Path) -> tuple[NDArray[np.int64], Array]:
+    """Ids (P,), ascending, and places (P, 3) of the points of the model in a folder.
+
+    Raises:
+        OSError: the file is missing or cut short.
+    """
+    path = folder / "points3D.bin"
     content = np.fromfile(path, np.uint8)
     starts, end = _point_starts(content)
     if end != len(content):
@@ -157,10 +236,19 @@ def _all_keypoints(path: Path) -> Iterator[tuple[int, NDArray[np.void]]]:
         raise OSError(errno.ENOSPC, _NO_ROOM, path) from None
 
 
-def _check(path: Path, length: Callable[[bytes, int], int]) -> None:
+def _mapped(path: Path) -> Content:
+    """The bytes of a file, read where they are looked at."""
+    with path.open("rb") as file:
+        try:
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except ValueError:  # it is empty
+            return b""
+
+
+def _check(path: Path, length: Callable[[Content, int], int]) -> None:
     """Follow a file's counts to its end."""
     try:
-        content = path.read_bytes()
+        content = _mapped(path)
     except OSError as error:
         raise ReconstructionError(f"{path}: cannot be read: {error.strerror}") from None
     at = 8
@@ -177,29 +265,31 @@ def _check(path: Path, length: Callable[[bytes, int], int]) -> None:
         )
 
 
-def _camera(content: bytes, at: int) -> int:
+def _camera(content: Content, at: int) -> int:
     _, model = struct.unpack_from("<Ii", content, at)
     return 24 + 8 * _PARAMS[model]
 
 
-def _image(content: bytes, at: int) -> int:
+def _image(content: Content, at: int) -> int:
     first, count = _keypoints(content, at)
     return first + KEYPOINT.itemsize * count - at
 
 
-def _keypoints(content: bytes, at: int) -> tuple[int, int]:
+def _keypoints(content: Content, at: int) -> tuple[int, int]:
     """Where the keypoints of the picture whose entry begins at a place do, and their number."""
-    end = content.index(b"\0", at + 4 + _POSE + 4) + 1
+    end = content.find(b"\0", at + 4 + _POSE + 4) + 1
+    if not end:
+        raise ValueError("a name without an end")
     (count,) = struct.unpack_from("<Q", content, end)
     return end + 8, int(count)
 
 
-def _point(content: bytes, at: int) -> int:
+def _point(content: Content, at: int) -> int:
     (track,) = struct.unpack_from("<Q", content, at + _TRACK_LENGTH)
     return int(_TRACK_LENGTH + 8 + 8 * track)
 
 
-def _rig(content: bytes, at: int) -> int:
+def _rig(content: Content, at: int) -> int:
     _, sensors = struct.unpack_from("<II", content, at)
     end = at + 8 + (_SENSOR if sensors else 0)
     for _ in range(max(0, min(sensors, len(content)) - 1)):
@@ -208,12 +298,12 @@ def _rig(content: bytes, at: int) -> int:
     return end - at
 
 
-def _frame(content: bytes, at: int) -> int:
+def _frame(content: Content, at: int) -> int:
     (data,) = struct.unpack_from("<I", content, at + 8 + _POSE)
     return int(8 + _POSE + 4 + (_SENSOR + 8) * data)
 
 
-_LENGTHS: dict[str, Callable[[bytes, int], int]] = {
+_LENGTHS: dict[str, Callable[[Content, int], int]] = {
     "cameras.bin": _camera,
     "images.bin": _image,
     "points3D.bin": _point,

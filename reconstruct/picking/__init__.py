@@ -1,0 +1,1 @@
+"""Spots picked in pictures: where they are seen, found again, and measured between."""

@@ -1,0 +1,371 @@
+"""Lengths between spots, with sigmas of picks, of poses and of the scale.
+
+Two spots that the same pictures show share the errors of these: the block around them is adjusted
+once more, to first order, and tells how stations err together. With a point of slopes J by its
+place, P by a station's pose and C by the rig, and picks that weigh W, a step of the stations and of
+the rig moves it by `-(J^T W J)^-1 J^T W (P dpose + C drig)`. A length is a difference of two such
+points, so that a shift or turn of the whole block cancels, and so does what both share. The normal
+equations of the model's keypoints, points eliminated, give the covariance of the poses for a rig
+that is known; poses follow the rig as they say (implicit function theorem), and the covariance of
+the rig, as the survey refined it, moves both. Only stations around the spots count; leaving others
+out knows less, never more.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.contents import read_arrays
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.stages import SCALE_FILE
+from camera_calib.rig import Rig, read_rig
+from reconstruct.adjustment.exact_observations import (
+    Pixels,
+    RigState,
+    calibrated_parameters,
+    exact_observations,
+)
+from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
+from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
+from reconstruct.mapping.arrays import LEAST_POINTS, Indices, first_of, linked_groups
+from reconstruct.picking.registered import RegisteredPictures
+from reconstruct.placing.control_file import Pick
+from reconstruct.placing.picked_points import (
+    Spot,
+    covariance_of_picks,
+    find_spots,
+    gain_of,
+    own_sigmas,
+    residuals,
+)
+from reconstruct.placing.place import LENGTH_SCALE_SIGMA
+from reconstruct.views.model_files import ImagesFile, points_of
+
+MOST_STATIONS = 120
+"""Stations that are adjusted: the nearest to the spots."""
+_MOST_OBSERVATIONS = 400_000
+"""Observations that are adjusted; of more, evenly chosen points."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpotErrors:
+    """How a spot errs."""
+
+    spot: Spot
+    picks: Array
+    """(3, 3) covariance by its own picks."""
+    by_poses: Array
+    """(3, F, 6) how it moves with the stations of a block."""
+    by_rig: Array
+    """(3, G) how it moves with the rig, the stations held."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Length:
+    """A distance between two spots, in the unit of the model, and parts of its sigma."""
+
+    value: float
+    sigma_picks: float
+    sigma_poses: float
+    sigma_scale: float
+    """By the calibration of the rig, or by what the model was scaled with."""
+
+    @property
+    def sigma(self) -> float:
+        """Of all."""
+        parts = (self.sigma_picks, self.sigma_poses, self.sigma_scale)
+        return float(np.sqrt(np.sum(np.square(parts))))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Block:
+    """Neighbouring stations as their keypoints determine them."""
+
+    numbers: Indices
+    """(F,) stations, ascending."""
+    state: RigState
+    fields: tuple[str, ...]
+    covariance: Array
+    """(G, G) of the rig's parameters `fields`."""
+    equations: PointEquations
+    gauge: Gauge
+
+    @classmethod
+    def around(cls, workspace: Path, pictures: RegisteredPictures, stations: Indices) -> "Block":
+        """The block of some stations.
+
+        Args:
+            workspace: folder with a finished `sparse/`.
+            pictures: its pictures.
+            stations: numbers of those wanted.
+
+        Raises:
+            ReconstructionError: these do not hang together, or have too few points.
+        """
+        folder = workspace / "sparse" / "model"
+        rig = _rig_of(workspace, pictures)
+        names = list(rig.cameras)
+        numbers = np.unique(stations)
+        rows = np.flatnonzero(np.isin(pictures.station, numbers))
+        state = _state_of(pictures, rig, numbers)
+        pixels, state = _observations(ImagesFile(folder), folder, pictures, rows, state, numbers)
+        fields = calibrated_parameters(rig, names)
+        known = np.zeros((0, 0))
+        if rig.covariance is not None:
+            known = rig.covariance.marginal(fields).matrix
+        sigma = float(read_arrays(workspace / "sparse" / "covariance.npz", "sigma_px")["sigma_px"])
+        linear = Linearised(
+            pixels=PixelParts(pixels, len(numbers)), state=state, fields=fields,
+            noise=(sigma, sigma**2),
+        )  # fmt: skip
+        group = linked_groups(pixels.station, pixels.point, len(numbers))
+        if group.any():
+            raise ReconstructionError(
+                "no points join the pictures of the two spots: their distance is not known"
+            )
+        scale_free = not _has_baseline(pictures, rows)
+        reach = state.points[pixels.point] - state.centres[pixels.station]
+        gauge = Gauge(
+            state.centres, float(np.median(np.linalg.norm(reach, axis=1))), scale_free, group
+        )
+        held = gauge.held.copy()
+        held[first_of(group)] = True
+        held[np.bincount(pixels.station, minlength=len(numbers)) < LEAST_POINTS] = True
+        return cls(
+            numbers=numbers, state=state, fields=fields, covariance=known, gauge=gauge,
+            equations=replace(reduce_parts(linear), free=~held),
+        )  # fmt: skip
+
+    def errors(self, spot: Spot, picks: Sequence[Pick], pictures: RegisteredPictures) -> SpotErrors:
+        """How a spot errs that was found from picks in pictures of the block."""
+        kept = [p for p in picks if p.image in pictures and p.image not in spot.left_out]
+        rows = [pictures.row(p.image) for p in kept]
+        station = np.searchsorted(self.numbers, pictures.station[rows])
+        names, own = list(self.state.rig.cameras), list(pictures.warps)
+        seen = Pixels(
+            starts=np.array([0, len(kept)]), station=station.astype(np.int64),
+            camera=np.array([names.index(own[pictures.camera[row]]) for row in rows], np.int64),
+            taken=np.array([[p.x_px, p.y_px] for p in kept]), point=np.zeros(len(kept), np.int64),
+        )  # fmt: skip
+        linear = exact_observations(
+            replace(self.state, points=spot.model[None]), seen, self.fields
+        )
+        jacobian = linear.by_point.reshape(-1, 3)
+        sigma = np.repeat(own_sigmas(kept), 2)
+        gain = gain_of(jacobian, sigma)
+        chi = float(((linear.miss.ravel() / sigma) ** 2).sum()) / max(1, 2 * len(kept) - 3)
+        by_poses, slopes = np.zeros((3, len(self.numbers), 6)), np.empty((2, 6))
+        for n in range(len(kept)):
+            by_pose(linear.by_point[n], linear.arm[n], slopes)
+            by_poses[:, station[n]] -= gain[:, 2 * n : 2 * n + 2] @ slopes
+        return SpotErrors(
+            spot=spot,
+            picks=gain @ covariance_of_picks(kept, jacobian, max(1.0, chi)) @ gain.T,
+            by_poses=by_poses,
+            by_rig=-gain @ linear.rest[..., :-1].reshape(2 * len(kept), -1),
+        )
+
+    def variances(self, by_poses: Array, by_rig: Array) -> tuple[Array, Array]:
+        """Covariances (K, K) of K figures by the poses and by the rig.
+
+        Args:
+            by_poses: (K, F, 6) slopes of the figures by the stations; motions of the whole block
+                are taken out.
+            by_rig: (K, G) by the rig, the stations held.
+        """
+        shape = np.stack([self.gauge.shape_weights(one) for one in by_poses], axis=-1)
+        poses = np.einsum("fik,fil->kl", shape, self.equations.undamped.solve(shape))
+        along = np.einsum("fik,fig->kg", shape, self._response) + by_rig
+        return poses, along @ self.covariance @ along.T
+
+    @cached_property
+    def _response(self) -> Array:
+        """(F, 6, G)."""
+        return self.equations.response
+
+
+class Lengths:
+    """Spots and lengths of a reconstructed workspace."""
+
+    def __init__(self, workspace: Path, pictures: RegisteredPictures) -> None:
+        """Take a workspace with a finished `sparse/`."""
+        self._workspace, self._pictures = workspace, pictures
+        self._kept: tuple[bytes, Block] | None = None
+        numbers, first = np.unique(pictures.station, return_index=True)
+        self._numbers, self._places = numbers, pictures.centres[first]
+
+    def between(self, first: Sequence[Pick], second: Sequence[Pick]) -> Length:
+        """The distance between two spots, each by its picks.
+
+        Raises:
+            ReconstructionError: one is not found, or the distance is not determined.
+        """
+        spots = [self.spot(picks) for picks in (first, second)]
+        way = spots[1].model - spots[0].model
+        value = float(np.linalg.norm(way))
+        if not value > 0:
+            raise ReconstructionError("the two spots are one and the same")
+        way /= value
+        block = self._block([*first, *second])
+        at = [block.errors(s, p, self._pictures) for s, p in zip(spots, (first, second), strict=True)]
+        picks = float(way @ (at[0].picks + at[1].picks) @ way)
+        poses, rig = block.variances(
+            np.einsum("i,ifk->fk", way, at[1].by_poses - at[0].by_poses)[None],
+            (way @ (at[1].by_rig - at[0].by_rig))[None],
+        )
+        scale = value * _scale_sigma(self._workspace)
+        return Length(
+            value=value, sigma_picks=float(np.sqrt(picks)),
+            sigma_poses=float(np.sqrt(max(poses[0, 0], 0.0))),
+            sigma_scale=float(np.sqrt(max(rig[0, 0], 0.0) + scale**2)),
+        )  # fmt: skip
+
+    def spot(self, picks: Sequence[Pick]) -> Spot:
+        """The spot that picks show.
+
+        Raises:
+            ReconstructionError: they show none.
+        """
+        cameras = {p.image: self._pictures.picture(p.image) for p in picks if p.image in self._pictures}
+        alone = [replace(pick, point="spot") for pick in picks]
+        found, lost = find_spots(alone, cameras)
+        if "spot" not in found:
+            raise ReconstructionError(f"the spot is not found: {lost.get('spot', 'no picks')}")
+        return found["spot"]
+
+    def _block(self, picks: Sequence[Pick]) -> Block:
+        rows = [self._pictures.row(p.image) for p in picks if p.image in self._pictures]
+        needed = np.unique(self._pictures.station[rows])
+        places = self._pictures.centres[rows]
+        ends = np.stack([places.min(axis=0), places.max(axis=0)])
+        along = ends[0] + np.linspace(0.0, 1.0, 20)[:, None] * (ends[1] - ends[0])
+        away = np.asarray(KDTree(along).query(self._places)[0])
+        away[np.isin(self._numbers, needed)] = -1.0
+        chosen = np.sort(self._numbers[np.argsort(away, kind="stable")[:MOST_STATIONS]])
+        if self._kept is None or self._kept[0] != chosen.tobytes():
+            self._kept = chosen.tobytes(), Block.around(self._workspace, self._pictures, chosen)
+        return self._kept[1]
+
+
+def spot_residuals(
+    spots: Mapping[str, Spot], picks: Sequence[Pick], pictures: RegisteredPictures
+) -> list[Array | None]:
+    """(2,) pixels by which each pick misses its spot; None where that is not known."""
+    found: list[Array | None] = []
+    for pick in picks:
+        known = pick.point in spots and pick.image in pictures
+        cameras = {pick.image: pictures.picture(pick.image)} if known else {}
+        found.append(residuals(spots[pick.point].model, [pick], cameras)[0] if known else None)
+    return found
+
+
+def _rig_of(workspace: Path, pictures: RegisteredPictures) -> Rig:
+    """The cameras that took pictures, their poses relative to the first as the model has them."""
+    path = workspace / "sparse" / "rig.json"
+    names = [name for n, name in enumerate(pictures.warps) if (pictures.camera == n).any()]
+    known = read_rig(path).covariance if path.is_file() else None
+    poses = {names[0]: RigidTransform.identity()}
+    for name in names[1:]:
+        pair = _pair(pictures, names[0], name)
+        poses[name] = RigidTransform.identity() if pair is None else pair
+    return Rig(
+        cameras={name: pictures.warps[name].camera for name in names},
+        cam_from_rig=poses, body_from_rig=None, source="of the model", covariance=known,
+    )  # fmt: skip
+
+
+def _pair(pictures: RegisteredPictures, first: str, second: str) -> RigidTransform | None:
+    """Pose of a camera relative to the first one by a station that both took; None without one."""
+    order = list(pictures.warps)
+    rows = [np.flatnonzero(pictures.camera == order.index(name)) for name in (first, second)]
+    _, a, b = np.intersect1d(*(pictures.station[r] for r in rows), return_indices=True)
+    if not len(a):
+        return None
+    one, two = (_pose(pictures, int(r[k[0]])) for r, k in zip(rows, (a, b), strict=True))
+    return two.inv() * one
+
+
+def _pose(pictures: RegisteredPictures, row: int) -> RigidTransform:
+    return pictures.picture(pictures.names[row]).model_from_cam
+
+
+def _has_baseline(pictures: RegisteredPictures, rows: Indices) -> bool:
+    """Whether any station has pictures of two cameras, whose distance the rig knows."""
+    _, count = np.unique(pictures.station[rows], return_counts=True)
+    return bool((count > 1).any()) and pictures.frame.scaled
+
+
+def _state_of(pictures: RegisteredPictures, rig: Rig, numbers: Indices) -> RigState:
+    order, turns, centres = list(pictures.warps), [], []
+    for number in numbers.tolist():
+        rows = np.flatnonzero(pictures.station == number)
+        row = int(min(rows, key=lambda r: list(rig.cameras).index(order[pictures.camera[r]])))
+        pose = _pose(pictures, row) * rig.cam_from_rig[order[pictures.camera[row]]]
+        turns.append(pose.rotation.as_matrix())
+        centres.append(pose.translation)
+    return RigState(
+        rig=rig, turns=np.stack(turns), centres=np.stack(centres), points=np.zeros((0, 3))
+    )
+
+
+def _observations(
+    file: ImagesFile,
+    folder: Path,
+    pictures: RegisteredPictures,
+    rows: Indices,
+    state: RigState,
+    numbers: Indices,
+) -> tuple[Pixels, RigState]:
+    """What pictures (R,) of the block see of points that two of them see."""
+    of_name = {picture.name: picture for picture in file.pictures}
+    names, order = list(state.rig.cameras), list(pictures.warps)
+    ids, station, camera = [], [], []
+    for row in rows.tolist():
+        seen = file.keypoints(of_name[pictures.names[row]])["point"]
+        seen = np.unique(seen[seen >= 0]).astype(np.int64)
+        ids.append(seen)
+        station.append(np.full(len(seen), np.searchsorted(numbers, pictures.station[row])))
+        camera.append(np.full(len(seen), names.index(order[pictures.camera[row]])))
+    every = np.concatenate(ids)
+    points, inverse, counts = np.unique(every, return_inverse=True, return_counts=True)
+    chosen = counts > 1
+    step = -(-int(counts[chosen].sum()) // _MOST_OBSERVATIONS)
+    if step > 1:
+        chosen &= np.arange(len(points)) % step == 0
+    kept = np.flatnonzero(chosen[inverse])
+    if not len(kept):
+        raise ReconstructionError("no points join the pictures of the two spots")
+    kept = kept[np.argsort(inverse[kept], kind="stable")]
+    _, index, sizes = np.unique(inverse[kept], return_inverse=True, return_counts=True)
+    state = replace(state, points=points_of(folder, points[chosen]))
+    pixels = Pixels(
+        starts=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        station=np.concatenate(station)[kept].astype(np.int64),
+        camera=np.concatenate(camera)[kept].astype(np.int64),
+        taken=np.zeros((len(kept), 2)), point=index.astype(np.int64),
+    )  # fmt: skip
+    arm = state.points[pixels.point] - state.centres[pixels.station]
+    in_rig = np.einsum("nij,ni->nj", state.turns[pixels.station], arm)
+    for number, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
+        mine = np.flatnonzero(pixels.camera == number)
+        # where they are seen, not where they were found: these are slopes, not an adjustment
+        pixels.taken[mine] = state.rig.cameras[name].project(pose.apply(in_rig[mine]))
+    return pixels, state
+
+
+def _scale_sigma(workspace: Path) -> float:
+    """Relative sigma of a scale that no rig gives."""
+    if MappingRecord.read(workspace / "mapping" / "mapping.json").scaled:
+        return 0.0
+    if ScaleRecord.made(workspace / SCALE_FILE) is not None:
+        return LENGTH_SCALE_SIGMA
+    placed = RegistrationRecord.read(workspace / "sparse" / "registration.json").georeference
+    found = None if placed is None else placed.scale_of_navigation_sigma
+    return LENGTH_SCALE_SIGMA if found is None else found

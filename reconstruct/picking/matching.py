@@ -1,0 +1,290 @@
+"""A spot picked in one picture, found in others by least-squares matching.
+
+The neighbourhood of the pick is seen as a piece of the plane that touches the surface there, and
+that plane says where each of its pixels is in another picture, through both exact lenses. From the
+best place of a search about that, shift, shear and stretch of the warp and brightness and contrast
+are fitted to the other picture (Gruen 1985, "Adaptive least squares correlation"); the scatter of
+what remains determines how well (White 1980; Newey & West 1987, for noise that neighbours share).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from alice_survey.base.frames import Array
+from reconstruct.picking.registered import tangents
+from reconstruct.picking.surface import SurfacePlace
+from reconstruct.placing.picked_points import RegisteredPicture
+
+Grey = NDArray[np.uint8]
+HALF_PX = 7
+"""A patch has this many pixels to either side of the pick."""
+_WEIGHT_PX = 0.5 * HALF_PX
+"""Sigma of the Gaussian weight of its pixels."""
+_SPLINE = 5
+_SPARE_PX = 12
+"""Pixels around a part of a picture that its spline needs to be that of the whole."""
+_LEAST_REACH_PX, _MOST_REACH_PX = 4, 24
+"""A search goes at least and at most this far from where the surface says."""
+_REACH_SIGMAS = 4.0
+_POSE_SIGMA_PX = 0.5
+"""By what poses may move a place besides the surface."""
+_ROUNDS = 20
+_SETTLED_PX = 1e-4
+_LEAST_CORRELATION = 0.6
+_RIVAL = 0.85
+"""A second place whose correlation is more than this share of the best's: they look the same."""
+_RIVAL_PX = 4
+"""Places at least this far apart are two."""
+_MOST_SIGMA_PX = 0.25
+_MOST_DRIFT_PX = 1.5
+"""The fit must end this close to where the search found the best place."""
+_MOST_STRETCH = 0.3
+_LAG_PX = 1
+"""Residuals farther apart are independent."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Match:
+    """A spot found in another picture."""
+
+    image: str
+    pixel: Array
+    """(2,) of the picture as taken, from the outer corner of the first."""
+    sigma_px: float
+    """Of either coordinate, relative to the pick that was matched."""
+    correlation: float
+    moved_px: float
+    """From where the surface and the poses say it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoMatch:
+    """Why a spot is not found in a picture."""
+
+    image: str
+    why: str
+
+
+class Matcher:
+    """Finds one pick again."""
+
+    def __init__(
+        self, grey: Grey, picture: RegisteredPicture, pixel: Array, place: SurfacePlace
+    ) -> None:
+        """Take a pick.
+
+        Args:
+            grey: (H, W) the picture as taken.
+            picture: its camera and pose.
+            pixel: (2,) picked in it, from the outer corner of the first.
+            place: of the surface, where the pick's ray meets it.
+        """
+        self._place = place
+        reach = np.arange(-HALF_PX, HALF_PX + 1.0)
+        grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+        self._weight = np.exp(-0.5 * (grid**2).sum(axis=1) / _WEIGHT_PX**2)
+        self._grid = grid
+        rays = [picture.ray(one) for one in pixel + grid]
+        starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
+        away = ((place.point - starts) @ place.normal) / (ways @ place.normal)
+        self._points = starts + away[:, None] * ways
+        self._own = _Part.around(grey, pixel, HALF_PX + 1)
+        self._shown = self._own.at(pixel + grid)[0]
+        self._finest = float(np.std(self._shown[np.isfinite(self._shown)]))
+
+    def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Match | NoMatch:
+        """Find the pick in another picture.
+
+        Args:
+            image: its name.
+            grey: (H, W) as taken.
+            picture: its camera and pose.
+        """
+        if not np.isfinite(self._shown).all():
+            return NoMatch(image=image, why="the pick is too close to the edge of its picture")
+        expected = np.stack([picture.project(point) for point in self._points])
+        middle = picture.project(self._place.point)
+        if not np.isfinite(expected).all():
+            return NoMatch(image=image, why="the picture does not see the spot")
+        raised = picture.project(self._place.point - [0.0, 0.0, self._place.sigma])
+        spread = float(np.hypot(np.linalg.norm(raised - middle), _POSE_SIGMA_PX))
+        reach = int(np.clip(np.ceil(_REACH_SIGMAS * spread), _LEAST_REACH_PX, _MOST_REACH_PX))
+        extent = int(np.ceil(np.abs(expected - middle).max())) + reach + 2
+        part = _Part.around(grey, middle, extent)
+        shift, likeness, rival = self._search(part, expected, reach)
+        if likeness < _LEAST_CORRELATION:
+            return NoMatch(
+                image=image,
+                why=f"nothing there looks like the pick (correlation {max(likeness, 0.0):.2f}): "
+                "hidden, in other light, outside, or without texture",
+            )
+        if rival > _RIVAL * likeness:
+            return NoMatch(image=image, why="several places there look like the pick")
+        fit = _fit(part, expected + shift, self._grid, self._shown, self._weight)
+        if fit is None:
+            return NoMatch(image=image, why="the match does not settle")
+        move, sigma, correlation = fit
+        if np.linalg.norm(move) > _MOST_DRIFT_PX or correlation < _LEAST_CORRELATION:
+            return NoMatch(image=image, why="the match does not settle")
+        if sigma > _MOST_SIGMA_PX:
+            return NoMatch(
+                image=image, why=f"too little texture: it would be known to {sigma:.1f} px only"
+            )
+        found = middle + shift + move
+        return Match(
+            image=image, pixel=found, sigma_px=sigma, correlation=correlation,
+            moved_px=float(np.linalg.norm(found - middle)),
+        )  # fmt: skip
+
+    def _search(self, part: "_Part", expected: Array, reach: int) -> tuple[Array, float, float]:
+        """Best whole-pixel shift (2,), its correlation, and the best one of places apart."""
+        steps = np.arange(-reach, reach + 1.0)
+        shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        seen = part.at((expected[None] + shifts[:, None]).reshape(-1, 2), order=1)[0]
+        likeness = _correlations(self._shown, seen.reshape(len(shifts), -1), self._weight)
+        likeness = np.where(np.isfinite(likeness), likeness, -1.0)
+        best = int(np.argmax(likeness))
+        square = likeness.reshape(len(steps), len(steps))
+        peaks = (square >= ndimage.maximum_filter(square, 3)).ravel()
+        apart = np.linalg.norm(shifts - shifts[best], axis=1) >= _RIVAL_PX
+        others = likeness[peaks & apart]
+        return shifts[best], float(likeness[best]), float(others.max(initial=-1.0))
+
+
+def find_in_others(
+    matcher: Matcher,
+    images: Sequence[str],
+    picture: Callable[[str], RegisteredPicture],
+    grey: Callable[[str], Grey],
+) -> list[Match | NoMatch]:
+    """Find a pick in pictures, one after the other."""
+    return [matcher.find(image, grey(image), picture(image)) for image in images]
+
+
+class _Part:
+    """A part of a picture as a quintic spline, with its slopes."""
+
+    def __init__(self, grey: Grey, left: int, top: int) -> None:
+        self._corner = np.array([left, top], dtype=np.float64)
+        self._size = np.array(grey.shape[::-1])
+        pixels = grey.astype(np.float64)
+        self._plain = pixels
+        self._spline = (
+            ndimage.spline_filter(pixels, order=_SPLINE, mode="mirror") if pixels.size else pixels
+        )
+
+    @classmethod
+    def around(cls, grey: Grey, pixel: Array, extent: int) -> "_Part":
+        """Pixels up to an extent around a pixel."""
+        reach, size = extent + _SPARE_PX, np.array(grey.shape[::-1])
+        low = np.clip(np.floor(pixel).astype(int) - reach, 0, size)
+        high = np.clip(np.floor(pixel).astype(int) + reach + 1, 0, size)
+        return cls(grey[low[1] : high[1], low[0] : high[0]], int(low[0]), int(low[1]))
+
+    def at(self, pixels: Array, order: int = _SPLINE, step: float = 0.0) -> Array:
+        """Grey levels (1, N) at pixels (N, 2), and with a step slopes by x and y below, (3, N)."""
+        place = pixels - self._corner
+        inside = ((place >= 0.5) & (place <= self._size - 0.5)).all(axis=1)
+        found = np.full((3 if step else 1, len(pixels)), np.nan)
+        source = self._plain if order == 1 else self._spline
+        at = place[inside, ::-1].T - 0.5
+
+        def read(where: Array) -> Array:
+            values: Array = ndimage.map_coordinates(
+                source, where, order=order, mode="mirror", prefilter=False
+            )
+            return values
+
+        if not inside.any():
+            return found
+        found[0, inside] = read(at)
+        for row, axis in ((1, 1), (2, 0)) if step else ():
+            ahead = np.zeros((2, 1))
+            ahead[axis] = step
+            found[row, inside] = (read(at + ahead) - read(at - ahead)) / (2 * step)
+        return found
+
+
+def _correlations(first: Array, others: Array, weight: Array) -> Array:
+    """(N,) weighted correlations of a patch (P,) with others (N, P)."""
+    total = weight.sum()
+    a = first - first @ weight / total
+    b = others - (others @ weight / total)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found: Array = (b @ (weight * a)) / np.sqrt((a * a) @ weight * ((b * b) @ weight))
+    return found
+
+
+def _fit(
+    part: _Part, start: Array, grid: Array, shown: Array, weight: Array
+) -> tuple[Array, float, float] | None:
+    """Shift (2,) from a start (P, 2), its sigma and the correlation there; None without an end."""
+    change = np.zeros(6)  # shift, then what the grid's x and y add to it
+    design = np.concatenate(
+        [np.tile(np.eye(2), (len(grid), 1, 1)), grid[:, :1, None] * np.eye(2),
+         grid[:, 1:, None] * np.eye(2)], axis=2
+    )  # fmt: skip
+    for _ in range(_ROUNDS):
+        seen = part.at(start + design @ change, step=0.05)
+        if not np.isfinite(seen).all():
+            return None
+        slopes = np.einsum("ip,pik->pk", seen[1:], design)
+        gain, level = np.linalg.lstsq(
+            np.sqrt(weight)[:, None] * np.column_stack([seen[0], np.ones(len(grid))]),
+            np.sqrt(weight) * shown, rcond=None,
+        )[0]  # fmt: skip
+        if not gain > 0:
+            return None
+        rest = shown - gain * seen[0] - level
+        columns = np.column_stack([gain * slopes, seen[0], np.ones(len(grid))])
+        matrix = columns.T @ (weight[:, None] * columns)
+        try:
+            inverse = np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:
+            return None
+        step = inverse @ (columns.T @ (weight * rest))
+        change = change + step[:6]
+        if np.abs(change[2:]).max() > _MOST_STRETCH or np.linalg.norm(change[:2]) > 2 * HALF_PX:
+            return None
+        if np.linalg.norm(step[:2]) < _SETTLED_PX:
+            return change[:2], _sigma(columns, weight, rest, inverse), float(
+                _correlations(shown, seen[:1], weight)[0]
+            )
+    return None
+
+
+def _sigma(columns: Array, weight: Array, rest: Array, inverse: Array) -> float:
+    """Sigma of a coordinate of the shift, from residuals that neighbours share."""
+    side = 2 * HALF_PX + 1
+    terms = ((weight * rest)[:, None] * columns[:, :]).T.reshape(-1, side, side)
+    fall = 1.0 - np.abs(np.arange(-_LAG_PX, _LAG_PX + 1)) / (_LAG_PX + 1)
+    near = ndimage.convolve1d(terms, fall, axis=1, mode="constant")
+    near = ndimage.convolve1d(near, fall, axis=2, mode="constant").reshape(len(terms), -1)
+    middle = terms.reshape(len(terms), -1) @ near.T
+    count = weight.sum() ** 2 / (weight**2).sum()
+    covariance = inverse @ (0.5 * (middle + middle.T)) @ inverse * count / (count - len(terms))
+    return float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2, 0.0)))
+
+
+def affine_between(
+    first: RegisteredPicture, second: RegisteredPicture, point: Array, normal: Array
+) -> Array:
+    """(2, 2) change of the second picture's pixel with the first's, along a surface at a point."""
+    along = tangents(normal)
+    step = 1e-4 * float(np.linalg.norm(point - first.model_from_pinhole.translation))
+    slopes = [
+        np.stack(
+            [
+                (one.project(point + step * way) - one.project(point - step * way)) / (2 * step)
+                for way in along.T
+            ],
+            axis=1,
+        )
+        for one in (first, second)
+    ]
+    found: Array = slopes[1] @ np.linalg.inv(slopes[0])
+    return found
