@@ -147,7 +147,8 @@ class Slopes:
             (self._smooth, self._near), right, up, strict=True
         ):  # fmt: skip
             for axis in range(3):
-                gathered[:, axis] += (upwards.T @ slopes[..., axis] @ across).ravel()
+                part = np.ascontiguousarray(slopes[..., axis])
+                gathered[:, axis] += (upwards.T @ (part @ across)).ravel()
         self._own += own
 
     def add_own(self, variance: float) -> None:

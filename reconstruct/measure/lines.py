@@ -118,8 +118,11 @@ def surface_length(surface: Surface, line: Profile) -> Figure:
             name=name, title=title, value=math.nan, own=math.nan, shared=math.nan,
             unit=surface.unit,
         )  # fmt: skip
-    # what noise adds differs from draw to draw, as the square of a Gaussian number
-    own = samples.own_variance(slopes[:, 2]) + 2.0 * float((added**2).sum())
+    # What noise adds differs from draw to draw, as the square of a Gaussian number. Derivatives at
+    # measured heights count that twice: of a quadratic form q = nᵀAn they give 4 tr(AKAK) in the
+    # mean, and its variance is 2 tr(AKAK).
+    scatter = 2.0 * float((added**2).sum())
+    own = max(samples.own_variance(slopes[:, 2]) - scatter, scatter)
     gathered = Slopes(surface.errors)
     gathered.add(samples.places, slopes, own)
     return figure(surface, name, title, value, gathered, 1)

@@ -29,7 +29,7 @@ from reconstruct.measure.surface import Surface
 _BLOCK_CELLS = 512
 _RIM = REACH_CELLS + 1
 """Cells around a block whose squares count for own errors in it."""
-_MOST_CELLS = 40_000_000
+_MOST_CELLS = 10_000_000
 _MOST_RIM_SAMPLES = 4000
 _LEAST_SHARE = 0.5
 """Share of a rim, and of a quadrat, that must be there."""
@@ -319,7 +319,8 @@ class _Sums:
             self.surface += float(np.nansum(block.weight * np.nan_to_num(found.area)))
             added += float(np.nansum(block.weight * np.nan_to_num(found.added)))
             region.add(self.by_surface, block, found.slopes)
-            self.by_surface.add_own(found.scatter(block.weight))
+            # counted twice by derivatives at measured heights (see `lines.surface_length`)
+            self.by_surface.add_own(-found.scatter(block.weight))
             region.add(self.by_area, block, plan_slopes(block.all_weight, cell))
             upright = _upright(block)
             weight = spread_to_cells(block.all_weight)

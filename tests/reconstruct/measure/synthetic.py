@@ -104,10 +104,10 @@ class Drawn:
         from_x, from_y = (here - motion[:, :2]).T
         shared = (self.truth(from_x, from_y) + motion[:, 2]).reshape(self._x.shape)
         white = rng.normal(size=(self.cells.rows, self.cells.columns))
-        # noise of which the correlation is exp(-d²) is white noise under exp(-2 d²)
-        frequency = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n) for n in white.shape[::-1])))
-        gain = np.sqrt(np.pi) * np.exp(-((np.pi * frequency) ** 2) / 2)
-        own = np.fft.ifft2(np.fft.fft2(white) * gain).real
+        # white noise under the root of the spectrum of its correlation, on a torus
+        steps = (np.minimum(np.arange(n), n - np.arange(n)) for n in white.shape[::-1])
+        spectrum = np.fft.fft2(own_correlation(np.hypot(*np.meshgrid(*steps)))).real
+        own = np.fft.ifft2(np.fft.fft2(white) * np.sqrt(np.maximum(spectrum, 0.0))).real
         return self.surface(shared + self._sigmas.own * own), moved
 
 

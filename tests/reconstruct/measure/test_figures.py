@@ -141,17 +141,14 @@ ALL = Sigmas(own=0.0012, shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
 def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> None:
     drawn, rng = Drawn(tmp_path, grid(1.0, 0.0125), hills, sigmas), np.random.default_rng(7)
     places = np.array([(-0.31, -0.22), (0.05, 0.13), (0.36, 0.17)])
-    true = {
-        **{
-            f"line {k}": v.value
-            for k, v in named(measure_line(drawn.true, places.tolist())).items()
-        },
-        **{k: v.value for k, v in named(measure_polygon(drawn.true, SLANTED, -10.05)[0]).items()},
-        "rim": named(measure_polygon(drawn.true, SLANTED, "rim")[0])["volume"].value,
-    }
+    exact = without_errors(tmp_path, drawn.cells, hills)
+    line, region = measure_line(exact, places.tolist()), measure_polygon(exact, SLANTED, -10.05)[0]
+    over_rim = named(measure_polygon(exact, SLANTED, "rim")[0])
+    true = {f"line {one.name}": one.value for one in line} | {one.name: one.value for one in region}
+    true["rim"] = over_rim["volume"].value
     misses = defaultdict(list)
     stated = defaultdict(list)
-    for _ in range(60):
+    for _ in range(40):
         surface, moved = drawn.draw(rng)
         line = named(measure_line(surface, moved(places).tolist()))
         corners = moved(np.array(SLANTED)).tolist()
@@ -172,7 +169,7 @@ def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> 
     wanted = {"line length", "line height_difference", "line surface_length", "surface_area",
               "rugosity", "rim", "volume", "mean_height"}  # fmt: skip
     assert wanted <= ratios.keys()
-    # 60 draws know a sigma to 9 %
+    # 40 draws know a sigma to 11 %
     for name in ("above", "below"):  # noise near the plane counts in full
         assert ratios.pop(name, 1.0) < 1.4
     wrong = {name: ratio for name, ratio in ratios.items() if not 0.7 < ratio < 1.4}
@@ -219,10 +216,10 @@ def test_what_is_unknown_is_said(tmp_path: Path) -> None:
 
 def test_parts_of_a_large_polygon_add_up(tmp_path: Path) -> None:
     """More blocks than one, against the same polygon cut in two."""
-    drawn = Drawn(tmp_path, grid(12.0, 0.01), hills, Sigmas(own=0.001))
+    drawn = Drawn(tmp_path, grid(12.0, 0.02), hills, Sigmas(own=0.001))
     surface: Surface = drawn.draw(np.random.default_rng(1))[0]
-    left = [(-5.5, -3.0), (0.105, -3.0), (0.105, 2.0), (-5.5, 2.0)]
-    right = [(0.105, -3.0), (5.0, -3.0), (5.0, 2.0), (0.105, 2.0)]
+    left = [(-5.5, -3.0), (0.105, -3.0), (0.105, -1.0), (-5.5, -1.0)]
+    right = [(0.105, -3.0), (5.5, -3.0), (5.5, -1.0), (0.105, -1.0)]
     whole = [left[0], right[1], right[2], left[3]]
     parts = [named(measure_polygon(surface, part, -10.2)[0]) for part in (left, right, whole)]
     for name in ("surface_area", "volume", "above", "below", "plan_area"):
