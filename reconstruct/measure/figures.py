@@ -82,7 +82,7 @@ def of_points(
     """A figure of points of a surface, which is a function of their coordinates."""
     centred = samples.points - samples.points.mean(axis=0)
     slopes, gathered = slopes_of(value, centred), Slopes(surface.errors)
-    gathered.add(samples.places, slopes, samples.own_variance(slopes[:, 2]))
+    gathered.add(samples.places, slopes, samples.own_variance(slopes))
     return figure(surface, name, title, value(centred), gathered, power, unit)
 
 

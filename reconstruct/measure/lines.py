@@ -122,7 +122,7 @@ def surface_length(surface: Surface, line: Profile) -> Figure:
     # measured heights count that twice: of a quadratic form q = nᵀAn they give 4 tr(AKAK) in the
     # mean, and its variance is 2 tr(AKAK).
     scatter = 2.0 * float((added**2).sum())
-    own = max(samples.own_variance(slopes[:, 2]) - scatter, scatter)
+    own = max(samples.own_variance(slopes) - scatter, scatter)
     gathered = Slopes(surface.errors)
     gathered.add(samples.places, slopes, own)
     return figure(surface, name, title, value, gathered, 1)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +24,7 @@ from reconstruct.measure.cells import (
 )
 from reconstruct.measure.errors import REACH_CELLS, Slopes
 from reconstruct.measure.figures import Figure, as_places, figure, of_points, plan_area, polyline
-from reconstruct.measure.surface import Surface
+from reconstruct.measure.surface import Samples, Surface
 
 _BLOCK_CELLS = 512
 _RIM = REACH_CELLS + 1
@@ -207,16 +207,16 @@ def measure_polygon(
             f"{moments.share:.1%} of the polygon is known: area of the surface, volume, slope and "
             "rugosity are of that part"
         )
-    ring = surface.at(np.concatenate([places, places[:1]]))
+    ring = _ring(surface, places)
     rim = None if base is None else _Rim.of(surface, region, base)
     sums = _Sums(region, moments, rim)
     figures = [
-        of_points(surface, _flat(ring), "plan_area", "Area in plan", plan_area, 2),
+        of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
         figure(surface, "surface_area", "Area of the surface", sums.surface, sums.by_surface, 2),
         sums.rugosity,
         *sums.slope,
         figure(surface, "mean_height", "Mean height", sums.mean, sums.by_mean, 1),
-        of_points(surface, _flat(ring), "perimeter", "Perimeter in plan", _outline, 1),
+        of_points(surface, ring, "perimeter", "Perimeter in plan", _outline, 1),
         *sums.volumes,
     ]
     if sums.noise > 0.1:
@@ -231,11 +231,12 @@ def _outline(points: Array) -> float:
     return polyline(points[:, :2])
 
 
-def _flat(ring: Any) -> Any:
-    """Samples whose heights do not matter, known or not."""
-    from dataclasses import replace
-
-    return replace(ring, height=np.zeros(len(ring.places)), own=np.zeros_like(ring.own))
+def _ring(surface: Surface, places: Array) -> Samples:
+    """Corners and the first again; own errors count where heights are known."""
+    found = surface.picked(np.concatenate([places, places[:1]]))
+    known = np.isfinite(found.height)
+    height, own = np.where(known, found.height, 0.0), np.where(known[:, None], found.own, 0.0)
+    return replace(found, height=height, own=own)
 
 
 def polygon_of(places: Array) -> Any:
@@ -257,7 +258,7 @@ def polygon_of(places: Array) -> Any:
 class _Rim:
     """The plane of a volume."""
 
-    def __init__(self, plane: Array, samples: Any, by_height: Array) -> None:
+    def __init__(self, plane: Array, samples: Samples | None, by_height: Array) -> None:
         self.plane = plane
         """(3,) height in the middle, and slopes."""
         self._samples, self._by_height = samples, by_height
@@ -290,7 +291,7 @@ class _Rim:
             return
         up = by_plane @ self._by_height
         motion = np.column_stack([np.zeros((len(up), 2)), up])
-        slopes.add(self._samples.places, motion, self._samples.own_variance(up))
+        slopes.add(self._samples.places, motion, self._samples.own_variance(motion))
 
 
 class _Sums:

@@ -1,7 +1,7 @@
 """The surface of a workspace, read by windows: its heights and their own errors; its rasters."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from reconstruct.measure.errors import REACH_CELLS, SharedErrors, own_correlation, shared_errors
+from reconstruct.measure.sight import sight_lines
 from reconstruct.planes import Plane, read_plane
 from reconstruct.raster import DemGrid, opened_raster, small_cache
 from reconstruct.views.model import WorldFrame, read_frame
@@ -44,6 +45,8 @@ class Samples:
     """(N, 4) sigmas of their own errors."""
     shared: Array
     """(N,) variances by what all heights share."""
+    sight: Array
+    """(N, 2) how far a place moves aside with the own error of its height."""
 
     @property
     def points(self) -> Array:
@@ -63,8 +66,9 @@ class Samples:
         """(N,) of the heights."""
         return np.sqrt(self.own_covariances(0) + self.shared)
 
-    def own_variance(self, slopes: Array) -> float:
-        """Variance by own errors of a figure with derivatives (N,) by the heights."""
+    def own_variance(self, motions: Array) -> float:
+        """Variance by own errors of a figure with derivatives (N, 3) by the places' motions."""
+        slopes = motions[:, 2] + (motions[:, :2] * self.sight).sum(axis=1)
         used = slopes != 0.0
         cells, cell_of = np.unique(self.cells[used].reshape(-1, 2), axis=0, return_inverse=True)
         kick = (slopes[used, None] * self.weights[used] * self.own[used]).ravel()
@@ -172,15 +176,22 @@ class Surface:
         return Samples(
             places=places, height=(weights * heights).sum(axis=1), cells=cells, weights=weights,
             own=own, shared=self.errors.variance_of_heights(places),
+            sight=np.zeros((len(places), 2)),
         )  # fmt: skip
 
+    def picked(self, places: Array) -> Samples:
+        """Spots that were picked where the mosaic shows them; see `sight_lines`."""
+        found = self.at(places)
+        lines = sight_lines(self.workspace, self.plane, found.points)
+        return found if lines is None else replace(found, sight=lines)
+
     def known_at(self, places: Array) -> Samples:
-        """The same where every place must have a height.
+        """The same where each must have a height.
 
         Raises:
             ReconstructionError: one has none.
         """
-        found = self.at(places)
+        found = self.picked(places)
         lost = np.flatnonzero(~np.isfinite(found.height))
         if len(lost):
             x, y = places[lost[0]]
