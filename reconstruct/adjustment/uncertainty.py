@@ -18,7 +18,7 @@ of the calibration moves with them.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pycolmap
@@ -356,10 +356,11 @@ def _usual_reach(pixels: Pixels, centres: Array, points: Array) -> float:
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
     """Write `covariance.npz`: fields of `Uncertainty` but the modes; points as float32."""
-    shared = found.shared
-    parts = () if shared is None else (
-        shared.places, shared.motions.astype(np.float32), shared.covariance, shared.rest,
-    )  # fmt: skip
+    parts: tuple[Array, ...] = ()
+    if found.shared is not None:
+        one = found.shared
+        parts = (one.places, one.motions.astype(np.float32), one.covariance, one.rest)
+    more: dict[str, Any] = dict(zip(_SHARED, parts, strict=False))
     np.savez(
         path,
         frames=found.frames,
@@ -370,7 +371,7 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
         point_cov=found.point_cov.astype(np.float32),
         point_noise=found.point_noise.astype(np.float32),
         sigma_px=np.array(found.sigma_px),
-        **dict(zip(_SHARED, parts, strict=False)),
+        **more,
     )
 
 

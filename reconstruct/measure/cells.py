@@ -5,6 +5,7 @@ triangles. Arrays of heights are (rows, columns) of cells, rows from north to so
 squares have one row and one column less.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +20,10 @@ _CORNERS = ((np.s_[:-1, :-1], -1, 1), (np.s_[:-1, 1:], 1, 1), (np.s_[1:, :-1], -
             (np.s_[1:, 1:], 1, -1))  # fmt: skip
 """Corners of squares in an array of cells: north-west, north-east, south-west, south-east, and on
 which side of the square each is, to the right and up."""
-_AROUND, _ALONG = 7, 25
-"""Squares, and steps of a line, of which the mean roughness is compared with noise."""
+_TOO_SMOOTH = 0.5
+"""Share of the stated noise that less scatter of slopes contradicts."""
+_AROUND, _ALONG = 9, 41
+"""Squares along a side, and steps of a line, over which the scatter of slopes is taken."""
 _FAR = 9.0
 """Sigmas from which on noise lifts nothing."""
 _NEXT, _ACROSS = (float(own_correlation(np.array(cells))) for cells in (1.0, np.sqrt(2.0)))
@@ -114,7 +117,7 @@ def surface_area(height: Array, own: Array, weight: Array, cell: float) -> Surfa
     up = {-1: (nw - sw) / cell, 1: (ne - se) / cell}
     sigma = {(-1, 1): 0, (1, 1): 1, (-1, -1): 2, (1, -1): 3}
     roots = corners_of(own)
-    area, added, rough, noise = (np.zeros_like(nw) for _ in range(4))
+    area, added, share_of_noise = np.zeros_like(nw), np.zeros_like(nw), np.ones_like(nw)
     slopes = np.zeros((*height.shape, 3))
     known = np.isfinite(nw + ne + sw + se)
     weight = np.where(known, weight, 0.0)
@@ -134,8 +137,8 @@ def surface_area(height: Array, own: Array, weight: Array, cell: float) -> Surfa
         # p and q have the sign of the corner that is to the right, or up
         cov = cov * (to_right * to_up)
         bend = ((1 + q**2) * var_p + (1 + p**2) * var_q - 2 * p * q * cov) / root**3
-        rough += p**2 + q**2
-        noise += (var_p + var_q) / cell**2
+        if (to_right, to_up) == (-1, 1):  # one corner of each square stands for all
+            share_of_noise = not_more((p, q), (var_p + var_q) / cell**2)
         area += cell**2 * root / 4.0
         added += bend / 8.0
         # A triangle's area ½ |E₁ × E₂| moves with its sides E₁ = c (1, 0, p), E₂ = c (0, 1, q).
@@ -147,28 +150,32 @@ def surface_area(height: Array, own: Array, weight: Array, cell: float) -> Surfa
         slopes[corner] += to_right * by_first + to_up * by_second
         slopes[others[-to_right, to_up]] -= to_right * by_first
         slopes[others[to_right, -to_up]] -= to_up * by_second
-    added *= not_more(rough, noise)
+    added *= share_of_noise
     return SurfaceArea(area=area - added, added=added, slopes=slopes)
 
 
-def not_more(rough: Array, noise: Array) -> Array:
+def not_more(slopes: Sequence[Array], noise: Array) -> Array:
     """Share of the stated noise that there can be, where the surface is smoother than that.
 
     Sigmas of cells at ledges and of bridged ones are of what is there, not of differences between
-    neighbours: noise is not larger than the mean square that is measured around.
+    neighbours: noise is not larger than the scatter of slopes that is measured around.
 
     Args:
-        rough: (H, W) or (N,) measured squares of slopes; NaN where unknown.
-        noise: of it, what noise is stated to add.
+        slopes: (H, W) or (N,) of each direction; NaN where unknown.
+        noise: sum of the variances of the slopes, as stated.
     """
-    known = np.isfinite(rough + noise)
-    size = _AROUND if rough.ndim > 1 else _ALONG
-    around = [
-        uniform_filter(np.where(known, part, 0.0), size, mode="constant") for part in (rough, noise)
-    ]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.where(around[1] > 0, around[0] / around[1], 1.0)
-    return np.clip(share, 0.0, 1.0)
+    known = np.isfinite(sum(slopes) + noise)
+    size = _AROUND if noise.ndim > 1 else _ALONG
+
+    def around(part: Array) -> Array:
+        return np.asarray(uniform_filter(np.where(known, part, 0.0), size, mode="constant"))
+
+    here = np.maximum(around(np.ones_like(noise)), 1e-12)
+    scatter = sum(around(one**2) / here - (around(one) / here) ** 2 for one in slopes)
+    stated = around(noise) / here
+    share = np.where(stated > 0, scatter / np.where(stated > 0, stated, 1.0), 1.0)
+    # Half of it or more is what a small sample may show of noise as stated.
+    return np.asarray(np.where(share < _TOO_SMOOTH, np.maximum(share, 0.0), 1.0))
 
 
 def plan_slopes(weight: Array, cell: float) -> Array:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,7 +230,7 @@ def on_lattice(
     company = min(_COMPANY, len(shared.places))
     tree = KDTree(shared.places[:, :2])
 
-    def mean(field: Array, places: Array) -> Array:
+    def mean(field: NDArray[Any], places: Array) -> Array:
         near = np.asarray(tree.query(places, k=company)[1]).reshape(len(places), company)
         return np.asarray(field[near].mean(axis=1))
 

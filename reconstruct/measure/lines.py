@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,9 +78,44 @@ def measure_line(surface: Surface, vertices: Sequence[Sequence[float]]) -> tuple
     """
     found = profile(surface, vertices)
     ends = surface.known_at(as_places(vertices))
+    figures = _of_ends(surface, ends)
+    figures.insert(-3, surface_length(surface, found))
+    return tuple(figures)
+
+
+def measure_points(
+    surface: Surface, points: Sequence[Sequence[float]]
+) -> tuple[tuple[Figure, ...], tuple[str, ...]]:
+    """Figures of a line through points in space, such as of the mesh of a surface.
+
+    Args:
+        surface: whose errors the points share; a point has the own error of the surface there.
+        points: two or more: right (east), up (north) and out (height).
+
+    Returns:
+        Figures, and what a reader must know of them.
+
+    Raises:
+        ReconstructionError: fewer than two points.
+    """
+    given = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if len(given) < 2:
+        raise ReconstructionError("a line needs two points")
+    there = surface.at(given[:, :2])
+    apart = np.abs(there.height - given[:, 2]) > surface.grid.cell + 3.0 * there.sigma
+    unlike = int((apart | ~np.isfinite(there.height)).sum())
+    notes = () if not unlike else (
+        f"{unlike} of {len(given)} points are not on the elevation model (a wall, an overhang, a "
+        "filled gap): their own errors are not known, and not counted",
+    )  # fmt: skip
+    own = np.where(np.isfinite(there.own), there.own, 0.0)
+    ends = replace(there, height=given[:, 2], own=own)
+    return tuple(_of_ends(surface, ends)), notes
+
+
+def _of_ends(surface: Surface, ends: Samples) -> list[Figure]:
     figures = [
         of_points(surface, ends, "length", "Length, from vertex to vertex", polyline, 1),
-        surface_length(surface, found),
         of_points(surface, ends, "plan_length", "Length in plan", _plan_length, 1),
         of_points(
             surface, ends, "height_difference", "Height difference, end minus start", _rise, 1
@@ -90,7 +125,7 @@ def measure_line(surface: Surface, vertices: Sequence[Sequence[float]]) -> tuple
     if len(ends.places) > 2:
         direct = of_points(surface, ends, "straight", "Straight from start to end", _straight, 1)
         figures.insert(1, direct)
-    return tuple(figures)
+    return figures
 
 
 def surface_length(surface: Surface, line: Profile) -> Figure:
@@ -105,7 +140,7 @@ def surface_length(surface: Surface, line: Profile) -> Figure:
     lengths = np.linalg.norm(steps, axis=1)
     own, next_to = samples.own_covariances(0), samples.own_covariances(1)
     noise = np.maximum(own[:-1] + own[1:] - 2.0 * next_to, 0.0)
-    noise *= not_more(steps[:, 2] ** 2, noise)
+    noise *= not_more((steps[:, 2],), noise)
     added = noise * plan**2 / (2.0 * lengths**3)
     value = float((lengths - added).sum())
     slopes = np.zeros_like(samples.points)
@@ -122,9 +157,9 @@ def surface_length(surface: Surface, line: Profile) -> Figure:
     # measured heights count that twice: of a quadratic form q = nᵀAn they give 4 tr(AKAK) in the
     # mean, and its variance is 2 tr(AKAK).
     scatter = 2.0 * float((added**2).sum())
-    own = max(samples.own_variance(slopes) - scatter, scatter)
+    variance = max(samples.own_variance(slopes) - scatter, scatter)
     gathered = Slopes(surface.errors)
-    gathered.add(samples.places, slopes, own)
+    gathered.add(samples.places, slopes, variance)
     return figure(surface, name, title, value, gathered, 1)
 
 

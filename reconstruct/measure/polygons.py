@@ -127,7 +127,8 @@ class _Region:
             west + c * cell, north - (r + 1) * cell, west + (c + 1) * cell, north - r * cell
         )
         share[r, c] = shapely.area(shapely.intersection(boxes, self.polygon)) / cell**2
-        return share
+        found: Array = share
+        return found
 
     def add(self, slopes: Slopes, block: _Block, by_motion: Array) -> None:
         """Add a block's derivatives (rows, columns, 3)."""
@@ -155,7 +156,7 @@ class _Moments:
     @property
     def fit(self) -> Array:
         """(3,) height in the middle, and slopes to the right and up, of the plane that fits."""
-        return np.linalg.solve(self.second, self.heights)
+        return np.asarray(np.linalg.solve(self.second, self.heights), dtype=np.float64)
 
 
 def _upright(block: _Block) -> Array:
