@@ -152,9 +152,16 @@ class Slopes:
                 gathered[:, axis] += (upwards.T @ (part @ across)).ravel()
         self._own += own
 
-    def add_own(self, variance: float) -> None:
-        """Add variance by own errors alone."""
-        self._own += variance
+    def count_once(self, scatter: float) -> None:
+        """Own variance of a figure that noise enters as a square, too.
+
+        Derivatives at measured heights count that twice: of a quadratic form q = nᵀAn of noise of
+        covariance K their variance is 4 tr(AKAK) in the mean, and that of q is 2 tr(AKAK).
+
+        Args:
+            scatter: variance of the quadratic form.
+        """
+        self._own = max(self._own - scatter, scatter)
 
     def add_times(self, factor: float, other: "Slopes") -> None:
         """Add a figure times a factor; both know different own errors."""

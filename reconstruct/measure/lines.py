@@ -153,13 +153,9 @@ def surface_length(surface: Surface, line: Profile) -> Figure:
             name=name, title=title, value=math.nan, own=math.nan, shared=math.nan,
             unit=surface.unit,
         )  # fmt: skip
-    # What noise adds differs from draw to draw, as the square of a Gaussian number. Derivatives at
-    # measured heights count that twice: of a quadratic form q = nᵀAn they give 4 tr(AKAK) in the
-    # mean, and its variance is 2 tr(AKAK).
-    scatter = 2.0 * float((added**2).sum())
-    variance = max(samples.own_variance(slopes) - scatter, scatter)
     gathered = Slopes(surface.errors)
-    gathered.add(samples.places, slopes, variance)
+    gathered.add(samples.places, slopes, samples.own_variance(slopes))
+    gathered.count_once(2.0 * float((added**2).sum()))
     return figure(surface, name, title, value, gathered, 1)
 
 

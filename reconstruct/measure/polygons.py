@@ -307,7 +307,7 @@ class _Sums:
         self._by_volume = {name: Slopes(errors) for name in ("volume", "above", "below")}
         self._volume = dict.fromkeys(self._by_volume, 0.0)
         by_plane = {name: np.zeros(3) for name in self._by_volume}
-        lift = added = self.surface = 0.0
+        lift = added = scatter = self.surface = 0.0
         fit = moments.fit
         inverse = np.linalg.inv(moments.second)
         steep = float(np.hypot(fit[1], fit[2]))
@@ -321,8 +321,7 @@ class _Sums:
             self.surface += float(np.nansum(block.weight * np.nan_to_num(found.area)))
             added += float(np.nansum(block.weight * np.nan_to_num(found.added)))
             region.add(self.by_surface, block, found.slopes)
-            # counted twice by derivatives at measured heights (see `lines.surface_length`)
-            self.by_surface.add_own(-found.scatter(block.weight))
+            scatter += found.scatter(block.weight)
             region.add(self.by_area, block, plan_slopes(block.all_weight, cell))
             upright = _upright(block)
             weight = spread_to_cells(block.all_weight)
@@ -344,6 +343,7 @@ class _Sums:
                     middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], -1)
                     share = (block.weight * part)[..., None] * middles
                     by_plane[name] -= cell**2 * share.sum(axis=(0, 1))
+        self.by_surface.count_once(scatter)
         if rim is not None:
             for name, slopes in self._by_volume.items():
                 rim.moves(slopes, by_plane[name])
