@@ -1,5 +1,6 @@
 """Commands that show a survey: the report, and the server for what is too large for one page."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -53,6 +54,12 @@ def studio(
         Path | None,
         typer.Option(help="GeoTIFF, BAG or other raster, to lie under the survey."),
     ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="Tiles of a web map under it, with {z}, {x} and {y}: network."
+        ),
+    ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
@@ -65,4 +72,6 @@ def studio(
     """
     from alice_survey.studio.server import run_studio
 
-    run_studio(workspace, port, browser=browser, show=typer.echo, chart=chart)
+    run_studio(
+        workspace, port, browser=browser, show=typer.echo, chart=chart, background=background
+    )

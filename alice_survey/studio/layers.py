@@ -119,9 +119,11 @@ class Pyramid:
             if self._crs is None:
                 yield raster
                 return
-            has_mask = raster.nodata is not None or raster.count == 4
+            unknown: dict[str, Any] = {"nodata": np.nan, "dtype": "float32"}
+            if self.numbers is None:
+                unknown = {"add_alpha": raster.count < 4}
             with WarpedVRT(
-                raster, crs=self._crs, resampling=Resampling.bilinear, add_alpha=not has_mask
+                raster, crs=self._crs, resampling=Resampling.bilinear, **unknown
             ) as warped:
                 yield warped
 

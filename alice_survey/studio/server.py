@@ -72,7 +72,13 @@ class Server:
     """Serves one workspace until it is shut down."""
 
     def __init__(
-        self, folder: Path, port: int = 0, *, log: str | None = None, chart: Path | None = None
+        self,
+        folder: Path,
+        port: int = 0,
+        *,
+        log: str | None = None,
+        chart: Path | None = None,
+        background: str | None = None,
     ) -> None:
         """Listen.
 
@@ -81,6 +87,7 @@ class Server:
             port: 0 for any that is free.
             log: where the navigation of a dive comes from.
             chart: raster to lie under the survey.
+            background: address of a web map's tiles to lie under it.
 
         Raises:
             WorkspaceError: the port is not available, or the chart cannot be shown.
@@ -91,6 +98,7 @@ class Server:
             layers=Layers(workspace, None if chart is None else check_chart(chart)),
             token=secrets.token_urlsafe(24),
             log=log,
+            background=background,
         )
         try:
             self.socket = socket.create_server((ADDRESS, port), backlog=128)
@@ -161,6 +169,7 @@ def run_studio(
     show: Callable[[str], Any],
     log: str | None = None,
     chart: Path | None = None,
+    background: str | None = None,
 ) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
@@ -171,11 +180,12 @@ def run_studio(
         show: prints a line.
         log: where the navigation of a dive comes from.
         chart: raster to lie under the survey.
+        background: address of a web map's tiles to lie under it.
 
     Raises:
         WorkspaceError: the port is taken, or the chart cannot be shown.
     """
-    server = Server(workspace, port, log=log, chart=chart)
+    server = Server(workspace, port, log=log, chart=chart, background=background)
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:

@@ -51,6 +51,7 @@ class _Shell:
             "datum": None if datum is None else [datum.latitude_deg, datum.longitude_deg],
             "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},
             "log": self.studio.log,
+            "background": self.studio.background,
             "tabs": [name for name in TABS if (web / f"{name}.js").is_file()],
         }
 
