@@ -31,9 +31,9 @@ _READ = (*RASTERS, "mosaic/mosaic_source.tif", "sparse/frame.json", "sparse/cova
 """Files that figures are of."""
 _MOST_DRAWN = 1200
 """Samples of a profile that a page draws."""
-_OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces over each other", ""),
+_OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", ""),
          "dense/lower.tif": ("Lowest surface", None),
-         "mosaic/coverage.tif": ("Pictures in the mosaic's coverage", ""),
+         "mosaic/coverage.tif": ("Pictures", ""),
          MOSAIC: ("Colour", "red, green, blue")}  # fmt: skip
 """Titles and units of rasters that are no layers of numbers; None is the unit of lengths."""
 
@@ -141,7 +141,7 @@ class _Model:
         for file, values in found.items():
             if file in numbers:
                 one = numbers[file]
-                title, what = one.title, one.label.partition(", ")[2]
+                title, what = one.title, one.label.partition(", ")[2].replace("degrees", "°")
                 value: Any = one.factor * values[0]
             else:
                 title, what = (
