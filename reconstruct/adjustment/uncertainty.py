@@ -57,7 +57,6 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 from reconstruct.views.model_files import as_transform
 
-
 _MOST_PLACES = 2000
 """Places at most at which the motions that points share are kept: they are smooth."""
 

@@ -126,13 +126,13 @@ def surface_area(height: Array, own: Array, weight: Array, cell: float) -> Surfa
         root = np.sqrt(1.0 + p**2 + q**2)
         # this corner, and the ends of the square's sides that meet in it
         here = sigma[to_right, to_up]
-        beside, below = sigma[-to_right, to_up], sigma[to_right, -to_up]
-        var_p = variances[here] + variances[beside] - 2 * _NEXT * roots[here] * roots[beside]
+        aside, below = sigma[-to_right, to_up], sigma[to_right, -to_up]
+        var_p = variances[here] + variances[aside] - 2 * _NEXT * roots[here] * roots[aside]
         var_q = variances[here] + variances[below] - 2 * _NEXT * roots[here] * roots[below]
         cov = (
             variances[here]
-            - _NEXT * roots[here] * (roots[beside] + roots[below])
-            + _ACROSS * roots[beside] * roots[below]
+            - _NEXT * roots[here] * (roots[aside] + roots[below])
+            + _ACROSS * roots[aside] * roots[below]
         )
         # p and q have the sign of the corner that is to the right, or up
         cov = cov * (to_right * to_up)

@@ -79,6 +79,12 @@ class SharedErrors:
         weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
         return nodes, weights
 
+    def motions_at(self, places: Array) -> Array:
+        """Motions (N, 3, K) of (N, 2) places."""
+        nodes, weights = self.around(places)
+        flat = self.motions.reshape(self.nodes, 3, -1)
+        return np.asarray(np.einsum("na,naik->nik", weights, flat[nodes]))
+
     def variance_of_heights(self, places: Array) -> Array:
         """Variances (N,) of the heights of (N, 2) places by what they share."""
         nodes, weights = self.around(places)
@@ -118,7 +124,7 @@ class Variance:
         return float(np.sqrt(self.own + self.shared))
 
 
-class Slopes:
+class FigureSlopes:
     """Derivatives of a figure with respect to the surface's motions, gathered part by part."""
 
     def __init__(self, errors: SharedErrors) -> None:
@@ -163,7 +169,7 @@ class Slopes:
         """
         self._own = max(self._own - scatter, scatter)
 
-    def add_times(self, factor: float, other: "Slopes") -> None:
+    def add_times(self, factor: float, other: "FigureSlopes") -> None:
         """Add a figure times a factor; both know different own errors."""
         self._smooth += factor * other._smooth
         self._near += factor * other._near
@@ -206,7 +212,6 @@ def shared_errors(
         notes.append("not counted: the model has no scale, figures are in its own units")
     elif scale > 0.0:
         notes.append(f"counted: the scale of navigation, sigma {scale:.2g}")
-    notes.append("not counted: how well a place was picked on the map")
     return replace(found, scale_sigma=scale, notes=tuple(notes))
 
 

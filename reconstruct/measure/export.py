@@ -27,7 +27,7 @@ class Measurement:
     places: Sequence[Sequence[float]]
     """Right (east) and up (north), of points in space also out (height)."""
     figures: Sequence[Mapping[str, Any]]
-    """As `Figure.to_json`; values that are not known are None."""
+    """As `Measured.to_json`; values that are not known are None."""
     notes: Sequence[str] = ()
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.frames import Array
-from reconstruct.measure.errors import Slopes
-from reconstruct.measure.surface import Samples, Surface
+from reconstruct.measure.errors import FigureSlopes
+from reconstruct.measure.surface import MeasuredSurface, Samples
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figure:
+class Measured:
     """A figure and how well it is known."""
 
     name: str
@@ -37,9 +37,9 @@ class Figure:
 
 
 def figure(
-    surface: Surface, name: str, title: str, value: float, slopes: Slopes, power: int,
+    surface: MeasuredSurface, name: str, title: str, value: float, slopes: FigureSlopes, power: int,
     unit: str | None = None,
-) -> Figure:  # fmt: skip
+) -> Measured:  # fmt: skip
     """A figure of a surface.
 
     Args:
@@ -54,7 +54,7 @@ def figure(
     found = slopes.variance
     scale = power * value * surface.errors.scale_sigma
     lengths = surface.unit + ("", "", "²", "³")[power] if power else ""
-    return Figure(
+    return Measured(
         name=name, title=title, value=value, own=math.sqrt(found.own),
         shared=math.hypot(math.sqrt(found.shared), scale),
         unit=lengths if unit is None else unit,
@@ -76,12 +76,12 @@ def slopes_of(value: Callable[[Array], float], points: Array) -> Array:
 
 
 def of_points(
-    surface: Surface, samples: Samples, name: str, title: str, value: Callable[[Array], float],
-    power: int, unit: str | None = None,
-) -> Figure:  # fmt: skip
+    surface: MeasuredSurface, samples: Samples, name: str, title: str,
+    value: Callable[[Array], float], power: int, unit: str | None = None,
+) -> Measured:  # fmt: skip
     """A figure of points of a surface, which is a function of their coordinates."""
     centred = samples.points - samples.points.mean(axis=0)
-    slopes, gathered = slopes_of(value, centred), Slopes(surface.errors)
+    slopes, gathered = slopes_of(value, centred), FigureSlopes(surface.errors)
     gathered.add(samples.places, slopes, samples.own_variance(slopes))
     return figure(surface, name, title, value(centred), gathered, power, unit)
 

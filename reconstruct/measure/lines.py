@@ -9,21 +9,21 @@ import numpy as np
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from reconstruct.measure.cells import not_more
-from reconstruct.measure.errors import Slopes
+from reconstruct.measure.errors import FigureSlopes
 from reconstruct.measure.figures import (
-    Figure,
+    Measured,
     as_places,
     figure,
     of_points,
     polyline,
 )
-from reconstruct.measure.surface import Samples, Surface
+from reconstruct.measure.surface import MeasuredSurface, Samples
 
 _MOST_SAMPLES = 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Profile:
+class SurfaceProfile:
     """Heights along a line."""
 
     samples: Samples
@@ -33,7 +33,7 @@ class Profile:
     """Samples that are the line's vertices."""
 
 
-def profile(surface: Surface, vertices: Sequence[Sequence[float]]) -> Profile:
+def profile(surface: MeasuredSurface, vertices: Sequence[Sequence[float]]) -> SurfaceProfile:
     """Heights along a line, a cell apart or less.
 
     Args:
@@ -59,14 +59,16 @@ def profile(surface: Surface, vertices: Sequence[Sequence[float]]) -> Profile:
     ]
     places = np.concatenate([*parts, corners[-1:]])
     along = np.concatenate([[0.0], np.cumsum(np.repeat(sides / steps, steps))])
-    return Profile(
+    return SurfaceProfile(
         samples=surface.at(places),
         along=along,
         corners=(0, *np.cumsum(steps).tolist()),
     )
 
 
-def measure_line(surface: Surface, vertices: Sequence[Sequence[float]]) -> tuple[Figure, ...]:
+def measure_line(
+    surface: MeasuredSurface, vertices: Sequence[Sequence[float]]
+) -> tuple[Measured, ...]:
     """Figures of a line through places of a surface.
 
     Args:
@@ -84,8 +86,8 @@ def measure_line(surface: Surface, vertices: Sequence[Sequence[float]]) -> tuple
 
 
 def measure_points(
-    surface: Surface, points: Sequence[Sequence[float]]
-) -> tuple[tuple[Figure, ...], tuple[str, ...]]:
+    surface: MeasuredSurface, points: Sequence[Sequence[float]]
+) -> tuple[tuple[Measured, ...], tuple[str, ...]]:
     """Figures of a line through points in space, such as of the mesh of a surface.
 
     Args:
@@ -113,7 +115,7 @@ def measure_points(
     return tuple(_of_ends(surface, ends)), notes
 
 
-def _of_ends(surface: Surface, ends: Samples) -> list[Figure]:
+def _of_ends(surface: MeasuredSurface, ends: Samples) -> list[Measured]:
     figures = [
         of_points(surface, ends, "length", "Length, from vertex to vertex", polyline, 1),
         of_points(surface, ends, "plan_length", "Length in plan", _plan_length, 1),
@@ -128,7 +130,7 @@ def _of_ends(surface: Surface, ends: Samples) -> list[Figure]:
     return figures
 
 
-def surface_length(surface: Surface, line: Profile) -> Figure:
+def surface_length(surface: MeasuredSurface, line: SurfaceProfile) -> Measured:
     """Length along the surface; NaN where a part of it is unknown.
 
     A step of length t in plan and a rise r is L = √(t² + r²) long. Noise of variance v in the rise
@@ -149,11 +151,11 @@ def surface_length(surface: Surface, line: Profile) -> Figure:
     slopes[1:] += along
     name, title = "surface_length", "Length along the surface"
     if not math.isfinite(value):
-        return Figure(
+        return Measured(
             name=name, title=title, value=math.nan, own=math.nan, shared=math.nan,
             unit=surface.unit,
         )  # fmt: skip
-    gathered = Slopes(surface.errors)
+    gathered = FigureSlopes(surface.errors)
     gathered.add(samples.places, slopes, samples.own_variance(slopes))
     gathered.count_once(2.0 * float((added**2).sum()))
     return figure(surface, name, title, value, gathered, 1)

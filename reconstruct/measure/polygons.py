@@ -22,9 +22,9 @@ from reconstruct.measure.cells import (
     spread_to_cells,
     surface_area,
 )
-from reconstruct.measure.errors import REACH_CELLS, Slopes
-from reconstruct.measure.figures import Figure, as_places, figure, of_points, plan_area, polyline
-from reconstruct.measure.surface import Samples, Surface
+from reconstruct.measure.errors import REACH_CELLS, FigureSlopes
+from reconstruct.measure.figures import Measured, as_places, figure, of_points, plan_area, polyline
+from reconstruct.measure.surface import MeasuredSurface, Samples
 
 _BLOCK_CELLS = 512
 _RIM = REACH_CELLS + 1
@@ -60,13 +60,13 @@ class Quadrat:
     """A square of the sea floor and its figures."""
 
     vertices: tuple[tuple[float, float], ...]
-    figures: tuple[Figure, ...]
+    figures: tuple[Measured, ...]
 
 
 class _Region:
     """A polygon on a surface."""
 
-    def __init__(self, surface: Surface, polygon: Any) -> None:
+    def __init__(self, surface: MeasuredSurface, polygon: Any) -> None:
         self.surface, self.polygon = surface, polygon
         centre = polygon.centroid
         self.middle = np.array([centre.x, centre.y])
@@ -130,7 +130,7 @@ class _Region:
         found: Array = share
         return found
 
-    def add(self, slopes: Slopes, block: _Block, by_motion: Array) -> None:
+    def add(self, slopes: FigureSlopes, block: _Block, by_motion: Array) -> None:
         """Add a block's derivatives (rows, columns, 3)."""
         own = own_variance(by_motion[..., 2], block.own, block.core)
         east, north = (
@@ -182,8 +182,8 @@ def _moments(region: _Region) -> _Moments:
 
 
 def measure_polygon(
-    surface: Surface, vertices: Sequence[Sequence[float]], base: Base | None = "rim"
-) -> tuple[tuple[Figure, ...], tuple[str, ...]]:
+    surface: MeasuredSurface, vertices: Sequence[Sequence[float]], base: Base | None = "rim"
+) -> tuple[tuple[Measured, ...], tuple[str, ...]]:
     """Figures of the surface within a polygon.
 
     Args:
@@ -232,7 +232,7 @@ def _outline(points: Array) -> float:
     return polyline(points[:, :2])
 
 
-def _ring(surface: Surface, places: Array) -> Samples:
+def _ring(surface: MeasuredSurface, places: Array) -> Samples:
     """Corners and the first again; own errors count where heights are known."""
     found = surface.picked(np.concatenate([places, places[:1]]))
     known = np.isfinite(found.height)
@@ -265,7 +265,7 @@ class _Rim:
         self._samples, self._by_height = samples, by_height
 
     @classmethod
-    def of(cls, surface: Surface, region: _Region, base: Base) -> "_Rim":
+    def of(cls, surface: MeasuredSurface, region: _Region, base: Base) -> "_Rim":
         """At a height, or fitted to the rim."""
         if base != "rim":
             return cls(np.array([float(base), 0.0, 0.0]), None, np.zeros((3, 0)))
@@ -286,7 +286,7 @@ class _Rim:
         by_height = np.linalg.pinv(np.column_stack([np.ones(len(x)), x, y]))
         return cls(by_height @ samples.height, samples, by_height)
 
-    def moves(self, slopes: Slopes, by_plane: Array) -> None:
+    def moves(self, slopes: FigureSlopes, by_plane: Array) -> None:
         """Add to a figure what moves the plane, from derivatives (3,) by its parameters."""
         if self._samples is None:
             return
@@ -302,9 +302,9 @@ class _Sums:
         surface = self._surface = region.surface
         errors, cell = surface.errors, surface.grid.cell
         self._moments, self._rim = moments, rim
-        self.by_surface, self.by_area, self.by_mean = (Slopes(errors) for _ in range(3))
-        self._by_slopes = [Slopes(errors) for _ in range(2)]
-        self._by_volume = {name: Slopes(errors) for name in ("volume", "above", "below")}
+        self.by_surface, self.by_area, self.by_mean = (FigureSlopes(errors) for _ in range(3))
+        self._by_slopes = [FigureSlopes(errors) for _ in range(2)]
+        self._by_volume = {name: FigureSlopes(errors) for name in ("volume", "above", "below")}
         self._volume = dict.fromkeys(self._by_volume, 0.0)
         by_plane = {name: np.zeros(3) for name in self._by_volume}
         lift = added = scatter = self.surface = 0.0
@@ -352,15 +352,15 @@ class _Sums:
         self.noise = added / moments.area
 
     @property
-    def rugosity(self) -> Figure:
+    def rugosity(self) -> Measured:
         """Surface over plan area."""
-        ratio, both = self.surface / self._moments.area, Slopes(self._surface.errors)
+        ratio, both = self.surface / self._moments.area, FigureSlopes(self._surface.errors)
         both.add_times(1.0 / self._moments.area, self.by_surface)
         both.add_times(-ratio / self._moments.area, self.by_area)
         return figure(self._surface, "rugosity", "Rugosity, surface over plan", ratio, both, 0)
 
     @property
-    def slope(self) -> tuple[Figure, Figure]:
+    def slope(self) -> tuple[Measured, Measured]:
         """Steepness of the plane that fits best, and the direction down it."""
         down = math.degrees(math.atan2(-self._fit[1], -self._fit[2])) % 360.0
         steep = math.degrees(math.atan(self._steep))
@@ -373,7 +373,7 @@ class _Sums:
         return first, second
 
     @property
-    def volumes(self) -> tuple[Figure, ...]:
+    def volumes(self) -> tuple[Measured, ...]:
         """Volume over the plane, and its parts above and below, which noise near it lifts."""
         if self._rim is None:
             return ()
@@ -383,7 +383,7 @@ class _Sums:
         for name, title in titles.items():
             one = figure(self._surface, name, title, self._volume[name], self._by_volume[name], 3)
             if name != "volume":
-                one = Figure(**{**vars(one), "own": math.hypot(one.own, self._lift)})
+                one = Measured(**{**vars(one), "own": math.hypot(one.own, self._lift)})
             found.append(one)
         return tuple(found)
 
@@ -396,7 +396,7 @@ def _by_height(slopes: Array) -> Array:
 
 
 def quadrats(
-    surface: Surface, vertices: Sequence[Sequence[float]], side: float
+    surface: MeasuredSurface, vertices: Sequence[Sequence[float]], side: float
 ) -> tuple[Quadrat, ...]:
     """Areas and rugosity of the squares that at least half lie within a polygon.
 

@@ -25,6 +25,7 @@ RASTERS = (
     "dense/surfaces.tif", "dense/lower.tif", "evaluation/error.tif", "mosaic/coverage.tif", MOSAIC,
 )  # fmt: skip
 """Rasters that a place has values in."""
+_PICKING = "not counted: how well a place was picked on the map"
 _WINDOW_CELLS = 1024
 """Cells along the side of what is read at once."""
 
@@ -79,7 +80,7 @@ class Samples:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
+class MeasuredSurface:
     """The DEM of a workspace with its sigmas; nothing of it is held."""
 
     workspace: Path
@@ -92,7 +93,7 @@ class Surface:
     errors: SharedErrors
 
     @classmethod
-    def of(cls, workspace: Path) -> "Surface":
+    def of(cls, workspace: Path) -> "MeasuredSurface":
         """Of a workspace.
 
         Raises:
@@ -103,6 +104,7 @@ class Surface:
         plane, grid = read_plane(dense), grid_of(dense / "dem.tif")
         east, south = grid.east_of(grid.columns), grid.north_of(grid.rows)
         bounds = (grid.west, float(south), float(east), grid.north)
+        errors = shared_errors(workspace, plane, frame, bounds)
         return cls(
             workspace=workspace,
             dem=dense / "dem.tif",
@@ -110,7 +112,7 @@ class Surface:
             grid=grid,
             frame=frame,
             plane=plane,
-            errors=shared_errors(workspace, plane, frame, bounds),
+            errors=replace(errors, notes=(*errors.notes, _PICKING)),
         )
 
     @property

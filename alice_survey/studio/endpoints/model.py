@@ -18,10 +18,10 @@ from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.studio.layers import ChangedError
 from reconstruct.measure.errors import SharedErrors
 from reconstruct.measure.export import Measurement, as_csv, as_geojson
-from reconstruct.measure.figures import Figure
+from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, measure_points, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
-from reconstruct.measure.surface import MOSAIC, RASTERS, Surface, values_at
+from reconstruct.measure.surface import MOSAIC, RASTERS, MeasuredSurface, values_at
 
 _MOST_PLACES = 2000
 _MOST_MEASURES = 1000
@@ -37,8 +37,7 @@ _OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", 
          MOSAIC: ("Colour", "red, green, blue")}  # fmt: skip
 """Titles and units of rasters that are no layers of numbers; None is the unit of lengths."""
 
-Number = float
-Place = tuple[Number, Number]
+Place = tuple[float, float]
 
 
 class _Asked(BaseModel):
@@ -55,7 +54,7 @@ class AskedMeasure(_Asked):
     """A line, points in space, or a polygon."""
 
     kind: Literal["line", "points", "polygon"]
-    places: list[tuple[Number, ...]] = Field(min_length=2, max_length=_MOST_PLACES)
+    places: list[tuple[float, ...]] = Field(min_length=2, max_length=_MOST_PLACES)
     base: float | Literal["rim"] | None = None
     """Plane of a polygon's volume."""
     quadrat: float | None = Field(None, gt=0)
@@ -79,7 +78,7 @@ class ExportedMeasure(_Asked):
 
     name: str = Field(max_length=200)
     kind: Literal["line", "points", "polygon"]
-    places: list[tuple[Number, ...]] = Field(min_length=1, max_length=_MOST_PLACES)
+    places: list[tuple[float, ...]] = Field(min_length=1, max_length=_MOST_PLACES)
     figures: list[ExportedFigure] = Field(max_length=100)
     notes: list[str] = Field(default=[], max_length=20)
 
@@ -96,11 +95,11 @@ class _Model:
         self.studio = studio
         self._cached = lru_cache(maxsize=1)(self._opened)
 
-    def _opened(self, _state: tuple[str, ...]) -> Surface:
-        return Surface.of(self.studio.workspace.folder)
+    def _opened(self, _state: tuple[str, ...]) -> MeasuredSurface:
+        return MeasuredSurface.of(self.studio.workspace.folder)
 
     @contextmanager
-    def _surface(self) -> Iterator[Surface]:
+    def _surface(self) -> Iterator[MeasuredSurface]:
         """The surface as it is now; what is replaced meanwhile is the page's to load again."""
         workspace = self.studio.workspace
         before = self._state()
@@ -144,10 +143,8 @@ class _Model:
                 title, what = one.title, one.label.partition(", ")[2].replace("degrees", "°")
                 value: Any = one.factor * values[0]
             else:
-                title, what = (
-                    _OTHERS[file][0],
-                    unit if _OTHERS[file][1] is None else _OTHERS[file][1],
-                )
+                title, other = _OTHERS[file]
+                what = unit if other is None else other
                 value = [round(v) for v in values] if file == MOSAIC else values[0]
             rows.append({"file": file, "title": title, "value": value, "unit": what})
         height, sigma = (found.get(f"dense/{name}.tif") for name in ("dem", "sigma"))
@@ -199,7 +196,7 @@ class _Model:
             raise AliceError(f"the request: places of {asked.kind!r} have {size} numbers")
         notes: tuple[str, ...] = ()
         squares: list[dict[str, Any]] = []
-        figures: tuple[Figure, ...]
+        figures: tuple[Measured, ...]
         with self._surface() as surface:
             if asked.kind == "line":
                 figures = measure_line(surface, asked.places)

@@ -94,7 +94,7 @@ def measured(page: Any, count: int) -> list[dict[str, Any]]:
 def test_lengths_areas_and_exports(tmp_path: Path) -> None:
     with opened(with_mesh(tmp_path / "reef")) as (page, _):
         page.locator(MAP).hover(position=at(page, 0.4, 0.6))
-        page.locator(".under", has_text="Sigma of height").wait_for(timeout=10_000)
+        page.locator(".under", has_text="Sigma").wait_for(timeout=10_000)
         page.locator("#map-readout", has_text="height −9.").wait_for(timeout=10_000)
 
         page.get_by_role("button", name="Length", exact=True).click()

@@ -9,7 +9,7 @@ import numpy as np
 from alice_survey.base.frames import Array
 from reconstruct.adjustment.uncertainty import SharedMotions
 from reconstruct.measure.errors import on_lattice, own_correlation
-from reconstruct.measure.surface import Surface
+from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import WorldFrame
@@ -77,20 +77,20 @@ class Drawn:
         found[:, 2, 4] = s.bend * (x**2 + y**2) / half**2
         return found
 
-    def surface(self, heights: Array) -> Surface:
+    def surface(self, heights: Array) -> MeasuredSurface:
         dem = write(self._folder / "dem.tif", self.cells, heights)
         sigma = write(self._folder / "sigma.tif", self.cells, self._sigma)
-        return Surface(
+        return MeasuredSurface(
             workspace=self._folder, dem=dem, sigma=sigma, grid=self.cells, frame=FRAME,
             plane=LEVEL_PLANE, errors=self.errors,
         )  # fmt: skip
 
     @property
-    def true(self) -> Surface:
+    def true(self) -> MeasuredSurface:
         """The true heights, with the sigmas of a measured surface."""
         return self.surface(self.truth(self._x, self._y))
 
-    def draw(self, rng: np.random.Generator) -> tuple[Surface, Callable[[Array], Array]]:
+    def draw(self, rng: np.random.Generator) -> tuple[MeasuredSurface, Callable[[Array], Array]]:
         """A measured surface, and where a place on the truth is found in it."""
         sizes = rng.normal(size=5)
 
@@ -111,10 +111,10 @@ class Drawn:
         return self.surface(shared + self._sigmas.own * own), moved
 
 
-def without_errors(folder: Path, cells: DemGrid, truth: Heights) -> Surface:
+def without_errors(folder: Path, cells: DemGrid, truth: Heights) -> MeasuredSurface:
     return Drawn(folder, cells, truth, Sigmas()).true
 
 
-def scaled(surface: Surface, sigma: float) -> Surface:
+def scaled(surface: MeasuredSurface, sigma: float) -> MeasuredSurface:
     """The same with a scale that is known apart."""
     return replace(surface, errors=replace(surface.errors, scale_sigma=sigma))

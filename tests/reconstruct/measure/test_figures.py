@@ -10,17 +10,17 @@ from scipy.special import ellipe
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
-from reconstruct.measure.figures import Figure
+from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
-from reconstruct.measure.surface import Surface
+from reconstruct.measure.surface import MeasuredSurface
 from tests.reconstruct.measure.synthetic import Drawn, Sigmas, grid, scaled, without_errors
 
 SQUARE = [(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)]
 SLANTED = [(-0.41, -0.32), (0.33, -0.4), (0.4, 0.21), (0.02, 0.43), (-0.35, 0.3)]
 
 
-def named(figures: Sequence[Figure]) -> dict[str, Figure]:
+def named(figures: Sequence[Measured]) -> dict[str, Measured]:
     return {figure.name: figure for figure in figures}
 
 
@@ -217,7 +217,7 @@ def test_what_is_unknown_is_said(tmp_path: Path) -> None:
 def test_parts_of_a_large_polygon_add_up(tmp_path: Path) -> None:
     """More blocks than one, against the same polygon cut in two."""
     drawn = Drawn(tmp_path, grid(12.0, 0.02), hills, Sigmas(own=0.001))
-    surface: Surface = drawn.draw(np.random.default_rng(1))[0]
+    surface: MeasuredSurface = drawn.draw(np.random.default_rng(1))[0]
     left = [(-5.5, -3.0), (0.105, -3.0), (0.105, -1.0), (-5.5, -1.0)]
     right = [(0.105, -3.0), (5.5, -3.0), (5.5, -1.0), (0.105, -1.0)]
     whole = [left[0], right[1], right[2], left[3]]

@@ -13,7 +13,7 @@ from camera_calib.rig import read_rig
 from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.measure.lines import measure_line
 from reconstruct.measure.sight import SOURCE
-from reconstruct.measure.surface import Surface
+from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import read_model
 
@@ -67,7 +67,7 @@ def test_lengths_are_as_wrong_as_their_sigmas_say(small_survey: Path) -> None:
 
 def length_errors(workspace: Path, rng: np.random.Generator) -> tuple[Array, Array]:
     """(200, 2) errors and sigmas of lengths, and the same of height differences."""
-    surface, truth = Surface.of(workspace), TrueSpots(workspace)
+    surface, truth = MeasuredSurface.of(workspace), TrueSpots(workspace)
     grid = surface.grid
     inside = surface.window(0, 0, grid.rows, grid.columns)[0]
     rows, columns = np.nonzero(np.isfinite(inside))
