@@ -3,7 +3,7 @@
 import contextlib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,8 +35,10 @@ def taken_from(path: Path) -> Iterator[None]:
         ) from None
 
 
-def read_arrays(path: Path, *names: str) -> "dict[str, NDArray[np.generic]]":
-    """Arrays of an `.npz` file.
+def read_arrays(
+    path: Path, *names: str, optional: Sequence[str] = ()
+) -> "dict[str, NDArray[np.generic]]":
+    """Arrays of an `.npz` file; of optional ones those that are there.
 
     Raises:
         WorkspaceError: it is missing or damaged, or lacks one.
@@ -45,7 +47,8 @@ def read_arrays(path: Path, *names: str) -> "dict[str, NDArray[np.generic]]":
 
     try:
         with np.load(path) as data:
-            return {name: data[name] for name in names}
+            there = [name for name in optional if name in data]
+            return {name: data[name] for name in (*names, *there)}
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     except (KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:

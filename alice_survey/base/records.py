@@ -255,6 +255,8 @@ class GeoreferenceRecord(JsonRecord):
     sigma_tilt_deg: float | None
     scale_of_navigation: float | None = None
     scale_of_navigation_sigma: float | None = None
+    sigma_scale: float = 0.0
+    """Sigma of the logarithm of the scale that navigation gave; 0 where it is held."""
     mount: MountRecord | None = None
 
 

@@ -1,12 +1,15 @@
-/* The report's mesh: drawn only when something changed, and only once it was scrolled to. */
+/* The mesh of pages and of the studio: drawn only when something changed. */
 
 const TURN = Math.PI / 24;
 const NEARER = 1.2;
 const FILLED = 0.9;
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
-/* East is x, up is y, south is z. */
-async function startMesh(root, canvas) {
+/* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where it
+   is seen from, `lost` is called when the browser takes its graphics memory back. Returns what moves
+   it, `pick`: the point under a pixel of the canvas or null, and `mark`: show some points and the
+   lines between. */
+async function startMesh(root, canvas, bytes, {told, lost}) {
   const view = canvas.parentElement;
   const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
   renderer.setPixelRatio(Math.min(2, window.devicePixelRatio || 1));
@@ -15,7 +18,7 @@ async function startMesh(root, canvas) {
   const lamp = new three.DirectionalLight(0xffffff, 2.6);
   scene.add(new three.HemisphereLight(0xffffff, 0x8c98a0, 1.1), lamp, lamp.target);
 
-  const model = (await parse(await bytesOf("mesh-glb"))).scene;
+  const model = (await parse(bytes)).scene;
   scene.add(model);
   const box = new three.Box3().setFromObject(model);
   const ball = box.getBoundingSphere(new three.Sphere());
@@ -58,9 +61,9 @@ async function startMesh(root, canvas) {
     canvas.dataset.azimuth = compass.toFixed(3);
     canvas.dataset.above = above.toFixed(3);
     canvas.dataset.distance = from.radius.toPrecision(6);
-    document.getElementById("mesh-readout").textContent = above > 88
+    told(above > 88
       ? "Seen from above"
-      : "Seen from the " + WINDS[Math.round(compass / 45) % 8] + ", " + Math.round(above) + "° above the horizon";
+      : "Seen from the " + WINDS[Math.round(compass / 45) % 8] + ", " + Math.round(above) + "° above the horizon");
   }
 
   function turn(around, over, farther = 1) {
@@ -104,6 +107,35 @@ async function startMesh(root, canvas) {
     draw();
   }
 
+  const caster = new three.Raycaster();
+  function pick(x, y) {
+    const {clientWidth: width, clientHeight: height} = canvas;
+    caster.setFromCamera(new three.Vector2(2 * x / width - 1, 1 - 2 * y / height), camera);
+    return caster.intersectObject(model, true)[0]?.point || null;
+  }
+
+  /* Seen through what is before them. */
+  let marks = [];
+  function mark(points, colour) {
+    marks.forEach((one) => scene.remove(one));
+    const dot = new three.SphereGeometry(ball.radius * 0.008, 12, 8);
+    const paint = new three.MeshBasicMaterial({color: colour, depthTest: false});
+    marks = points.map((point) => {
+      const one = new three.Mesh(dot, paint);
+      one.position.copy(point);
+      return one;
+    });
+    if (points.length > 1) {
+      const line = new three.BufferGeometry().setFromPoints(points);
+      marks.push(new three.Line(line, new three.LineBasicMaterial({color: colour, depthTest: false})));
+    }
+    marks.forEach((one) => {
+      one.renderOrder = 1;
+      scene.add(one);
+    });
+    draw();
+  }
+
   const acts = {
     left: () => turn(-TURN, 0), right: () => turn(TURN, 0),
     up: () => turn(0, -TURN), down: () => turn(0, TURN),
@@ -136,7 +168,8 @@ async function startMesh(root, canvas) {
     placed = true;
     reset();
   }).observe(view);
-  canvas.addEventListener("webglcontextlost", () => showStill(root, "The browser took its graphics memory back: this is a still picture."));
+  canvas.addEventListener("webglcontextlost", lost);
+  return {pick, mark, reset, draw, vector: (x, y, z) => new three.Vector3(x, y, z)};
 }
 
 /* What the page holds, or its server gives. */
@@ -185,7 +218,9 @@ function awaitMesh() {
   const watch = new IntersectionObserver((entries) => {
     if (!entries.some((entry) => entry.isIntersecting)) return;
     watch.disconnect();
-    startMesh(root, canvas).then(() => { root.dataset.ready = ""; }, (fault) => {
+    const told = (text) => { document.getElementById("mesh-readout").textContent = text; };
+    const lost = () => showStill(root, "The browser took its graphics memory back: this is a still picture.");
+    bytesOf("mesh-glb").then((bytes) => startMesh(root, canvas, bytes, {told, lost})).then(() => { root.dataset.ready = ""; }, (fault) => {
       showStill(root, "The mesh cannot be shown here (" + fault.message + "): this is a still picture.");
       throw fault;
     });
@@ -193,4 +228,4 @@ function awaitMesh() {
   watch.observe(root);
 }
 
-awaitMesh();
+if (document.getElementById("mesh-glb")) awaitMesh();

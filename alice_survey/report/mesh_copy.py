@@ -37,7 +37,8 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     whole = mesh.triangles <= _MOST_TRIANGLES
     if not whole and not held.has("mosaic"):
         return None
-    scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held)
+    offset = np.array(mesh.offset_east_north_up)
+    scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held, offset)
     glb.write_bytes(scene.export(file_type="glb"))
     return Mesh(
         glb=glb,
@@ -86,8 +87,8 @@ def _shrunk(path: Path) -> Any:
     return scene
 
 
-def _relief(held: Held) -> Any:
-    """The elevation model as triangles under the mosaic."""
+def _relief(held: Held, offset: Array) -> Any:
+    """The elevation model as triangles under the mosaic, from the origin of the mesh."""
     import trimesh
     from PIL import Image
 
@@ -96,6 +97,7 @@ def _relief(held: Held) -> Any:
     east = cell.c + cell.a * (np.arange(columns) + 0.5)
     north = cell.f + cell.e * (np.arange(rows) + 0.5)
     points, faces, used = grid_mesh(east, north, heights.astype(np.float64).filled(np.nan))
+    points -= offset[[0, 2, 1]] * [1.0, 1.0, -1.0]
     with rasterio.open(held.workspace / "mosaic" / "mosaic.tif") as raster:
         shrink = max(1.0, max(raster.width, raster.height) / _MOST_TEXTURE_PX)
         size = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))
@@ -125,7 +127,7 @@ def grid_mesh(east: Array, north: Array, heights: Array) -> tuple[Array, Array, 
         heights: (H, W); NaN where unknown.
 
     Returns:
-        (V, 3) vertices as glTF has them (x east, y up, z south) about their middle, (T, 3) faces,
+        (V, 3) vertices as glTF has them (x east, y up, z south), (T, 3) faces,
         and (V, 2) east and north of the vertices.
     """
     known = np.isfinite(heights)
@@ -143,8 +145,7 @@ def grid_mesh(east: Array, north: Array, heights: Array) -> tuple[Array, Array, 
     easts, norths = np.meshgrid(east, north)
     places = np.column_stack([easts[known], norths[known]])
     up = heights[known]
-    points = np.column_stack([places[:, 0], up, -places[:, 1]])
-    return points - (points.max(axis=0) + points.min(axis=0)) / 2, faces, places
+    return np.column_stack([places[:, 0], up, -places[:, 1]]), faces, places
 
 
 def _as_jpeg(picture: Any) -> Any:

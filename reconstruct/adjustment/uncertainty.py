@@ -18,10 +18,12 @@ of the calibration moves with them.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -55,6 +57,30 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 from reconstruct.views.model_files import as_transform
 
+_MOST_PLACES = 2000
+"""Places at most at which the motions that points share are kept: they are smooth."""
+
+
+_SHARED = ("shared_places", "shared_motions", "shared_cov", "shared_rest")
+
+
+@dataclass(frozen=True, eq=False)
+class SharedMotions:
+    """How points move together: the soft modes of a block, then what else of its rig is unknown.
+
+    The covariance of the poses' part of two points is the product of their motions with the
+    covariance between; what it leaves of a point's own is not shared.
+    """
+
+    places: Array
+    """(M, 3) points, spread over the model."""
+    motions: Array | NDArray[np.float32]
+    """(M, 3, K) of them, each by one sigma."""
+    covariance: Array
+    """(K, K) of these, in their sigmas."""
+    rest: Array
+    """(M, 3, 3) covariances of what poses do to the points besides."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Uncertainty:
@@ -79,19 +105,26 @@ class Uncertainty:
     """Sigma of one coordinate of a keypoint, from the residuals."""
     modes: "SoftModes"
     """What of these errors is soft."""
+    shared: SharedMotions | None = None
+    """What points share; None where a file of an earlier version does not say."""
 
     def knowing(self, left: Array) -> Self:
         """The same where measurements leave the modes the covariance (K, K)."""
-        modes = self.modes
+        modes, shared = self.modes, self.shared
         gain = np.diag(modes.known) - left
+        if shared is not None:
+            covariance = shared.covariance.copy()
+            covariance[: len(left), : len(left)] = left
+            shared = replace(shared, covariance=covariance)
         return replace(
             self,
             frame_cov=self.frame_cov - spread(modes.stations, gain),
             point_cov=self.point_cov - spread(modes.points, gain),
+            shared=shared,
         )
 
-    def moved(self, scale: float, rotation: Rotation) -> Self:
-        """The same in the world, `scale` and `rotation` being those of `world_from_model`.
+    def moved(self, scale: float, rotation: Rotation, translation: Array) -> Self:
+        """The same in the world; the arguments are those of `world_from_model`.
 
         Its modes are no longer to be found: they are by groups in the model.
         """
@@ -101,8 +134,15 @@ class Uncertainty:
         places, noise = (
             scale**2 * turn @ part @ turn.T for part in (self.point_cov, self.point_noise)
         )
+        shared = self.shared and replace(
+            self.shared,
+            places=scale * rotation.apply(self.shared.places) + translation,
+            motions=scale * turn @ self.shared.motions,
+            rest=scale**2 * turn @ self.shared.rest @ turn.T,
+        )
         return replace(
             self, frame_cov=both @ self.frame_cov @ both.T, point_cov=places, point_noise=noise,
+            shared=shared,
             modes=replace(
                 self.modes, stations=both @ self.modes.stations,
                 points=(scale * turn).astype(np.float32) @ self.modes.points, groups=None,
@@ -163,6 +203,7 @@ def estimate(
         point_noise=shape.noise[back],
         sigma_px=float(np.sqrt(variance / weights.mean())),
         modes=shape.modes.of_points(back),
+        shared=shape.shared,
     )
 
 
@@ -177,6 +218,7 @@ class BlockShape:
     noise: Array
     """(P, 3, 3) what the noise of a point's own keypoints does."""
     modes: SoftModes
+    shared: SharedMotions
     gauge: Gauge
     equations: PointEquations
     """Of the stations, with nothing shared."""
@@ -224,7 +266,7 @@ def shape_of_block(
     blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
     of_points = equations.point_covariances(blocks)
     of_stations = blocks[equations.own]
-    moving = None
+    moving = shape = None
     if calibration is not None:
         of_place = group_of_point[KDTree(points).query(calibration.places)[1]]
         calibration = replace(calibration, group=of_place)
@@ -232,15 +274,73 @@ def shape_of_block(
         of_stations = of_stations + shape.of_stations()
         of_points += shape.of_points(points, group_of_point)
         moving = None if held else calibration
+    modes = soft_modes(equations, gauge, moving, points, group_of_point)
     return BlockShape(
         stations=of_stations,
         points=of_points,
         noise=equations.point_inverse,
         gauge=gauge,
-        modes=soft_modes(equations, gauge, moving, points, group_of_point),
+        modes=modes,
+        shared=_shared_motions(
+            modes, shape, points, group_of_point, of_points, equations.point_inverse
+        ),
         equations=equations,
         calibration=calibration,
     )
+
+
+def _shared_motions(
+    modes: SoftModes,
+    shape: Motions | None,
+    points: Array,
+    group: Indices,
+    covariances: Array,
+    noise: Array,
+) -> SharedMotions:
+    """What points share: modes, and what of the rig these leave.
+
+    Given the modes, the rig's parameters have the covariance that is left after theirs; that what
+    poses do apart from modes goes along with it is left out.
+
+    Args:
+        modes: of the block.
+        shape: what errors of the rig do to its shape; None where they are unknown.
+        points: (P, 3).
+        group: (P,) of them.
+        covariances: (P, 3, 3) of them.
+        noise: (P, 3, 3) of it, what their own keypoints do.
+    """
+    known = np.flatnonzero(np.isfinite(modes.points[..., 0]).all(axis=1))
+    rows = known[_spread_rows(points[known])]
+    motions, covariance = modes.points[rows], np.diag(modes.known)
+    if shape is not None:
+        rig = shape.covariance.copy()
+        if len(modes.calibration):
+            soft = modes.calibration[:, : len(modes.known) - modes.joints]
+            rig -= soft @ soft.T
+        variances, axes = np.linalg.eigh(rig)
+        by_axis = shape.points @ (axes * np.sqrt(np.maximum(variances, 0.0)))
+        rest = by_axis[shape.nearest(points[rows], group[rows])].astype(np.float32)
+        motions = np.concatenate([motions, rest], axis=2)
+        covariance = block_diag(covariance, np.eye(rest.shape[2]))
+    return SharedMotions(
+        points[rows], motions, covariance,
+        covariances[rows] - noise[rows] - spread(motions, covariance),
+    )  # fmt: skip
+
+
+def _spread_rows(points: Array) -> Indices:
+    """Rows of some of the points (P, 3), one in each cube of space."""
+    if len(points) <= _MOST_PLACES:
+        return np.arange(len(points))
+    low, high = np.percentile(points, [2, 98], axis=0)
+    side = float(np.linalg.norm(high - low)) / np.sqrt(_MOST_PLACES)
+    while True:
+        cubes = np.floor((points - low) / side)
+        rows = np.sort(np.unique(cubes, axis=0, return_index=True)[1])
+        if len(rows) <= _MOST_PLACES:
+            return rows
+        side *= 1.25
 
 
 def _usual_reach(pixels: Pixels, centres: Array, points: Array) -> float:
@@ -255,6 +355,11 @@ def _usual_reach(pixels: Pixels, centres: Array, points: Array) -> float:
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
     """Write `covariance.npz`: fields of `Uncertainty` but the modes; points as float32."""
+    parts: tuple[Array, ...] = ()
+    if found.shared is not None:
+        one = found.shared
+        parts = (one.places, one.motions.astype(np.float32), one.covariance, one.rest)
+    more: dict[str, Any] = dict(zip(_SHARED, parts, strict=False))
     np.savez(
         path,
         frames=found.frames,
@@ -265,6 +370,7 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
         point_cov=found.point_cov.astype(np.float32),
         point_noise=found.point_noise.astype(np.float32),
         sigma_px=np.array(found.sigma_px),
+        **more,
     )
 
 
@@ -276,7 +382,7 @@ def read_uncertainty(path: Path) -> Uncertainty:
     """
     data = read_arrays(
         path, "frames", "stations", "images", "cov", "point_ids", "point_cov", "point_noise",
-        "sigma_px",
+        "sigma_px", optional=_SHARED,
     )  # fmt: skip
     with taken_from(path):
         return Uncertainty(
@@ -289,6 +395,9 @@ def read_uncertainty(path: Path) -> Uncertainty:
             point_noise=data["point_noise"].astype(np.float64),
             sigma_px=float(data["sigma_px"]),
             modes=no_modes(len(data["frames"]), len(data["point_ids"])),
+            shared=None
+            if not all(name in data for name in _SHARED)
+            else SharedMotions(*(data[name].astype(np.float64) for name in _SHARED)),
         )
 
 

@@ -155,7 +155,8 @@ def run_sparse(
     covariances = _covariances(folder, placed, rows, shape)
     if adjusted.shape is not None:
         write_uncertainty(
-            folder / "covariance.npz", adjusted.shape.moved(move.scale, move.rotation)
+            folder / "covariance.npz",
+            adjusted.shape.moved(move.scale, move.rotation, move.translation),
         )
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)

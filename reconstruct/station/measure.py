@@ -24,8 +24,11 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.rig import Rig, read_rig
 from camera_calib.triangulate import nearest_to_rays
 from reconstruct.evaluate.elevation import Elevation, read_elevation
+from reconstruct.measure.errors import SharedErrors, shared_errors
+from reconstruct.measure.figures import polygon_area, polyline, slopes_of
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.placing.picked_points import RegisteredPicture
+from reconstruct.planes import LEVEL_PLANE
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
 from reconstruct.station.solve import PairOptics, calibration_slopes, stereo_rig
@@ -63,15 +66,7 @@ class Located:
 
     def sigma(self, figure: Callable[[Array], float]) -> tuple[float, float]:
         """Standard deviations of a figure of the points: independent part, and shared part."""
-        slope = np.zeros_like(self.points)
-        step = 1e-6 * max(1.0, float(np.abs(self.points).max()))
-        for n, axis in np.ndindex(*self.points.shape):
-            ends = []
-            for sign in (1.0, -1.0):
-                moved = self.points.copy()
-                moved[n, axis] += sign * step
-                ends.append(figure(moved))
-            slope[n, axis] = (ends[0] - ends[1]) / (2 * step)
+        slope = slopes_of(figure, self.points)
         own = float(np.einsum("ni,nij,nj->", slope, self.own, slope))
         along = np.einsum("pni,ni->p", self.shared, slope)
         return np.sqrt(max(own, 0.0)), np.sqrt(max(float(along @ self.parameters @ along), 0.0))
@@ -136,20 +131,9 @@ def parse_picks(points: str) -> list[tuple[PickedPixel, ...]]:
     return found
 
 
-def polyline(points: Array) -> float:
-    """Length of the line through points (N, 3)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
 def _segment(number: int, points: Array) -> float:
     """Length of one segment of that line."""
     return polyline(points[number : number + 2])
-
-
-def polygon_area(points: Array) -> float:
-    """Area of the closed polygon through points (N, 3): the length of its vector area."""
-    local = points - points.mean(axis=0)
-    return 0.5 * float(np.linalg.norm(np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)))
 
 
 def _described(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
@@ -288,6 +272,10 @@ def _in_workspace(
         raise ReconstructionError("the model has no scale: lengths in it are not metres")
     pictures = Pictures.open(workspace)
     views = {view.image: view for view in model.views}
+    known = model.points_world[:, [1, 0]]
+    low, high = np.percentile(known, 2.0, axis=0), np.percentile(known, 98.0, axis=0)
+    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    errors = shared_errors(workspace, LEVEL_PLANE, model.frame, bounds)
     points, own = [], []
     surface = None
     for pick in picks:
@@ -305,17 +293,20 @@ def _in_workspace(
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
             surface = surface or read_elevation(workspace)[0]
-            point, covariance = _on_surface(surface, *rays[0], pick_sigma_px)
+            point, covariance = _on_surface(surface, errors, *rays[0], pick_sigma_px)
         points.append(point)
         own.append(covariance)
     turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    enu = np.stack(points) @ turn
+    grown = errors.scale_sigma * (enu - enu.mean(axis=0))
+    motions = np.concatenate([errors.motions_at(enu[:, :2]), grown[:, :, None]], axis=2)
     return Located(
-        points=np.stack(points) @ turn,
+        points=enu,
         own=turn @ np.stack(own) @ turn,
-        shared=np.zeros((0, len(points), 3)),
-        parameters=np.zeros((0, 0)),
+        shared=np.moveaxis(motions, 2, 0),
+        parameters=block_diag(errors.covariance, np.eye(1)),
         axes=("east", "north", "up"),
-        notes=("sigmas count pixels and surface, not the scale and bend of the whole model",),
+        notes=errors.notes,
     )
 
 
@@ -353,7 +344,12 @@ def _crossed(rays: list[tuple[View, PinholeWarp, Array]], sigma_px: float) -> tu
 
 
 def _on_surface(
-    surface: Elevation, view: View, warp: PinholeWarp, taken: Array, sigma_px: float
+    surface: Elevation,
+    errors: SharedErrors,
+    view: View,
+    warp: PinholeWarp,
+    taken: Array,
+    sigma_px: float,
 ) -> tuple[Array, Array]:
     start, direction = _ray(view, warp, taken)
     point = surface.hit(start, direction)
@@ -362,7 +358,9 @@ def _on_surface(
             f"{view.image}:{taken[0] - 0.5:g},{taken[1] - 0.5:g}: its ray meets no known "
             "surface; pick another pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
         )
-    sigma = float(surface.at(surface.sigma, point[None, [1, 0]])[0])
+    place = point[None, [1, 0]]
+    stated, shared = surface.at(surface.sigma, place), errors.variance_of_heights(place)
+    sigma = float(np.sqrt(np.maximum(stated**2 - shared, 0.0))[0])
     raised = surface.hit(start, direction, lift=sigma)
     moves = [raised - point if raised is not None else sigma * direction]
     for axis in range(2):

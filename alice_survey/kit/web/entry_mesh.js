@@ -1,7 +1,8 @@
-/* What the report's mesh needs of three. */
+/* What the mesh of reports and of the studio needs of three. */
 export {
-  Box3, Color, DirectionalLight, HemisphereLight, MeshLambertMaterial, PerspectiveCamera, Scene,
-  Sphere, Spherical, TextureLoader, Vector3, WebGLRenderer,
+  Box3, BufferGeometry, Color, DirectionalLight, HemisphereLight, Line, LineBasicMaterial, Mesh,
+  MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera, Raycaster, Scene, Sphere,
+  SphereGeometry, Spherical, TextureLoader, Vector2, Vector3, WebGLRenderer,
 } from "three";
 export {OrbitControls} from "three/examples/jsm/controls/OrbitControls.js";
 export {GLTFLoader} from "three/examples/jsm/loaders/GLTFLoader.js";

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.block_solver import BlockStep
@@ -22,9 +23,10 @@ from reconstruct.adjustment.normal_equations import (
     reduce_points,
 )
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
-from reconstruct.adjustment.soft_modes import Motions
+from reconstruct.adjustment.soft_modes import Motions, spread
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
+    Uncertainty,
     estimate,
     pinhole_survey,
     read_uncertainty,
@@ -152,8 +154,8 @@ def test_memory_hardly_grows_with_the_observations(monkeypatch: pytest.MonkeyPat
         found = shape_of_block(linear, pixels, state.centres, state.points, None, scale_free=False)
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        kept = sum(a.nbytes for a in (found.points, found.noise, found.modes.points))
-        return len(pixels.station), most - kept
+        kept = (found.points, found.noise, found.modes.points, found.shared.motions)
+        return len(pixels.station), most - sum(a.nbytes for a in kept)
 
     (few, small), (many, large) = (peak(points, 4_000) for points in (300, 1200))
     assert many > 3.5 * few > 14 * 4_000
@@ -311,7 +313,7 @@ def test_a_wrong_parameter_moves_the_points_as_predicted(name: str, tmp_path: Pa
 
 def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
-    stations, points, too_sure = [], [], []
+    stations, points, too_sure, apart = [], [], [], []
     for seed in range(12):
         steps = {name: float(s * rng.normal()) for name, s in SIGMAS.items()}
         rig = off(noisy().rig, steps)
@@ -328,9 +330,10 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
         )
         stations.append(away[0] / _sigmas(found.frame_cov))
         points.append(away[1] / _sigmas(found.point_cov))
+        apart.append(_relative_misses(found, away[1], mapped, rng))
         without = estimate(mapped, seen.images)
         too_sure.append(away[1] / _sigmas(without.point_cov))
-    for ratios in (stations, points):
+    for ratios in (stations, points, apart):
         assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
     assert np.sqrt(np.mean(np.square(too_sure))) > 1.8, "then the calibration would not matter"
 
@@ -386,3 +389,40 @@ def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:
     assert np.isfinite(part.stations).all()
     assert np.all(part.stations[4] == 0)
     assert np.all(np.abs(np.delete(part.stations, [0, 4], axis=0)).max(axis=(1, 2)) > 0)
+
+
+def _relative_misses(
+    found: Uncertainty, misses: Array, mapped: Mapped, rng: np.random.Generator
+) -> Array:
+    """Errors of one point relative to another over what shared motions and own noise say."""
+    shared = found.shared
+    assert shared is not None
+    points = np.array([mapped.model.points3D[int(n)].xyz for n in found.point_ids])
+    rows = KDTree(points).query(shared.places)[1]
+    i, j = rng.permutation(len(rows))[:200].reshape(2, 100)
+    motion = shared.motions[i] - shared.motions[j]
+    noise = found.point_noise[rows[i]] + found.point_noise[rows[j]]
+    variance = np.diagonal(spread(motion, shared.covariance) + noise, axis1=1, axis2=2)
+    ratios: Array = (misses[rows[i]] - misses[rows[j]]) / np.sqrt(variance)
+    return ratios
+
+
+def test_what_points_share_is_nearly_all_that_poses_do(tmp_path: Path) -> None:
+    mapped, _ = points_with(noisy().rig, tmp_path)
+    part = part_of(mapped, warped_scene(noisy())[0], noisy().rig)
+    shares = []
+    for calibration in (None, part):
+        found = estimate(mapped, noisy().records, calibration)
+        write_uncertainty(tmp_path / "a.npz", found)
+        shared = read_uncertainty(tmp_path / "a.npz").shared
+        assert shared is not None
+        points = np.array([mapped.model.points3D[int(n)].xyz for n in found.point_ids])
+        away, rows = KDTree(points).query(shared.places)
+        assert away.max() == 0.0
+        pose = np.trace((found.point_cov - found.point_noise)[rows], axis1=1, axis2=2)
+        seen = np.trace(spread(shared.motions, shared.covariance), axis1=1, axis2=2)
+        share = seen / pose
+        assert share.max() < 1.1
+        shares.append(float(np.median(share)))
+    assert 0.6 < shares[0] < 1.001, shares
+    assert 0.8 < shares[1] < 1.05, shares

@@ -206,7 +206,9 @@ def test_three_patches_are_joined(tmp_path: Path) -> None:
     assert sorted(np.bincount(found.group).tolist()) == [9, 12, 15]
     assert found.before.modes.groups is not None
     of_point = found.before.modes.groups.point
-    known = found.after.moved(1.0, found.fit.ned_from_model.rotation).point_cov[:, 2, 2]
+    known = found.after.moved(1.0, found.fit.ned_from_model.rotation, np.zeros(3)).point_cov[
+        :, 2, 2
+    ]
     ratios = []
     for group in (1, 2):
         wrong, covariance = found.joint(group)

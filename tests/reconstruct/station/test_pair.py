@@ -15,7 +15,8 @@ from alice_survey.base.errors import (
     WorkspaceError,
 )
 from camera_calib.rig import Covariance, Rig, write_rig
-from reconstruct.station.measure import measure, parse_picks, polygon_area, polyline
+from reconstruct.measure.figures import polygon_area, polyline
+from reconstruct.station.measure import measure, parse_picks
 from reconstruct.station.pair import read_depth, reconstruct_pair
 from reconstruct.station.solve import calibration_slopes, stereo_rig
 from tests.oracles_mesh import SIZE, port_rig, station_pictures, surface_points

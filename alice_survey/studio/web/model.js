@@ -1,0 +1,377 @@
+/* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
+
+import {attempt, button, download, el, field, get, number, say, send, table, withSigma} from "./core.js";
+import {profileView} from "./model_profile.js";
+import {meshPart} from "./model_mesh.js";
+
+const COLOUR = "#d55e00";
+const FAINT = "#cc79a7";
+const ASK_MS = 120;
+/* What each tool draws, how many places end it, and the figure that stands for the measure. */
+const TOOLS = {
+  length: {title: "Length", key: "l", kind: "line", ends: 2, main: "length", hint: "Click two places."},
+  profile: {title: "Profile", key: "p", kind: "line", main: "surface_length", hint: "Click along a line, then finish."},
+  area: {title: "Area", key: "a", kind: "polygon", main: "surface_area", hint: "Click the corners in order, then finish."},
+  volume: {title: "Volume", key: "v", kind: "polygon", main: "volume", hint: "Click the corners in order, then finish."},
+  rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity", hint: "Click the corners in order, then finish."},
+};
+const FILES = [
+  ["report/report.html", "The report"], ["mosaic/mosaic.tif", "The mosaic, cloud-optimised GeoTIFF"],
+  ["dense/dem.tif", "The elevation model, GeoTIFF"], ["dense/sigma.tif", "Its sigma, GeoTIFF"],
+  ["dense/cloud.copc.laz", "The point cloud, COPC"], ["mesh/mesh.glb", "The mesh, glTF"],
+  ["sparse/track.csv", "The cameras' track, CSV"], ["plan/plan.html", "The plan"],
+];
+
+export function tab(studio) {
+  const {map, state} = studio;
+  document.head.append(el("link", {rel: "stylesheet", href: "/app/model.css"}));
+  const kept = "alice-survey measures " + state.workspace;
+  let measures = restored();
+  let chosen = null;
+  let active = false;
+
+  function restored() {
+    try {
+      return JSON.parse(sessionStorage.getItem(kept)) || [];
+    } catch {
+      return [];
+    }
+  }
+
+  /* ---- Values of the rasters under the pointer, or in the middle of the map ---- */
+
+  const under = el("div", {class: "under"});
+  const readout = document.getElementById("map-readout");
+  let asking = null;
+  let wanted = null;
+
+  function heightText(found) {
+    return found.height === null ? "; no height here" : "; height " + withSigma(found.height, found.sigma, found.unit);
+  }
+
+  function valueOf({value, unit}) {
+    if (!Array.isArray(value)) return Number.isInteger(value) ? value + " " + unit : number(value, unit, 5);
+    return el("span", {title: value.join(", ")}, el("span", {class: "swatch", style: {background: "rgb(" + value.join(",") + ")"}}), " ", value.join(" "));
+  }
+
+  async function ask() {
+    const place = wanted;
+    const found = await get("/api/model/value", {east: place.lng, north: place.lat}).catch((fault) => ({fault}));
+    asking = null;
+    if (!active) return;
+    if (found.fault) {
+      under.replaceChildren(el("p", {class: "error"}, found.fault.message));
+      return;
+    }
+    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], "", 6) + " " + axis).join(", ");
+    under.replaceChildren(el("p", {}, found.values.length ? "At " + at : "No raster knows anything at " + at + "."),
+      el("dl", {}, found.values.map((row) => el("div", {}, el("dt", {}, row.title.replace(" of height", "")), el("dd", {}, valueOf(row))))));
+    if (wanted === place) readout.textContent += heightText(found);
+    else later();
+  }
+
+  function later() {
+    if (asking === null) asking = setTimeout(ask, ASK_MS);
+  }
+
+  map.moreAt((place) => {
+    if (active) {
+      wanted = place;
+      later();
+    }
+    return "";
+  });
+
+  /* ---- Drawing ---- */
+
+  const draft = leaflet.polyline([], {color: COLOUR, weight: 3, dashArray: "6 4", interactive: false});
+  const dots = leaflet.featureGroup();
+  let drawing = null;
+  const hint = el("p", {class: "note", role: "status"});
+  const finishing = button("Finish (D)", () => finish(), {class: "primary"});
+  const steps = el("div", {class: "buttons", hidden: true}, finishing,
+    button("Undo the last place", () => undo()), button("Cancel", () => map.release()));
+  const toolButtons = Object.entries(TOOLS).map(([name, tool]) => button(tool.title, () => begin(name), {
+    "aria-pressed": "false", "data-tool": name, title: tool.title + " (" + tool.key.toUpperCase() + ")",
+  }));
+
+  const base = el("select", {}, el("option", {value: "rim"}, "fitted to the polygon's rim"),
+    el("option", {value: "level"}, "level, at a height"));
+  const level = el("input", {type: "number", step: "any"});
+  const levelField = field("Height of the plane, " + state.unit, level);
+  const quadrat = el("input", {type: "number", step: "any", min: "0"});
+  const forVolume = el("div", {hidden: true}, field("Plane of the volume", base), levelField);
+  const forRugosity = el("div", {hidden: true}, field("Side of quadrats, " + state.unit, quadrat, "Empty: the polygon as a whole."));
+  base.addEventListener("change", () => { levelField.hidden = base.value !== "level"; });
+  levelField.hidden = true;
+
+  function redraw(pointer) {
+    const places = [...drawing.places, ...(pointer ? [pointer] : [])];
+    draft.setLatLngs(drawing.tool.kind === "polygon" && places.length > 2 ? [...places, places[0]] : places);
+    dots.clearLayers();
+    drawing.places.forEach((place) => dots.addLayer(leaflet.circleMarker(place, {
+      radius: 5, color: "#fff", weight: 1.5, fillColor: COLOUR, fillOpacity: 1, interactive: false,
+    })));
+    const least = drawing.tool.kind === "polygon" ? 3 : 2;
+    finishing.disabled = drawing.places.length < least;
+    hint.textContent = drawing.tool.hint + " Enter takes the middle of the map. " + drawing.places.length + " so far.";
+  }
+
+  function begin(name) {
+    if (drawing?.name === name) {
+      map.release();
+      return;
+    }
+    const tool = TOOLS[name];
+    map.take({
+      name,
+      click: (place) => add(place),
+      move: (place) => drawing && redraw(place),
+      end: ended,
+      keys: {d: () => finish(), Backspace: () => undo()},
+    });
+    drawing = {name, tool, places: []};
+    draft.addTo(map.leaflet);
+    dots.addTo(map.leaflet);
+    toolButtons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === name)));
+    steps.hidden = false;
+    forVolume.hidden = name !== "volume";
+    forRugosity.hidden = name !== "rugosity";
+    redraw();
+  }
+
+  function ended() {
+    drawing = null;
+    draft.remove();
+    dots.remove();
+    toolButtons.forEach((one) => one.setAttribute("aria-pressed", "false"));
+    steps.hidden = true;
+    hint.textContent = "";
+  }
+
+  function add(place) {
+    if (drawing.places.length && drawing.places[drawing.places.length - 1].equals(place, 1e-12)) {
+      say("That is the last place again: move the map or the pointer first.", "warn");
+      return;
+    }
+    drawing.places.push(leaflet.latLng(place.lat, place.lng));
+    redraw();
+    if (drawing.places.length === drawing.tool.ends) finish();
+  }
+
+  function undo() {
+    drawing?.places.pop();
+    if (drawing) redraw();
+  }
+
+  async function finish() {
+    if (!drawing || finishing.disabled) return;
+    const {name, tool, places} = drawing;
+    const asked = {kind: tool.kind, places: places.map((place) => [place.lng, place.lat])};
+    if (name === "volume") {
+      if (base.value === "level" && !Number.isFinite(level.valueAsNumber)) {
+        say("Give the height of the plane.", "warn");
+        level.focus();
+        return;
+      }
+      asked.base = base.value === "level" ? level.valueAsNumber : "rim";
+    }
+    if (name === "rugosity" && quadrat.value) asked.quadrat = quadrat.valueAsNumber;
+    map.release();
+    await measure(name, asked);
+  }
+
+  async function measure(name, asked) {
+    say("Measuring …");
+    const found = await attempt(() => send("/api/model/measure", asked));
+    if (!found) return;
+    const tool = TOOLS[name];
+    const same = measures.filter((one) => one.tool === name).length + 1;
+    const made = {
+      id: Math.max(0, ...measures.map((one) => one.id)) + 1, name: tool.title + " " + same, tool: name,
+      kind: asked.kind, places: asked.places, ...found,
+    };
+    measures.push(made);
+    chosen = made.id;
+    changed();
+    const main = found.figures.find((one) => one.name === tool.main);
+    say(made.name + ": " + withSigma(main.value, main.sigma, main.unit));
+  }
+
+  /* ---- Results ---- */
+
+  const results = el("div", {});
+  const details = el("div", {});
+
+  function mainOf(one) {
+    return one.figures.find((figure) => figure.name === TOOLS[one.tool].main) || one.figures[0];
+  }
+
+  function changed() {
+    sessionStorage.setItem(kept, JSON.stringify(measures));
+    drawMeasures();
+    showResults();
+    showChosen();
+  }
+
+  function drawMeasures() {
+    const described = (kind) => {
+      const some = measures.filter((one) => (one.kind === "polygon") === (kind === "polygon"));
+      return {
+        kind, name: "measured-" + kind, title: kind === "polygon" ? "Measured areas" : "Measured lines", colour: COLOUR,
+        dashed: false, fill: 0.12, width: 3, group: "Measures",
+        shapes: some.map((one) => one.places.map(([east, north]) => [east, north])),
+        texts: some.map((one) => one.name + ": " + withSigma(mainOf(one).value, mainOf(one).sigma, mainOf(one).unit)),
+      };
+    };
+    ["line", "polygon"].forEach((kind) => {
+      const about = described(kind);
+      if (about.shapes.length) map.put(about);
+      else map.remove(about.name);
+    });
+    const squares = measures.find((one) => one.id === chosen)?.quadrats || [];
+    map.remove("quadrats");
+    if (squares.length) {
+      map.put({
+        kind: "polygon", name: "quadrats", title: "Quadrats", colour: FAINT, dashed: false, fill: 0.1, width: 1.5, group: "Measures",
+        shapes: squares.map((one) => one.places),
+        texts: squares.map((one) => figureText(one.figures.find((figure) => figure.name === "rugosity"))),
+      });
+    }
+  }
+
+  const figureText = (figure) => figure.title + " " + withSigma(figure.value, figure.sigma, figure.unit);
+
+  function showResults() {
+    if (!measures.length) {
+      results.replaceChildren(el("p", {class: "note"}, "Nothing is measured yet."));
+      return;
+    }
+    const rows = measures.map((one) => {
+      const name = el("input", {value: one.name, maxlength: 200, "aria-label": "Name of " + one.name});
+      name.addEventListener("change", () => {
+        one.name = name.value.trim() || one.name;
+        changed();
+      });
+      const main = mainOf(one);
+      return el("tr", {"data-measure": one.id, "aria-current": one.id === chosen ? "true" : null},
+        el("td", {}, name), el("td", {}, withSigma(main.value, main.sigma, main.unit)),
+        el("td", {}, button("Show", () => { chosen = one.id; changed(); lookAt(one); }, {"aria-label": "Show " + one.name}), " ",
+          button("×", () => drop(one), {"aria-label": "Delete " + one.name})));
+    });
+    results.replaceChildren(
+      el("table", {class: "figures measures"}, el("caption", {}, "Measures"),
+        el("thead", {}, el("tr", {}, ["Name", "Result", "Actions"].map((text) => el("th", {scope: "col"}, text)))),
+        el("tbody", {}, rows)),
+      el("div", {class: "buttons"}, button("Export CSV", () => attempt(() => exported("csv"))),
+        button("Export GeoJSON", () => attempt(() => exported("geojson"))),
+        button("Delete all", () => { measures = []; chosen = null; changed(); })),
+    );
+  }
+
+  function drop(one) {
+    measures = measures.filter((other) => other !== one);
+    if (chosen === one.id) chosen = null;
+    changed();
+  }
+
+  function lookAt(one) {
+    const bounds = leaflet.latLngBounds(one.places.map(([east, north]) => [north, east]));
+    map.leaflet.fitBounds(bounds.pad(0.4), {animate: false});
+  }
+
+  const profile = profileView(map, state.unit);
+
+  async function showChosen() {
+    const one = measures.find((other) => other.id === chosen);
+    profile.clear();
+    if (!one) {
+      details.replaceChildren();
+      return;
+    }
+    const rows = one.figures.map((figure) => [figure.title, withSigma(figure.value, figure.sigma, figure.unit)]);
+    details.replaceChildren(
+      table(one.name, ["Figure", "Value ± sigma"], rows),
+      ...one.notes.map((note) => el("p", {class: "note"}, note)),
+      one.quadrats.length ? squaresTable(one) : "",
+      one.kind === "polygon" ? "" : profile.element,
+    );
+    if (one.kind === "polygon") return;
+    const places = one.places.map(([east, north]) => [east, north]);
+    const found = await attempt(() => send("/api/model/profile", {places}));
+    if (found && chosen === one.id) profile.show(found);
+  }
+
+  function squaresTable(one) {
+    const rough = one.quadrats.map((square) => square.figures.find((figure) => figure.name === "rugosity"));
+    const mean = rough.reduce((sum, figure) => sum + figure.value, 0) / rough.length;
+    const spread = Math.sqrt(rough.reduce((sum, figure) => sum + (figure.value - mean) ** 2, 0) / Math.max(1, rough.length - 1));
+    return el("details", {}, el("summary", {}, rough.length + " quadrats: rugosity " + number(mean, "", 4) + ", scatter " + number(spread, "", 2)),
+      table("Quadrats, from south-west", ["Quadrat", "Rugosity"], rough.map((figure, i) => [String(i + 1), withSigma(figure.value, figure.sigma)])));
+  }
+
+  async function exported(form) {
+    const body = JSON.stringify({
+      form,
+      measures: measures.map(({name, kind, places, figures, notes}) => ({name, kind, places, figures, notes})),
+    });
+    const answer = await fetch("/api/model/export", {method: "POST", body, headers: {"Content-Type": "application/json"}});
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    download("measures." + form, await answer.text(), answer.headers.get("Content-Type"));
+    say(measures.length + (measures.length === 1 ? " measure" : " measures") + " written to measures." + form);
+  }
+
+  /* ---- What sigmas count, and the files ---- */
+
+  const counted = el("ul", {});
+  const about = el("details", {hidden: true}, el("summary", {}, "What the sigmas count"), counted);
+  async function fillAbout() {
+    const found = await get("/api/model/about").catch(() => null);
+    about.hidden = !found;
+    if (!found) return;
+    counted.replaceChildren(...found.notes.map((note) => el("li", {}, note)),
+      el("li", {}, "areas and rugosity are of cells of " + number(found.cell, found.unit, 3)));
+  }
+
+  const links = el("ul", {});
+  function fillFiles() {
+    const has = {
+      "report/report.html": state.has.report, "mosaic/mosaic.tif": state.has.mosaic, "dense/dem.tif": state.has.dem,
+      "dense/sigma.tif": state.has.dem, "dense/cloud.copc.laz": state.has.cloud, "mesh/mesh.glb": state.has.mesh,
+      "sparse/track.csv": state.has.sparse, "plan/plan.html": state.has.plan,
+    };
+    links.replaceChildren(...FILES.filter(([path]) => has[path]).map(([path, text]) => el("li", {}, el("a", {href: "/files/" + path}, text))),
+      el("li", {}, el("a", {href: "/files/"}, "All files of this workspace")));
+  }
+  const files = el("details", {}, el("summary", {}, "Files"), links, el("p", {class: "note"},
+    "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with the protocol HTTP(S) and the address "
+    + window.location.origin + "/files/mosaic/mosaic.tif"));
+
+  const mesh = meshPart(studio, {colour: COLOUR, measured: (points) => measure("length", {kind: "points", places: points})});
+
+  const panel = el("div", {class: "model"},
+    el("h2", {}, "Look and measure"),
+    el("div", {class: "buttons", role: "group", "aria-label": "Measure on the map"}, toolButtons),
+    forVolume, forRugosity, hint, steps, under, results, details, mesh.element, about, files);
+
+  return {
+    name: "model", title: "Model", panel,
+    enter() {
+      active = true;
+      const there = Boolean(state.has.dem);
+      toolButtons.forEach((one) => { one.disabled = !there; });
+      if (!there) hint.textContent = "There is no surface yet: run 'alice-survey reconstruct', or the tab Run.";
+      fillAbout();
+      fillFiles();
+      mesh.enter();
+      changed();
+      map.refresh();
+    },
+    leave() {
+      active = false;
+      profile.clear();
+      mesh.leave();
+    },
+    keys: Object.fromEntries(Object.entries(TOOLS).map(([name, tool]) => [tool.key, () => state.has.dem && begin(name)])),
+  };
+}

@@ -1,0 +1,303 @@
+"""What moves a surface's heights: errors that its cells share, on a lattice, and each cell's own.
+
+`sigma.tif` holds both together, a cell at a time, so that a sum over cells needs more: how errors
+go together. Poses and calibration move all of a surface, smoothly, by the motions that
+`sparse/covariance.npz` states; a figure that hardly changes when all of its points move together
+is hardly touched by them. What the dense stage adds is a cell's own, and fades within about a
+cell: windows that are compared have a Gaussian weight of 1.25 px (`dense.refine_depth`), so that
+errors of pixels at a distance d correlate by exp(-d² / (2 * 1.25 px)²), and a cell is about 2.5 px
+wide (`dense.scales.CELL_PIXELS`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from alice_survey.base.frames import Array
+from alice_survey.base.records import RegistrationRecord, SurfaceRecord
+from reconstruct.adjustment.uncertainty import SharedMotions, read_uncertainty
+from reconstruct.planes import Plane
+from reconstruct.views.model import WorldFrame
+
+_NODES = 33
+"""Nodes of the lattice along its longer side: motions that points share are smooth."""
+_PATCHES = 3
+"""The same where only the size of the poses' part is known: it is shared within patches."""
+_COMPANY = 8
+"""Points around a node of which the mean counts."""
+REACH_CELLS = 2
+"""Cells from which on own errors do not go together: exp(-9)."""
+
+
+def own_correlation(cells: Array) -> Array:
+    """Correlation of own errors at a distance in cells."""
+    fading: Array = np.where(cells < REACH_CELLS + 0.9, np.exp(-(cells**2)), 0.0)
+    return fading
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SharedErrors:
+    """Motions that a surface's points share, in the axes of its rasters: right, up, out."""
+
+    west: float
+    south: float
+    """Of the first node."""
+    pitch: float
+    motions: Array
+    """(rows, columns, 3, K) of the nodes, rows from south to north, each by one sigma."""
+    covariance: Array
+    """(K, K) of these."""
+    rest: Array
+    """(rows, columns, 3, 3) covariances that the places around a node share with no others."""
+    scale_sigma: float = 0.0
+    """Of the logarithm of the scale, where it is known apart from the shape."""
+    notes: tuple[str, ...] = ()
+    """What is counted, and what is not."""
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return int(self.motions.shape[0] * self.motions.shape[1])
+
+    def around(self, places: Array) -> tuple[NDArray[np.int64], Array]:
+        """Numbers (N, 4) of the nodes around (N, 2) places, and their bilinear weights."""
+        rows, columns = self.motions.shape[:2]
+        x = np.clip((places[:, 0] - self.west) / self.pitch, 0.0, columns - 1.0)
+        y = np.clip((places[:, 1] - self.south) / self.pitch, 0.0, rows - 1.0)
+        left = np.minimum(x.astype(np.int64), max(columns - 2, 0))
+        low = np.minimum(y.astype(np.int64), max(rows - 2, 0))
+        right, high = np.minimum(left + 1, columns - 1), np.minimum(low + 1, rows - 1)
+        x, y = x - left, y - low
+        nodes = np.stack([low * columns + left, low * columns + right,
+                          high * columns + left, high * columns + right], axis=1)  # fmt: skip
+        weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
+        return nodes, weights
+
+    def motions_at(self, places: Array) -> Array:
+        """Motions (N, 3, K) of (N, 2) places."""
+        nodes, weights = self.around(places)
+        flat = self.motions.reshape(self.nodes, 3, -1)
+        return np.asarray(np.einsum("na,naik->nik", weights, flat[nodes]))
+
+    def variance_of_heights(self, places: Array) -> Array:
+        """Variances (N,) of the heights of (N, 2) places by what they share."""
+        nodes, weights = self.around(places)
+        return np.asarray((weights * self._of_heights[nodes]).sum(axis=1))
+
+    @cached_property
+    def _of_heights(self) -> Array:
+        up = self.motions[..., 2, :].reshape(self.nodes, -1)
+        rest = self.rest[..., 2, 2].ravel()
+        return np.asarray(((up @ self.covariance) * up).sum(axis=1) + rest)
+
+    def along(self, places: Array, axis: int) -> tuple[Array, Array]:
+        """Bilinear weights, and those of the nearest node, (N, rows or columns) along an axis.
+
+        Args:
+            places: (N,) to the right, or up.
+            axis: 0 to the right, 1 up.
+        """
+        count = self.motions.shape[1 - axis]
+        at = np.clip((places - (self.west, self.south)[axis]) / self.pitch, 0.0, count - 1.0)
+        smooth = np.maximum(1.0 - np.abs(at[:, None] - np.arange(count)), 0.0)
+        return smooth, np.eye(count)[np.rint(at).astype(np.int64)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variance:
+    """Variance of a figure, by what it comes from."""
+
+    own: float
+    """Of the cells' own errors."""
+    shared: float
+    """Of what poses and calibration do to all."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of both together."""
+        return float(np.sqrt(self.own + self.shared))
+
+
+class FigureSlopes:
+    """Derivatives of a figure with respect to the surface's motions, gathered part by part."""
+
+    def __init__(self, errors: SharedErrors) -> None:
+        """Begin with a figure that nothing moves."""
+        self._errors = errors
+        self._smooth, self._near = (np.zeros((errors.nodes, 3)) for _ in range(2))
+        self._own = 0.0
+
+    def add(self, places: Array, slopes: Array, own: float) -> None:
+        """Add places (N, 2), derivatives (N, 3) by their motions, and variance by own errors."""
+        nodes, weights = self._errors.around(places)
+        for axis in range(3):
+            shares = weights * slopes[:, axis, None]
+            self._smooth[:, axis] += np.bincount(
+                nodes.ravel(), shares.ravel(), minlength=self._errors.nodes
+            )
+            nearest = nodes[np.arange(len(nodes)), weights.argmax(axis=1)]
+            self._near[:, axis] += np.bincount(
+                nearest, slopes[:, axis], minlength=self._errors.nodes
+            )
+        self._own += own
+
+    def add_grid(self, x: Array, y: Array, slopes: Array, own: float) -> None:
+        """Add derivatives (rows, columns, 3) of a grid at x (columns,) and y (rows,)."""
+        right, up = (self._errors.along(places, axis) for axis, places in enumerate((x, y)))
+        for gathered, across, upwards in zip(
+            (self._smooth, self._near), right, up, strict=True
+        ):  # fmt: skip
+            for axis in range(3):
+                part = np.ascontiguousarray(slopes[..., axis])
+                gathered[:, axis] += (upwards.T @ (part @ across)).ravel()
+        self._own += own
+
+    def count_once(self, scatter: float) -> None:
+        """Own variance of a figure that noise enters as a square, too.
+
+        Derivatives at measured heights count that twice: of a quadratic form q = nᵀAn of noise of
+        covariance K their variance is 4 tr(AKAK) in the mean, and that of q is 2 tr(AKAK).
+
+        Args:
+            scatter: variance of the quadratic form.
+        """
+        self._own = max(self._own - scatter, scatter)
+
+    def add_times(self, factor: float, other: "FigureSlopes") -> None:
+        """Add a figure times a factor; both know different own errors."""
+        self._smooth += factor * other._smooth
+        self._near += factor * other._near
+        self._own += factor**2 * other._own
+
+    @property
+    def variance(self) -> Variance:
+        """Of the figure."""
+        errors = self._errors
+        by_motion = np.einsum(
+            "ni,nik->k", self._smooth, errors.motions.reshape(errors.nodes, 3, -1)
+        )
+        rest = np.einsum("ni,nij,nj->", self._near, errors.rest.reshape(-1, 3, 3), self._near)
+        shared = float(by_motion @ errors.covariance @ by_motion) + float(rest)
+        return Variance(own=max(self._own, 0.0), shared=max(shared, 0.0))
+
+
+def shared_errors(
+    workspace: Path, plane: Plane, frame: WorldFrame, bounds: tuple[float, float, float, float]
+) -> SharedErrors:
+    """What poses, calibration and scale do to the surface of a workspace.
+
+    Args:
+        workspace: reconstructed.
+        plane: of its rasters.
+        frame: of its model.
+        bounds: west, south, east and north of its rasters.
+    """
+    notes = ["counted: own errors of cells, which go together within about a cell"]
+    path = workspace / "sparse" / "covariance.npz"
+    shared = read_uncertainty(path).shared if path.is_file() else None
+    if shared is not None:
+        notes.append("counted: shape and scale of the model, by its poses and its calibration")
+        found = on_lattice(in_plane(shared, plane), bounds, _NODES)
+    else:
+        found, note = _patches(workspace, bounds)
+        notes.append(note)
+    scale = _scale_sigma(workspace)
+    if not frame.scaled:
+        notes.append("not counted: the model has no scale, figures are in its own units")
+    elif scale > 0.0:
+        notes.append(f"counted: the scale of navigation, sigma {scale:.2g}")
+    return replace(found, scale_sigma=scale, notes=tuple(notes))
+
+
+def in_plane(shared: SharedMotions, plane: Plane) -> SharedMotions:
+    """Motions in the axes of a plane's rasters: right, up, out."""
+    to_raster = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    turn = to_raster @ plane.plane_from_world.rotation.as_matrix()
+    return SharedMotions(
+        plane.plane_from_world.apply(shared.places) @ to_raster.T,
+        turn @ shared.motions,
+        shared.covariance,
+        turn @ shared.rest @ turn.T,
+    )
+
+
+def on_lattice(
+    shared: SharedMotions,
+    bounds: tuple[float, float, float, float],
+    nodes: int,
+) -> SharedErrors:
+    """Motions of points as those of a lattice over a raster.
+
+    Args:
+        shared: of points, in the raster's axes.
+        bounds: west, south, east and north of the raster.
+        nodes: along its longer side.
+    """
+    company = min(_COMPANY, len(shared.places))
+    tree = KDTree(shared.places[:, :2])
+
+    def mean(field: NDArray[Any], places: Array) -> Array:
+        near = np.asarray(tree.query(places, k=company)[1]).reshape(len(places), company)
+        return np.asarray(field[near].mean(axis=1))
+
+    # A variance that rounding left below zero is none.
+    values, axes = np.linalg.eigh((shared.rest + shared.rest.swapaxes(1, 2)) / 2)
+    rest = np.einsum("nij,nj,nkj->nik", axes, np.maximum(values, 0.0), axes)
+    return _lattice(
+        bounds, nodes, lambda places: mean(shared.motions, places),
+        shared.covariance, lambda places: mean(rest, places),
+    )  # fmt: skip
+
+
+def _lattice(
+    bounds: tuple[float, float, float, float],
+    nodes: int,
+    motions: Callable[[Array], Array],
+    covariance: Array,
+    rest: Callable[[Array], Array],
+) -> SharedErrors:
+    west, south, east, north = bounds
+    pitch = max(east - west, north - south) / (nodes - 1)
+    columns, rows = (
+        max(2, int(np.ceil(side / pitch - 1e-9)) + 1) for side in (east - west, north - south)
+    )
+    y, x = np.mgrid[:rows, :columns]
+    places = np.column_stack([west + pitch * x.ravel(), south + pitch * y.ravel()])
+    return SharedErrors(
+        west=west, south=south, pitch=pitch,
+        motions=motions(places).reshape(rows, columns, 3, -1),
+        covariance=covariance,
+        rest=rest(places).reshape(rows, columns, 3, 3),
+    )  # fmt: skip
+
+
+def _patches(
+    workspace: Path, bounds: tuple[float, float, float, float]
+) -> tuple[SharedErrors, str]:
+    """Where only the usual size of the poses' part is known: it is shared within patches."""
+    surface = SurfaceRecord.made(workspace / SurfaceRecord.path)
+    sigma = None if surface is None else surface.pose_sigma
+    rest = np.diag([0.0, 0.0, (sigma or 0.0) ** 2])
+    found = _lattice(
+        bounds, _PATCHES, lambda places: np.zeros((len(places), 3, 1)), np.eye(1),
+        lambda places: np.broadcast_to(rest, (len(places), 3, 3)),
+    )  # fmt: skip
+    if sigma is None:
+        return found, "not counted: errors of poses and calibration, which are not known here"
+    return found, (
+        "counted in patches of a third of the model: errors of poses and calibration; its "
+        "covariance is of an earlier version: delete sparse/ and run 'alice-survey reconstruct' "
+        "for how they go together"
+    )
+
+
+def _scale_sigma(workspace: Path) -> float:
+    record = RegistrationRecord.made(workspace / RegistrationRecord.path)
+    place = None if record is None else record.georeference
+    return 0.0 if place is None else place.sigma_scale

@@ -1,0 +1,254 @@
+"""The surface of a workspace, read by windows: its heights and their own errors; its rasters."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.windows import Window
+from scipy.spatial import KDTree
+
+from alice_survey.base.artefacts import need_stage
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from reconstruct.measure.errors import REACH_CELLS, SharedErrors, own_correlation, shared_errors
+from reconstruct.measure.sight import sight_lines
+from reconstruct.planes import Plane, read_plane
+from reconstruct.raster import DemGrid, opened_raster, small_cache
+from reconstruct.views.model import WorldFrame, read_frame
+
+MOSAIC = "mosaic/mosaic.tif"
+RASTERS = (
+    "dense/dem.tif", "dense/sigma.tif", "dense/slope.tif", "dense/stations.tif", "dense/count.tif",
+    "dense/surfaces.tif", "dense/lower.tif", "evaluation/error.tif", "mosaic/coverage.tif", MOSAIC,
+)  # fmt: skip
+"""Rasters that a place has values in."""
+_PICKING = "not counted: how well a place was picked on the map"
+_WINDOW_CELLS = 1024
+"""Cells along the side of what is read at once."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Samples:
+    """Heights at places, each between four cells."""
+
+    places: Array
+    """(N, 2) right (east) and up (north)."""
+    height: Array
+    """(N,) NaN where one of the cells is unknown."""
+    cells: NDArray[np.int64]
+    """(N, 4, 2) rows and columns of the cells."""
+    weights: Array
+    """(N, 4) of the cells."""
+    own: Array
+    """(N, 4) sigmas of their own errors."""
+    shared: Array
+    """(N,) variances by what all heights share."""
+    sight: Array
+    """(N, 2) how far a place moves aside with the own error of its height."""
+
+    @property
+    def points(self) -> Array:
+        """(N, 3) right, up and out."""
+        return np.column_stack([self.places, self.height])
+
+    def own_covariances(self, step: int) -> Array:
+        """Covariances (N - step,) of own errors of each sample and of the one `step` after it."""
+        first, second = slice(None, len(self.places) - step), slice(step, None)
+        apart = self.cells[first, :, None] - self.cells[second, None, :]
+        together = own_correlation(np.linalg.norm(apart, axis=-1))
+        here, there = self.weights * self.own, self.weights * self.own
+        return np.asarray(np.einsum("na,nab,nb->n", here[first], together, there[second]))
+
+    @property
+    def sigma(self) -> Array:
+        """(N,) of the heights."""
+        return np.sqrt(self.own_covariances(0) + self.shared)
+
+    def own_variance(self, motions: Array) -> float:
+        """Variance by own errors of a figure with derivatives (N, 3) by the places' motions."""
+        slopes = motions[:, 2] + (motions[:, :2] * self.sight).sum(axis=1)
+        used = slopes != 0.0
+        cells, cell_of = np.unique(self.cells[used].reshape(-1, 2), axis=0, return_inverse=True)
+        kick = (slopes[used, None] * self.weights[used] * self.own[used]).ravel()
+        kicks = np.bincount(cell_of.ravel(), kick, minlength=len(cells))
+        i, j = KDTree(cells).query_pairs(REACH_CELLS + 0.9, output_type="ndarray").T
+        fading = own_correlation(np.linalg.norm(cells[i] - cells[j], axis=1))
+        return float(kicks @ kicks + 2.0 * (kicks[i] * kicks[j] * fading).sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSurface:
+    """The DEM of a workspace with its sigmas; nothing of it is held."""
+
+    workspace: Path
+    dem: Path
+    sigma: Path
+    grid: DemGrid
+    frame: WorldFrame
+    """Of the model."""
+    plane: Plane
+    errors: SharedErrors
+
+    @classmethod
+    def of(cls, workspace: Path) -> "MeasuredSurface":
+        """Of a workspace.
+
+        Raises:
+            WorkspaceError: the surface is not there, or damaged.
+        """
+        dense = need_stage(workspace, "dense", "reconstruct")
+        frame = read_frame(need_stage(workspace, "sparse", "reconstruct") / "frame.json")
+        plane, grid = read_plane(dense), grid_of(dense / "dem.tif")
+        east, south = grid.east_of(grid.columns), grid.north_of(grid.rows)
+        bounds = (grid.west, float(south), float(east), grid.north)
+        errors = shared_errors(workspace, plane, frame, bounds)
+        return cls(
+            workspace=workspace,
+            dem=dense / "dem.tif",
+            sigma=dense / "sigma.tif",
+            grid=grid,
+            frame=frame,
+            plane=plane,
+            errors=replace(errors, notes=(*errors.notes, _PICKING)),
+        )
+
+    @property
+    def unit(self) -> str:
+        """Of lengths."""
+        return self.frame.unit
+
+    @property
+    def axes(self) -> tuple[str, str, str]:
+        """What its coordinates are called."""
+        if not self.plane.is_level:
+            return "right", "up", "out"
+        return ("east", "north", "up") if self.frame.name == "ned" else ("x", "y", "up")
+
+    def window(self, row: int, column: int, rows: int, columns: int) -> tuple[Array, Array]:
+        """Heights and sigmas of own errors (rows, columns) of a window; NaN beyond the grid."""
+        found = tuple(np.full((rows, columns), np.nan) for _ in range(2))
+        top, left = max(row, 0), max(column, 0)
+        bottom = min(row + rows, self.grid.rows)
+        right = min(column + columns, self.grid.columns)
+        if bottom <= top or right <= left:
+            return found[0], found[1]
+        part = Window(left, top, right - left, bottom - top)
+        inner = np.s_[top - row : bottom - row, left - column : right - column]
+        for array, path in zip(found, (self.dem, self.sigma), strict=True):
+            with small_cache(), opened_raster(path) as raster:
+                array[inner] = raster.read(1, window=part)
+        height, sigma = found
+        known = np.isfinite(height)
+        places = self.places_of(*(np.flatnonzero(known.ravel()) // columns + row,
+                                  np.flatnonzero(known.ravel()) % columns + column))  # fmt: skip
+        shared = self.errors.variance_of_heights(places)
+        sigma[~known] = np.nan
+        sigma[known] = np.sqrt(np.maximum(sigma[known] ** 2 - shared, 0.0))
+        return height, sigma
+
+    def places_of(self, rows: NDArray[Any], columns: NDArray[Any]) -> Array:
+        """Places (N, 2) of the middles of cells."""
+        return np.column_stack([self.grid.east_of(columns + 0.5), self.grid.north_of(rows + 0.5)])
+
+    def at(self, places: Array) -> Samples:
+        """Heights at places (N, 2), close ones after each other."""
+        x = (places[:, 0] - self.grid.west) / self.grid.cell - 0.5
+        y = (self.grid.north - places[:, 1]) / self.grid.cell - 0.5
+        left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+        x, y = x - left, y - top
+        cells = np.stack(
+            [np.stack([top + down, left + right], axis=1) for down in (0, 1) for right in (0, 1)],
+            axis=1,
+        )
+        weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
+        heights, own = np.full(weights.shape, np.nan), np.full(weights.shape, np.nan)
+        for part in _runs(cells[:, 0]):
+            low = cells[part].min(axis=(0, 1))
+            rows, columns = cells[part].max(axis=(0, 1)) - low + 1
+            height, sigma = self.window(int(low[0]), int(low[1]), int(rows), int(columns))
+            index = tuple(np.moveaxis(cells[part] - low, 2, 0))
+            heights[part], own[part] = height[index], sigma[index]
+        # A cell of no weight need not be known.
+        idle = weights == 0.0
+        heights[idle & ~np.isfinite(heights)] = 0.0
+        own[idle & ~np.isfinite(own)] = 0.0
+        return Samples(
+            places=places, height=(weights * heights).sum(axis=1), cells=cells, weights=weights,
+            own=own, shared=self.errors.variance_of_heights(places),
+            sight=np.zeros((len(places), 2)),
+        )  # fmt: skip
+
+    def picked(self, places: Array) -> Samples:
+        """Spots that were picked where the mosaic shows them; see `sight_lines`."""
+        found = self.at(places)
+        lines = sight_lines(self.workspace, self.plane, found.points)
+        return found if lines is None else replace(found, sight=lines)
+
+    def known_at(self, places: Array) -> Samples:
+        """The same where each must have a height.
+
+        Raises:
+            ReconstructionError: one has none.
+        """
+        found = self.picked(places)
+        lost = np.flatnonzero(~np.isfinite(found.height))
+        if len(lost):
+            x, y = places[lost[0]]
+            raise ReconstructionError(
+                f"no height is known at {x:.3f} {self.axes[0]}, {y:.3f} {self.axes[1]}: choose a "
+                "place on the surface"
+            )
+        return found
+
+
+def grid_of(path: Path) -> DemGrid:
+    """The cells of a raster."""
+    with opened_raster(path) as raster:
+        return DemGrid(
+            west=float(raster.transform.c), north=float(raster.transform.f),
+            cell=float(raster.transform.a), rows=raster.height, columns=raster.width,
+        )  # fmt: skip
+
+
+def _runs(cells: NDArray[np.int64]) -> Iterator[slice]:
+    """Parts of a sequence of cells (N, 2), each within a window that may be read at once."""
+    start = 0
+    while start < len(cells):
+        end = len(cells)
+        while end - start > 1 and np.any(np.ptp(cells[start:end], axis=0) > _WINDOW_CELLS):
+            end = start + (end - start + 1) // 2
+        yield slice(start, end)
+        start = end
+
+
+def values_at(
+    workspace: Path, place: Sequence[float], files: Sequence[str] = RASTERS
+) -> Mapping[str, tuple[float, ...]]:
+    """Values of rasters of a workspace at a place, by their files; of a mosaic red, green, blue.
+
+    A raster that is not there, does not reach the place or knows nothing there is left out.
+
+    Args:
+        workspace: reconstructed.
+        place: right (east) and up (north).
+        files: of the rasters.
+    """
+    found = {}
+    for file in files:
+        path = workspace / file
+        if not path.is_file():
+            continue
+        with small_cache(), opened_raster(path) as raster:
+            row, column = raster.index(place[0], place[1])
+            if not (0 <= row < raster.height and 0 <= column < raster.width):
+                continue
+            part = Window(int(column), int(row), 1, 1)
+            bands = list(range(1, min(raster.count, 4) + 1))
+            values = raster.read(bands, window=part)[:, 0, 0]
+            seen = bool(raster.dataset_mask(window=part)[0, 0])
+        if seen and np.isfinite(values).all():
+            found[file] = tuple(float(value) for value in values[:3])
+    return found

@@ -1,0 +1,207 @@
+"""The tab Model in Chromium: measured by clicks and by keys, on the map and on the mesh."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from axe_playwright_python.sync_playwright import Axe
+from PIL import Image
+
+from alice_survey.base.artefacts import write_json
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.sketch import sketch_mesh
+from tests.alice_survey.report.tiny import SLOPE, tiny_workspace
+from tests.alice_survey.studio.client import serving
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+MAP = "#map-canvas"
+RISE = math.hypot(1.0, SLOPE)
+
+
+def with_mesh(folder: Path) -> Path:
+    """The tiny workspace, and a mesh about the middle of its surface."""
+    workspace = tiny_workspace(folder)
+    mesh = workspace / "mesh"
+    mesh.mkdir()
+    sketch_mesh(mesh).glb.rename(mesh / "mesh.glb")
+    parts = trimesh.load_scene(mesh / "mesh.glb").geometry.values()
+    about = {"area": 12.0, "textured_share": 1.0, "offset_east_north_up": [0.4, 0.6, -10.0]}
+    write_json(mesh / "mesh.json", {"triangles": sum(len(p.faces) for p in parts), **about})
+    Image.new("RGB", (40, 30)).save(mesh / "mesh.png")
+    write_json(mesh / "stage.json", {"stage": "mesh"})
+    return workspace
+
+
+@contextmanager
+def opened(folder: Path, width: int = 1280) -> Iterator[tuple[Any, Heard]]:
+    with serving(folder) as server, chromium() as browser:
+        page = browser.new_page(viewport={"width": width, "height": 900}, reduced_motion="reduce")
+        heard = Heard()
+        heard.listen(page)
+        page.goto(server.address + "#model")
+        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        page.wait_for_selector("#panel-model:visible")
+        yield page, heard
+        assert heard.complaints == []
+        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
+            server.url.split("/")[2]
+        }
+        page.close()
+
+
+def at(page: Any, east: float, north: float) -> dict[str, float]:
+    """Pixel of the map that shows a place."""
+    view = page.locator(MAP)
+    box = view.bounding_box()
+    zoom, e, n = (float(view.get_attribute(f"data-{name}")) for name in ("zoom", "east", "north"))
+    return {
+        "x": box["width"] / 2 + (east - e) * 2**zoom,
+        "y": box["height"] / 2 - (north - n) * 2**zoom,
+    }
+
+
+def click(page: Any, *places: tuple[float, float]) -> None:
+    for place in places:
+        page.locator(MAP).click(position=at(page, *place))
+        page.wait_for_timeout(60)
+
+
+def kept(page: Any) -> list[dict[str, Any]]:
+    text = page.evaluate(
+        "Object.entries(sessionStorage).find(([key]) => key.startsWith('alice-survey measures'))[1]"
+    )
+    found: list[dict[str, Any]] = json.loads(text)
+    return found
+
+
+def named(measure: dict[str, Any]) -> dict[str, Any]:
+    return {one["name"]: one for one in measure["figures"]}
+
+
+def measured(page: Any, count: int) -> list[dict[str, Any]]:
+    page.wait_for_selector(f"tr[data-measure] >> nth={count - 1}", timeout=20_000)
+    return kept(page)
+
+
+def test_lengths_areas_and_exports(tmp_path: Path) -> None:
+    with opened(with_mesh(tmp_path / "reef")) as (page, _):
+        page.locator(MAP).hover(position=at(page, 0.4, 0.6))
+        page.locator(".under", has_text="Sigma").wait_for(timeout=10_000)
+        page.locator("#map-readout", has_text="height −9.").wait_for(timeout=10_000)
+
+        page.get_by_role("button", name="Length", exact=True).click()
+        click(page, (0.2, 0.5), (0.6, 0.5))
+        (length,) = measured(page, 1)
+        true = math.dist(*length["places"])
+        assert true == pytest.approx(0.4, abs=0.01)
+        assert named(length)["length"]["value"] == pytest.approx(true * RISE, rel=1e-3)
+        page.wait_for_selector(".profile svg polyline")
+        page.locator(".profile").focus()
+        page.keyboard.press("End")
+        assert "along: −9.8" in page.locator(".profile + p").inner_text()
+
+        page.get_by_role("button", name="Volume", exact=True).click()
+        page.get_by_label("Plane of the volume").select_option("level")
+        page.get_by_label("Height of the plane, m").fill("-10")
+        click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
+        page.get_by_role("button", name="Finish (D)").click()
+        volume = measured(page, 2)[1]
+        assert named(volume)["volume"]["value"] == pytest.approx(0.2 * 0.5 * SLOPE, rel=0.05)
+        assert named(volume)["aspect"]["value"] == pytest.approx(270.0, abs=1.0)
+
+        page.get_by_label("Name of Length 1").fill("coral =1")
+        page.keyboard.press("Tab")
+        assert kept(page)[0]["name"] == "coral =1"
+        with page.expect_download() as found:
+            page.get_by_role("button", name="Export CSV").click()
+        rows = list(csv.DictReader(io.StringIO(Path(found.value.path()).read_text())))
+        assert {row["name"] for row in rows} == {"coral =1", "Volume 1"}
+        with page.expect_download() as found:
+            page.get_by_role("button", name="Export GeoJSON").click()
+        features = json.loads(Path(found.value.path()).read_text())["features"]
+        assert [one["geometry"]["type"] for one in features] == ["LineString", "Polygon"]
+
+        page.reload()
+        page.wait_for_selector("tr[data-measure] >> nth=1")
+        page.get_by_role("button", name="Delete coral =1").click()
+        assert [one["name"] for one in kept(page)] == ["Volume 1"]
+
+
+def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
+    with opened(with_mesh(tmp_path / "reef")) as (page, _):
+        page.locator(MAP).focus()
+        page.keyboard.press("p")
+        for key in ("ArrowRight", "ArrowUp", "ArrowLeft"):
+            page.keyboard.press("Enter")
+            page.keyboard.press(key)
+            page.wait_for_timeout(400)
+        page.keyboard.press("Enter")
+        page.keyboard.press("Backspace")
+        page.keyboard.press("d")
+        (line,) = measured(page, 1)
+        assert len(line["places"]) == 3
+        page.keyboard.press("r")
+        page.keyboard.press("Escape")
+        assert page.locator(MAP).get_attribute("data-tool") is None
+        page.keyboard.press("l")
+        page.keyboard.press("Enter")
+        page.keyboard.press("Enter")  # the same place is no length
+        page.wait_for_selector("#status.warn")
+        assert len(kept(page)) == 1
+
+
+def test_two_picks_on_the_mesh_are_a_length(tmp_path: Path) -> None:
+    import open3d as o3d
+
+    with opened(with_mesh(tmp_path / "reef")) as (page, _):
+        page.get_by_text("Mesh", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        canvas = page.locator("#mesh-canvas")
+        box = canvas.bounding_box()
+        canvas.click(position={"x": box["width"] * 0.45, "y": box["height"] * 0.5})
+        page.get_by_text("click another place").wait_for()
+        canvas.focus()
+        page.keyboard.press("Enter")
+        (length,) = measured(page, 1)
+        first, second = length["places"]
+        assert named(length)["length"]["value"] == pytest.approx(math.dist(first, second), rel=1e-6)
+        # picked points lie on the triangles of the file
+        mesh = trimesh.load_scene(tmp_path / "reef" / "mesh" / "mesh.glb").to_mesh()
+        points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+        assert scene.compute_distance(points.astype(np.float32)).numpy().max() < 1e-4
+        assert math.dist(first, second) > 1e-3
+        page.get_by_role("button", name="Larger, over the map").click()
+        assert canvas.bounding_box()["width"] > 800
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_it_is_accessible(width: int, tmp_path: Path) -> None:
+    with opened(with_mesh(tmp_path / "reef"), width) as (page, _):
+        page.get_by_role("button", name="Rugosity", exact=True).click()
+        page.get_by_label("Side of quadrats, m").fill("0.2")
+        click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
+        assert Axe().run(page).violations_count == 0
+        page.keyboard.press("d")
+        (area,) = measured(page, 1)
+        assert 4 <= len(area["quadrats"]) <= 6  # a row that is half outside
+        page.get_by_role("button", name="Profile", exact=True).click()
+        click(page, (0.2, 0.5), (0.6, 0.5), (0.6, 0.9))
+        page.keyboard.press("d")
+        measured(page, 2)
+        page.get_by_text("Mesh", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        for text in ("What the sigmas count", "Files"):
+            page.get_by_text(text, exact=True).click()
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width

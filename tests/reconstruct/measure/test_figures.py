@@ -1,0 +1,241 @@
+"""Figures of surfaces of known shape: closed forms, sigmas against draws of noise."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ellipe
+
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from reconstruct.measure.figures import Measured
+from reconstruct.measure.lines import measure_line, profile
+from reconstruct.measure.polygons import measure_polygon, quadrats
+from reconstruct.measure.surface import MeasuredSurface
+from tests.reconstruct.measure.synthetic import Drawn, Sigmas, grid, scaled, without_errors
+
+SQUARE = [(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)]
+SLANTED = [(-0.41, -0.32), (0.33, -0.4), (0.4, 0.21), (0.02, 0.43), (-0.35, 0.3)]
+
+
+def named(figures: Sequence[Measured]) -> dict[str, Measured]:
+    return {figure.name: figure for figure in figures}
+
+
+def ramp(x: Array, y: Array) -> Array:
+    return np.asarray(0.3 * x - 0.4 * y - 10.0)
+
+
+def waves(x: Array, y: Array) -> Array:
+    return np.asarray(0.02 * np.sin(2 * np.pi * x / 0.2) + 0.0 * y)
+
+
+def hills(x: Array, y: Array) -> Array:
+    return np.asarray(0.05 * np.sin(9 * x) * np.cos(7 * y) + 0.1 * x - 10.0)
+
+
+def test_a_tilted_plane_has_the_figures_of_geometry(tmp_path: Path) -> None:
+    surface = without_errors(tmp_path, grid(1.0, 0.01), ramp)
+    found = named(measure_polygon(surface, SLANTED, -10.2)[0])
+    x, y = np.array(SLANTED).T
+    area = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+    assert found["plan_area"].value == pytest.approx(area, rel=1e-9)
+    assert found["rugosity"].value == pytest.approx(np.sqrt(1.25), rel=1e-6)
+    assert found["surface_area"].value == pytest.approx(np.sqrt(1.25) * area, rel=1e-6)
+    assert found["slope"].value == pytest.approx(np.degrees(np.arctan(0.5)), abs=1e-3)
+    # down is west and north: 0.3 of each metre to the east goes up, 0.4 to the north goes down
+    assert found["aspect"].value == pytest.approx(360 - np.degrees(np.arctan2(0.3, 0.4)), abs=1e-3)
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    middle = np.array([np.sum((a + np.roll(a, -1)) * cross) / (6 * area) for a in (x, y)])
+    height = ramp(*middle) + 10.2
+    assert found["volume"].value == pytest.approx(height * area, rel=1e-5)
+    over_rim = named(measure_polygon(surface, SLANTED, "rim")[0])
+    for name in ("volume", "above", "below"):
+        assert over_rim[name].value == pytest.approx(0.0, abs=1e-6 * area)
+    line = named(measure_line(surface, [(-0.2, 0.1), (0.2, 0.4)]))
+    rise = 0.3 * 0.4 - 0.4 * 0.3
+    assert line["height_difference"].value == pytest.approx(rise, abs=1e-6)
+    line = named(measure_line(surface, [(0.0, -0.2), (0.0, 0.3)]))
+    assert line["slope"].value == pytest.approx(-np.degrees(np.arctan(0.4)), abs=1e-3)
+    for name in ("length", "surface_length"):
+        assert line[name].value == pytest.approx(0.5 * np.sqrt(1.16), rel=1e-5)
+
+
+def test_a_hemisphere_has_its_area_and_volume(tmp_path: Path) -> None:
+    def dome(x: Array, y: Array) -> Array:
+        return np.sqrt(np.maximum(0.3**2 - x**2 - y**2, 0.0))
+
+    surface = without_errors(tmp_path, grid(1.0, 0.004), dome)
+    found = named(measure_polygon(surface, SQUARE, 0.0)[0])
+    assert found["above"].value == pytest.approx(2 / 3 * np.pi * 0.3**3, rel=2e-3)
+    assert found["below"].value == pytest.approx(0.0, abs=1e-9)
+    # a vertical rim is steeper than any cell: seen from above, all that is less than 70° steep
+    angles = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    cap = 0.3 * np.sin(np.radians(70)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    found = named(measure_polygon(surface, cap.tolist(), None)[0])
+    assert found["surface_area"].value == pytest.approx(
+        2 * np.pi * 0.3**2 * (1 - np.cos(np.radians(70))), rel=2e-3
+    )
+    assert "volume" not in found
+    rim = named(measure_polygon(surface, cap.tolist(), "rim")[0])
+    height = 0.3 * (1 - np.cos(np.radians(70)))
+    volume = np.pi * height**2 * (3 * 0.3 - height) / 3
+    assert rim["volume"].value == pytest.approx(volume, rel=5e-3)
+
+
+def test_waves_are_as_rough_as_their_arc_is_long(tmp_path: Path) -> None:
+    surface = without_errors(tmp_path, grid(1.0, 0.004), waves)
+    steep = 2 * np.pi * 0.02 / 0.2
+    # the arc of a sine over its length: 2/π √(1 + k²) E(k² / (1 + k²))
+    arc = 2 / np.pi * np.sqrt(1 + steep**2) * ellipe(steep**2 / (1 + steep**2))
+    found = named(measure_polygon(surface, SQUARE, None)[0])
+    assert found["rugosity"].value == pytest.approx(arc, rel=1e-3)
+    line = named(measure_line(surface, [(-0.4, 0.01), (0.4, 0.01)]))
+    assert line["surface_length"].value == pytest.approx(arc * 0.8, rel=2e-3)
+    squares = quadrats(surface, SQUARE, 0.2)
+    assert len(squares) == 16
+    for square in squares:
+        assert named(square.figures)["rugosity"].value == pytest.approx(arc, rel=2e-3)
+        assert named(square.figures)["plan_area"].value == pytest.approx(0.04, rel=1e-9)
+
+
+def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:
+    """Without the correction a level floor would be 1 + v of slope noise v a side."""
+    cells, rng = grid(1.0, 0.01), np.random.default_rng(5)
+    for sigma in (0.001, 0.002):
+        drawn = Drawn(tmp_path, cells, lambda x, y: 0.0 * x, Sigmas(own=sigma))
+        noise = 2 * sigma**2 * (1 - np.exp(-1.0)) / 0.01**2
+        rough, line = [], []
+        for _ in range(4):
+            surface, _ = drawn.draw(rng)
+            rough.append(named(measure_polygon(surface, SQUARE, None)[0])["rugosity"].value - 1)
+            found = named(measure_line(surface, [(-0.4, 0.0), (0.4, 0.0)]))
+            line.append(found["surface_length"].value / 0.8 - 1)
+        assert abs(np.mean(rough)) < 0.15 * noise, (sigma, np.mean(rough) / noise)
+        assert abs(np.mean(line)) < 0.25 * noise, (sigma, np.mean(line) / noise)
+
+
+def test_a_sigma_that_is_too_large_takes_no_roughness_below_that_of_a_plane(tmp_path: Path) -> None:
+    drawn = Drawn(tmp_path, grid(1.0, 0.01), ramp, Sigmas(own=0.02))
+    surface = drawn.true
+    found = named(measure_polygon(surface, SQUARE, None)[0])
+    assert found["rugosity"].value == pytest.approx(np.sqrt(1.25), rel=1e-4)
+    line = named(measure_line(surface, [(0.0, -0.2), (0.0, 0.3)]))
+    assert line["surface_length"].value == pytest.approx(0.5 * np.sqrt(1.16), rel=1e-4)
+
+
+ALL = Sigmas(own=0.0012, shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
+
+
+@pytest.mark.parametrize(
+    "sigmas",
+    [
+        Sigmas(own=0.0012),
+        Sigmas(shift=0.004, tilt=0.002, scale=0.002, bend=0.004),
+        ALL,
+    ],
+    ids=["own", "shared", "all"],
+)
+def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> None:
+    drawn, rng = Drawn(tmp_path, grid(1.0, 0.0125), hills, sigmas), np.random.default_rng(7)
+    places = np.array([(-0.31, -0.22), (0.05, 0.13), (0.36, 0.17)])
+    exact = without_errors(tmp_path, drawn.cells, hills)
+    line, region = measure_line(exact, places.tolist()), measure_polygon(exact, SLANTED, -10.05)[0]
+    over_rim = named(measure_polygon(exact, SLANTED, "rim")[0])
+    true = {f"line {one.name}": one.value for one in line} | {one.name: one.value for one in region}
+    true["rim"] = over_rim["volume"].value
+    misses = defaultdict(list)
+    stated = defaultdict(list)
+    for _ in range(40):
+        surface, moved = drawn.draw(rng)
+        line = named(measure_line(surface, moved(places).tolist()))
+        corners = moved(np.array(SLANTED)).tolist()
+        region = named(measure_polygon(surface, corners, -10.05)[0])
+        found = {
+            **{f"line {name}": one for name, one in line.items()},
+            **region,
+            "rim": named(measure_polygon(surface, corners, "rim")[0])["volume"],
+        }
+        for name, one in found.items():
+            misses[name].append(one.value - true[name])
+            stated[name].append(one.sigma)
+    ratios = {
+        name: float(np.sqrt(np.mean(np.square(errors))) / np.mean(stated[name]))
+        for name, errors in misses.items()
+        if np.mean(stated[name]) > 1e-6
+    }
+    wanted = {"line length", "line height_difference", "line surface_length", "surface_area",
+              "rugosity", "rim", "volume", "mean_height"}  # fmt: skip
+    assert wanted <= ratios.keys()
+    # 40 draws know a sigma to 11 %
+    for name in ("above", "below"):  # noise near the plane counts in full
+        assert ratios.pop(name, 1.0) < 1.4
+    wrong = {name: ratio for name, ratio in ratios.items() if not 0.7 < ratio < 1.4}
+    assert not wrong, ratios
+
+
+def test_a_scale_known_apart_counts_by_the_dimension(tmp_path: Path) -> None:
+    surface = scaled(without_errors(tmp_path, grid(1.0, 0.02), hills), 0.01)
+    found = named(measure_polygon(surface, SQUARE, -10.2)[0])
+    line = named(measure_line(surface, [(-0.3, 0.0), (0.3, 0.2)]))
+    powers = {"plan_area": 2, "surface_area": 2, "volume": 3, "rugosity": 0}
+    for one, power in [*((found[k], n) for k, n in powers.items()), (line["length"], 1),
+                       (line["slope"], 0)]:  # fmt: skip
+        assert one.sigma == pytest.approx(0.01 * power * abs(one.value), rel=1e-9, abs=1e-12)
+
+
+def test_what_is_unknown_is_said(tmp_path: Path) -> None:
+    def holed(x: Array, y: Array) -> Array:
+        return np.where(np.hypot(x - 0.2, y) < 0.1, np.nan, 0.1 * x)
+
+    surface = without_errors(tmp_path, grid(1.0, 0.01), holed)
+    figures, notes = measure_polygon(surface, SQUARE, "rim")
+    found = named(figures)
+    known = 1 - np.pi * 0.1**2 / 0.64
+    assert found["surface_area"].value == pytest.approx(0.64 * known * np.sqrt(1.01), rel=2e-2)
+    assert found["rugosity"].value == pytest.approx(np.sqrt(1.01), rel=1e-6)
+    assert "95." in notes[0] or "94." in notes[0]
+    line = named(measure_line(surface, [(-0.3, 0.0), (0.4, 0.0)]))
+    assert np.isnan(line["surface_length"].value)
+    assert line["length"].value == pytest.approx(0.7 * np.sqrt(1.01), rel=1e-6)
+    for wrong in ([(0.2, 0.0), (0.4, 0.0)], [(0.0, 0.0), (0.0, 0.0)], [(0.0, 0.0), (3.0, 0.0)]):
+        with pytest.raises(ReconstructionError):
+            measure_line(surface, wrong)
+    for wrong in (SQUARE[:2], [SQUARE[k] for k in (0, 2, 1, 3)], [(x + 4, y) for x, y in SQUARE]):
+        with pytest.raises(ReconstructionError):
+            measure_polygon(surface, wrong, None)
+    hole = [(0.15, -0.05), (0.25, -0.05), (0.25, 0.05)]
+    with pytest.raises(ReconstructionError):
+        measure_polygon(surface, hole, None)
+    for side in (0.001, 0.021, 3.0):
+        with pytest.raises(ReconstructionError):
+            quadrats(surface, SQUARE, side)
+
+
+def test_parts_of_a_large_polygon_add_up(tmp_path: Path) -> None:
+    """More blocks than one, against the same polygon cut in two."""
+    drawn = Drawn(tmp_path, grid(12.0, 0.02), hills, Sigmas(own=0.001))
+    surface: MeasuredSurface = drawn.draw(np.random.default_rng(1))[0]
+    left = [(-5.5, -3.0), (0.105, -3.0), (0.105, -1.0), (-5.5, -1.0)]
+    right = [(0.105, -3.0), (5.5, -3.0), (5.5, -1.0), (0.105, -1.0)]
+    whole = [left[0], right[1], right[2], left[3]]
+    parts = [named(measure_polygon(surface, part, -10.2)[0]) for part in (left, right, whole)]
+    for name in ("surface_area", "volume", "above", "below", "plan_area"):
+        assert parts[0][name].value + parts[1][name].value == pytest.approx(
+            parts[2][name].value, rel=1e-6
+        )
+    own = [part["volume"].own for part in parts]
+    assert np.hypot(own[0], own[1]) == pytest.approx(own[2], rel=0.01)
+
+
+def test_a_profile_passes_its_corners(tmp_path: Path) -> None:
+    surface = without_errors(tmp_path, grid(1.0, 0.01), hills)
+    corners = [(-0.3, -0.2), (0.1, 0.1), (0.1, 0.4)]
+    found = profile(surface, corners)
+    np.testing.assert_allclose(found.samples.places[list(found.corners)], corners, atol=1e-12)
+    np.testing.assert_allclose(found.along[list(found.corners)], [0.0, 0.5, 0.8], atol=1e-12)
+    assert np.diff(found.along).max() <= 0.01 + 1e-12
+    true = hills(*found.samples.places.T)
+    assert np.abs(found.samples.height - true).max() < 2e-4
