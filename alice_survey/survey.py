@@ -120,7 +120,7 @@ def run(
 
     lines, found = [], {}
     executor = executor or local_executor()
-    with _only_one(workspace):
+    with only_one(workspace):
         if "fly" in stages and "plan" not in stages:
             by = flight or FlightChanges()  # what a plan may have been made with
             alike = [planned, changed(planned, "vehicle", name=by.vehicle)]
@@ -324,7 +324,7 @@ def status_report(
 
 
 @contextlib.contextmanager
-def _only_one(workspace: Path) -> Iterator[None]:
+def only_one(workspace: Path) -> Iterator[None]:
     """Lock the workspace so that no second run writes into it."""
     lock = FileLock(workspace / ".lock", timeout=0)
     try:

@@ -89,8 +89,8 @@ def test_a_workspace_that_cannot_be_written_is_named(disk: Path) -> None:
 def _holder(workspace: Path) -> subprocess.Popen[str]:
     """Another process that works in the workspace until it is killed."""
     code = (
-        "import sys, time; from pathlib import Path; from alice_survey.survey import _only_one\n"
-        "with _only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
+        "import sys, time; from pathlib import Path; from alice_survey.survey import only_one\n"
+        "with only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(workspace)], stdout=subprocess.PIPE, text=True

@@ -1,42 +1,53 @@
-/* The report's map, part 2 of 2: what lies over the pictures, and the controls. */
+/* The map of pages and of the studio, part 2 of 2: what lies over the pictures, and the controls. */
 
 const RIMMED = 20;
 
-/* Metres east and north stand where Leaflet has longitude and latitude. */
-function startMap() {
-  const data = JSON.parse(document.getElementById("map-data").textContent);
-  const root = document.getElementById("map");
+/* Metres east and north stand where Leaflet has longitude and latitude. Returns Leaflet's map and
+   what changes it: `put` and `remove` a layer that is described as in `data.layers`, `show` one,
+   `fit` all, `moreAt` a place in the line below the map, `take` clicks for a tool and `release`. */
+function startMap(data, root) {
   const box = document.getElementById("map-canvas");
   const readout = document.getElementById("map-readout");
-  const [west, south, east, north] = data.extent;
-  const whole = leaflet.latLngBounds([south, west], [north, east]);
   root.hidden = false;
   root.parentElement.classList.add("lives");
 
-  const pixels = data.layers.filter((layer) => layer.kind === "picture").map((layer) => layer.pixel);
-  const span = Math.max(east - west, north - south) || 1;
-  const finest = Math.min(...pixels, span / 500);
   const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
   const map = new leaflet.Map(box, {
     crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false,
-    zoomSnap: 0.25, wheelPxPerZoomLevel: 90, maxZoom: Math.log2(16 / finest),
-    minZoom: Math.log2(60 / span), scrollWheelZoom: false, zoomAnimation: !still,
+    zoomSnap: 0.25, wheelPxPerZoomLevel: 90, scrollWheelZoom: false, zoomAnimation: !still,
     fadeAnimation: false, renderer: leaflet.canvas({tolerance: 6, padding: 0.3}),
   });
   map.createPane("pictures").style.zIndex = 200;
   map.createPane("over").style.zIndex = 300;
-  const showAll = () => map.fitBounds(whole, {padding: [24, 24], animate: !still});
+  const layers = new Map();
+  let whole = null;
+  const fit = (animate) => map.fitBounds(whole, {padding: [24, 24], animate});
+
+  /* What the map holds: west, south, east and north limits. */
+  function extend([west, south, east, north]) {
+    whole = leaflet.latLngBounds([south, west], [north, east]);
+    const span = Math.max(east - west, north - south) || 1;
+    const pixels = [...layers.values()].filter((layer) => layer.about).map((layer) => layer.about.pixel);
+    map.setMaxZoom(Math.log2(16 / Math.min(span / 500, ...pixels)));
+    map.setMinZoom(Math.log2(60 / span));
+  }
 
   /* A page that scrolls must not stop at its map: the wheel zooms only what was chosen. */
   box.addEventListener("focusin", () => map.scrollWheelZoom.enable());
   box.addEventListener("focusout", () => map.scrollWheelZoom.disable());
 
-  const layers = new Map(data.layers.map((about) => [
-    about.name,
-    about.kind === "picture"
-      ? new Pyramid(about, about.base ? "pictures" : "over")
-      : shapesOf(about),
-  ]));
+  /* Take a layer, instead of another of its name. */
+  function put(about) {
+    remove(about.name);
+    const layer = about.kind === "picture"
+      ? new Pyramid(about, about.base ? "pictures" : "over") : shapesOf(about);
+    layers.set(about.name, layer);
+    return layer;
+  }
+  function remove(name) {
+    layers.get(name)?.remove();
+    layers.delete(name);
+  }
 
   function shapesOf(about) {
     const places = (shape) => shape.map(([e, n]) => [n, e]);
@@ -61,7 +72,7 @@ function startMap() {
           fillOpacity: about.fill, ...dashes,
         });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
-      drawn.on("click", (event) => { if (!ruler.on) describe(drawn, event.latlng); });
+      drawn.on("click", (event) => { if (!tool) describe(drawn, event.latlng); });
       group.addLayer(drawn);
     });
     group.kind = about.kind;
@@ -127,39 +138,62 @@ function startMap() {
     });
   }
 
-  /* Lengths between places that are clicked, or that Enter takes from the middle. */
-  const ruler = {on: false, places: [], line: leaflet.polyline([], {
-    color: "#8e44ad", weight: 2.5, dashArray: "6 3", interactive: false,
-  }).addTo(map)};
-  const ruled = (places) => places.slice(1).reduce(
-    (sum, place, i) => sum + Math.hypot(place.lat - places[i].lat, place.lng - places[i].lng), 0,
-  );
-  function measure(on) {
-    ruler.on = on;
-    ruler.places = [];
-    ruler.line.setLatLngs([]);
-    root.querySelector('[data-act="measure"]').setAttribute("aria-pressed", String(on));
-    if (on) map.closePopup();
+  /* Places that are clicked, or that Enter takes from the middle, go to the tool in hand, if any:
+     its `click`, its `move`, its `text` for the line below the map, its `end`, and its `keys`. */
+  let tool = null;
+  function take(taken) {
+    release();
+    tool = taken;
+    map.closePopup();
+    box.dataset.tool = taken.name || "";
     readCentre();
   }
-  function addPlace(place) {
-    ruler.places.push(place);
-    ruler.line.setLatLngs(ruler.places);
-    read("", place);
+  function release() {
+    const ended = tool;
+    tool = null;
+    delete box.dataset.tool;
+    if (ended && ended.end) ended.end();
+    readCentre();
   }
 
-  /* What a script of the page's own, before this one, adds for a place. */
-  let more = () => "";
+  function ruler() {
+    const places = [];
+    const line = leaflet.polyline([], {
+      color: "#8e44ad", weight: 2.5, dashArray: "6 3", interactive: false,
+    }).addTo(map);
+    const button = root.querySelector('[data-act="measure"]');
+    button.setAttribute("aria-pressed", "true");
+    return {
+      name: "ruler",
+      click(place) {
+        places.push(place);
+        line.setLatLngs(places);
+      },
+      move: (place) => line.setLatLngs([...places, place]),
+      text(place) {
+        const all = [...places, place];
+        const total = all.slice(1).reduce(
+          (sum, end, i) => sum + Math.hypot(end.lat - all[i].lat, end.lng - all[i].lng), 0,
+        );
+        return places.length ? "; measured " + lengthText(total, data.unit, 4) : "; click to measure";
+      },
+      end() {
+        line.remove();
+        button.setAttribute("aria-pressed", "false");
+      },
+    };
+  }
+  const measure = () => (tool && tool.name === "ruler" ? release() : take(ruler()));
+
+  /* What others add for a place, each a function of it. */
+  const more = [];
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
     let text = word + e + " " + data.unit + " " + data.axes[0] + ", " + n + " " + data.unit + " " + data.axes[1];
     if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
-    if (ruler.on) {
-      const total = lengthText(ruled([...ruler.places, place]), data.unit, 4);
-      text += ruler.places.length ? "; measured " + total : "; click to measure";
-    }
-    readout.textContent = text + more(place);
+    if (tool && tool.text) text += tool.text(place);
+    readout.textContent = text + more.map((add) => add(place)).join("");
   }
   const readCentre = () => read("Middle: ", map.getCenter());
 
@@ -172,6 +206,11 @@ function startMap() {
     bar.firstChild.textContent = lengthText(length, data.unit);
   }
 
+  function click(place) {
+    if (!tool) return;
+    tool.click(place);
+    read("", place);
+  }
   map.on("moveend zoomend", () => {
     note();
     readCentre();
@@ -179,15 +218,17 @@ function startMap() {
   });
   map.on("mousemove", (event) => {
     read("", event.latlng);
-    if (ruler.on) ruler.line.setLatLngs([...ruler.places, event.latlng]);
+    if (tool && tool.move) tool.move(event.latlng);
   });
-  map.on("click", (event) => { if (ruler.on) addPlace(event.latlng); });
+  map.on("click", (event) => click(event.latlng));
   map.on("mouseout", readCentre);
   map.on("tilelost", () => {
     readout.textContent = "A part of the picture did not come: load this page again";
   });
-  map.fitBounds(whole, {padding: [24, 24], animate: false});
-  if (typeof extendMap === "function") more = extendMap(map, layers, data.more);
+  data.layers.forEach(put);
+  extend(data.extent);
+  fit(false);
+  if (typeof extendMap === "function") more.push(extendMap(map, layers, data.more));
 
   root.querySelectorAll("input").forEach((input) => {
     if (input.checked) show(input.value, true);
@@ -200,15 +241,15 @@ function startMap() {
       show(input.value, input.checked);
     });
   });
-  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll, measure: () => measure(!ruler.on)};
+  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: () => fit(!still), measure};
   root.querySelectorAll("button[data-act]").forEach((button) => {
     button.addEventListener("click", acts[button.dataset.act]);
   });
   box.addEventListener("keydown", (event) => {
     if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
-    const enter = ruler.on ? () => addPlace(map.getCenter()) : describeMiddle;
-    const act = {
-      0: showAll, Enter: enter, m: acts.measure, Escape: ruler.on ? () => measure(false) : null,
+    const act = tool?.keys?.[event.key] || {
+      0: acts.all, Enter: tool ? () => click(map.getCenter()) : describeMiddle, m: measure,
+      Escape: tool ? release : null,
     }[event.key];
     if (!act) return;
     event.preventDefault();
@@ -216,6 +257,10 @@ function startMap() {
   });
   new ResizeObserver(() => map.invalidateSize({pan: false})).observe(box);
   root.dataset.ready = "";
+  return {
+    leaflet: map, layers, put, remove, show, extend, fit: () => fit(!still), take, release,
+    data, moreAt: (add) => more.push(add), refresh: readCentre,
+  };
 }
 
 /* Latitude and longitude are quadratic in metres north and east. */
@@ -233,4 +278,6 @@ function lengthText(length, unit, digits = 2) {
   return length >= 0.01 ? places(length * 100) + " cm" : places(length * 1000) + " mm";
 }
 
-startMap();
+if (document.getElementById("map-data")) {
+  startMap(JSON.parse(document.getElementById("map-data").textContent), document.getElementById("map"));
+}

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import secrets
 import socket
 import threading
 from collections.abc import Callable
@@ -10,7 +11,6 @@ from typing import Any
 
 from alice_survey.base.errors import WorkspaceError, why
 from alice_survey.base.run.interrupts import for_other_programs
-from alice_survey.report.held import Held
 from alice_survey.studio.layers import Layers
 from alice_survey.studio.paths import Workspace
 
@@ -19,6 +19,7 @@ try:
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     from alice_survey.studio.app import application
+    from alice_survey.studio.endpoints.base import Studio
 except ImportError as missing:
     raise WorkspaceError(
         f"the studio needs {missing.name}, which is not installed: "
@@ -69,18 +70,24 @@ class _TimedConnection(H11Protocol):
 class Server:
     """Serves one workspace until it is shut down."""
 
-    def __init__(self, folder: Path, port: int = 0) -> None:
+    def __init__(self, folder: Path, port: int = 0, *, log: str | None = None) -> None:
         """Listen.
 
         Args:
             folder: folder of the workspace.
             port: 0 for any that is free.
+            log: where the navigation of a dive comes from.
 
         Raises:
             WorkspaceError: the port is not available.
         """
         workspace = Workspace(folder)
-        self._layers = Layers(workspace)
+        self.studio = Studio(
+            workspace=workspace,
+            layers=Layers(workspace),
+            token=secrets.token_urlsafe(24),
+            log=log,
+        )
         try:
             self.socket = socket.create_server((ADDRESS, port), backlog=128)
         except OSError as error:
@@ -92,7 +99,7 @@ class Server:
         hosts = {f"{name}:{self.port}" for name in names} | (set(names) if port == 80 else set())
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
-                application(workspace, self._layers, frozenset(hosts)),
+                application(self.studio, frozenset(hosts)),
                 http=_TimedConnection,
                 ws="none",
                 lifespan="off",
@@ -107,8 +114,13 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Where the survey's page is."""
+        """Where the studio is."""
         return f"http://{ADDRESS}:{self.port}/"
+
+    @property
+    def address(self) -> str:
+        """The same with the token that a page needs to change anything."""
+        return f"{self.url}?token={self.studio.token}"
 
     def serve_forever(self) -> None:
         """Answer until an interruption of this thread, or `shutdown` from another.
@@ -127,39 +139,44 @@ class Server:
 
     def shutdown(self) -> None:
         """End `serve_forever`."""
+        self.studio.ending.set()
         self._uvicorn.should_exit = True
 
     def close(self) -> None:
         """Stop listening, and wait briefly for what is being read."""
         with contextlib.suppress(OSError):
             self.socket.close()
-        self._layers.close()
+        self.studio.layers.close()
 
 
-def run_studio(workspace: Path, port: int, *, browser: bool, show: Callable[[str], Any]) -> None:
+def run_studio(
+    workspace: Path,
+    port: int,
+    *,
+    browser: bool,
+    show: Callable[[str], Any],
+    log: str | None = None,
+) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
     Args:
-        workspace: the workspace to show.
+        workspace: the workspace; it need not exist yet.
         port: to listen on; 0 for any that is free.
         browser: open one.
         show: prints a line.
+        log: where the navigation of a dive comes from.
 
     Raises:
-        WorkspaceError: there is nothing to show, or the port is taken.
+        WorkspaceError: the port is taken.
     """
-    if not Held.of(workspace).stages:
-        raise WorkspaceError(
-            f"{workspace} holds nothing to show: run 'alice-survey plan' or 'import-images'"
-        )
-    server = Server(workspace, port)
+    server = Server(workspace, port, log=log)
     try:
-        show(f"{workspace} is shown at {server.url} to this machine alone; Ctrl-C ends it")
+        show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:
             import webbrowser
 
             with for_other_programs():
-                webbrowser.open(server.url)
+                webbrowser.open(server.address)
         server.serve_forever()
     finally:
         server.close()

@@ -67,7 +67,7 @@ def test_a_model_without_a_place_is_shown(tmp_path: Path, scaled: bool) -> None:
     workspace = tiny_workspace(tmp_path, scaled=scaled, placed=False)
     (workspace / "plan" / "stage.json").unlink()
     with serving(workspace) as server:
-        reply = ask(server, "/")
+        reply = ask(server, "/api/map")
     assert reply.status == 200
     assert '"name":"cameras"' in reply.text
 
@@ -320,7 +320,7 @@ def test_a_gis_reads_the_mosaic_by_parts(server: Server, folder: Path) -> None:
 def test_many_at_once(server: Server) -> None:
     paths = [
         "/tiles/mosaic/1/0/0.webp", "/tiles/mosaic/1/0/1.webp", "/tiles/height/0/0/0.webp",
-        "/tiles/sigma/0/0/0.webp", "/files/dense/dem.tif", "/files/", "/none", "/",
+        "/tiles/sigma/0/0/0.webp", "/files/dense/dem.tif", "/files/", "/none", "/", "/api/map",
     ]  # fmt: skip
     expected = {path: ask(server, path).body for path in paths}
     faults: list[object] = []
@@ -373,7 +373,7 @@ def test_a_stage_made_again_while_it_is_served(tmp_path: Path) -> None:
                 replies += [
                     ask(server, "/tiles/height/0/0/0.webp"),
                     ask(server, "/files/dense/dem.tif"),
-                    ask(server, "/"),
+                    ask(server, "/api/map"),
                 ]
         finally:
             stop.set()
@@ -381,13 +381,13 @@ def test_a_stage_made_again_while_it_is_served(tmp_path: Path) -> None:
         assert {reply.status for reply in replies} <= {200, 404, 409}
         assert {reply.body for reply in replies[0::3] if reply.status == 200} <= {same}
         assert {reply.body for reply in replies[1::3] if reply.status == 200} <= {content}
-        assert ask(server, "/").status == 200
+        assert ask(server, "/api/map").status == 200
 
 
 def test_an_old_page_has_to_be_loaded_again(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     with serving(workspace) as server:
-        before = address_of_tiles(ask(server, "/").text)
+        before = address_of_tiles(ask(server, "/api/map").text)
         assert ask(server, before.replace("{}", "0/0/0")).status == 200
         with rasterio.open(workspace / "dense" / "dem.tif", "r+") as raster:
             raster.write(raster.read() + 3.0)
@@ -395,12 +395,12 @@ def test_an_old_page_has_to_be_loaded_again(tmp_path: Path) -> None:
         assert (stale.status, stale.text) == (
             409, "the survey was worked on meanwhile: load the page again\n",
         )  # fmt: skip
-        after = address_of_tiles(ask(server, "/").text)
+        after = address_of_tiles(ask(server, "/api/map").text)
         assert after != before
         assert ask(server, after.replace("{}", "0/0/0")).status == 200
         shutil.rmtree(workspace / "dense")
         assert ask(server, after.replace("{}", "0/0/0")).status == 404
-        assert "/tiles/height/" not in ask(server, "/").text
+        assert "/tiles/height/" not in ask(server, "/api/map").text
 
 
 def address_of_tiles(page: str) -> str:
@@ -415,10 +415,10 @@ def test_damaged_files_are_reported_in_a_line(tmp_path: Path) -> None:
     (workspace / "dense" / "sigma.tif").write_text("no raster")
     (workspace / "dense" / "surface.json").write_text("{")
     with serving(workspace) as server:
-        for path in ("/tiles/mosaic/1/0/1.webp", "/tiles/sigma/0/0/0.webp", "/"):
+        for path in ("/tiles/mosaic/1/0/1.webp", "/tiles/sigma/0/0/0.webp", "/api/map"):
             reply = ask(server, path)
             assert reply.status == 500
-            assert reply.text.count("\n") == 1
+            assert len(reply.text.splitlines()) == 1
         assert ask(server, "/tiles/height/0/0/0.webp").status == 200
 
 

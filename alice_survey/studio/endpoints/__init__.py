@@ -1,0 +1,1 @@
+"""What the tabs of the studio ask the server for: one module each, found by its `endpoints`."""

@@ -1,0 +1,183 @@
+"""Endpoints of the studio: what one is, what it is asked, and what it may use."""
+
+import asyncio
+import contextlib
+import json
+import math
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import AliceError
+from alice_survey.studio.layers import Layers
+from alice_survey.studio.paths import Workspace
+
+M = TypeVar("M", bound=BaseModel)
+_ALIVE_S = 5.0
+"""Time after which a silent stream of events says that it is there."""
+_MOST_WAITING = 1000
+"""Events that a page may be behind; a slower one misses the oldest."""
+
+
+class StaleError(AliceError):
+    """What a page wants to change is no longer what it has seen."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Content:
+    """An answer that is not JSON."""
+
+    data: bytes
+    kind: str
+    """Content type."""
+    tag: str = ""
+    """Token of what it is of; empty for an answer that is not to be kept."""
+    name: str = ""
+    """File name to save it by; empty for one to be shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Call:
+    """A request to an endpoint."""
+
+    query: Mapping[str, str]
+    path: Mapping[str, str]
+    """Values of the parts in braces of the endpoint's path."""
+    body: bytes = b""
+
+    def read(self, kind: type[M]) -> M:
+        """The body as a model.
+
+        Raises:
+            AliceError: it is not one; the line names the first value that is wrong.
+        """
+        try:
+            return kind.model_validate_json(self.body)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise AliceError(f"the request: {place or 'its body'}: {shown(first['msg'])}") from None
+
+    def number(self, name: str) -> float:
+        """A finite number of the query.
+
+        Raises:
+            AliceError: it is missing, or no number.
+        """
+        with contextlib.suppress(KeyError, ValueError):
+            value = float(self.query[name])
+            if math.isfinite(value):
+                return value
+        raise AliceError(f"the request needs a number as {name}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Endpoint:
+    """Something that a page may ask for."""
+
+    path: str
+    """From `/api/` on; `{name}` and `{name:path}` stand for a part of it."""
+    answer: Callable[[Call], Any]
+    """Runs in a thread. Returns JSON values, or `Content`. A number that is not finite is null."""
+    method: Literal["GET", "POST"] = "GET"
+    writes: bool = False
+    """Whether files change, or files outside of the workspace are named: needs the token."""
+    most_bytes: int = 1 << 20
+    """Largest body."""
+
+    def __post_init__(self) -> None:
+        if self.writes and self.method != "POST":
+            raise ValueError(f"{self.path} writes, and is not POST")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Studio:
+    """What endpoints share."""
+
+    workspace: Workspace
+    layers: Layers
+    token: str
+    """What a page has to show to change anything."""
+    log: str | None = None
+    """Where the navigation of a dive comes from, as `--log` names it."""
+    events: "Events" = field(default_factory=lambda: Events())
+    ending: threading.Event = field(default_factory=threading.Event)
+    """Set when the studio ends: threads of endpoints have to end then."""
+
+    def publish(self, event: str, data: Any) -> None:
+        """Send an event to every page; any thread may."""
+        self.events.publish(event, data)
+
+    @contextlib.contextmanager
+    def only_writer(self) -> Iterator[None]:
+        """Keep commands and other pages from working in the workspace.
+
+        Raises:
+            WorkspaceError: one does already.
+        """
+        from alice_survey.survey import only_one
+
+        with only_one(self.workspace.folder):
+            yield
+
+
+class Events:
+    """Server-sent events (WHATWG HTML, 9.2) for any number of pages."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pages: dict[asyncio.Queue[str], asyncio.AbstractEventLoop] = {}
+
+    def publish(self, event: str, data: Any) -> None:
+        """Send an event to every page; any thread may."""
+        text = f"event: {event}\ndata: {json_text(data)}\n\n"
+        with self._lock:
+            for queue, loop in self._pages.items():
+                with contextlib.suppress(RuntimeError):  # the loop has ended
+                    loop.call_soon_threadsafe(_put, queue, text)
+
+    async def stream(self, ended: Callable[[], bool]) -> AsyncIterator[str]:
+        """Events from now on, until the server ends."""
+        queue: asyncio.Queue[str] = asyncio.Queue()
+        with self._lock:
+            self._pages[queue] = asyncio.get_running_loop()
+        try:
+            yield "retry: 1000\n\n"
+            silent_s = 0.0
+            while not ended():
+                try:
+                    yield await asyncio.wait_for(queue.get(), 0.5)
+                    silent_s = 0.0
+                except TimeoutError:
+                    silent_s += 0.5
+                    if silent_s >= _ALIVE_S:
+                        silent_s = 0.0
+                        yield ": still here\n\n"
+        finally:
+            with self._lock:
+                self._pages.pop(queue, None)
+
+
+def _put(queue: asyncio.Queue[str], text: str) -> None:
+    if queue.qsize() >= _MOST_WAITING:
+        queue.get_nowait()
+    queue.put_nowait(text)
+
+
+def json_text(values: Any) -> str:
+    """JSON on one line; numbers that are not finite are null."""
+    return json.dumps(_finite(values), allow_nan=False, separators=(",", ":"))
+
+
+def _finite(values: Any) -> Any:
+    if isinstance(values, float):
+        return values if math.isfinite(values) else None
+    if isinstance(values, dict):
+        return {str(name): _finite(value) for name, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [_finite(value) for value in values]
+    return values

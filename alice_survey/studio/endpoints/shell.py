@@ -1,0 +1,113 @@
+"""What every tab needs: the state of the workspace, and the map of what it holds."""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+from alice_survey.base.errors import AliceError
+from alice_survey.kit.document import PictureLayer, ShapeLayer
+from alice_survey.kit.map import map_data
+from alice_survey.report.held import Held
+from alice_survey.report.run import survey_map
+from alice_survey.report.shapes import shape_layers
+from alice_survey.studio.endpoints.base import Call, Endpoint, Studio
+from alice_survey.studio.layers import ChangedError
+
+TABS = ("plan", "model", "pictures", "annotate", "compare", "follow", "run")
+_PRODUCTS = {
+    "plan": "plan/plan.json", "flight": "flight/navigation.csv", "pictures": "images/manifest.csv",
+    "sparse": "sparse/track.csv", "dem": "dense/dem.tif", "mosaic": "mosaic/mosaic.tif",
+    "mesh": "mesh/mesh.glb", "cloud": "dense/cloud.copc.laz", "report": "report/report.html",
+    "survey": "survey.toml",
+}  # fmt: skip
+_EMPTY_M = 50.0
+"""Half a side of the map of a workspace that holds nothing."""
+
+
+@dataclass(frozen=True)
+class _Shell:
+    studio: Studio
+
+    def state(self, call: Call) -> dict[str, Any]:
+        """The workspace in short: what it is called, what it holds, where its map lies."""
+        workspace = self.studio.workspace
+        held = Held.of(workspace.folder)
+        found = survey_map(held, ())
+        datum = held.frame.datum
+        web = resources.files("alice_survey.studio") / "web"
+        return {
+            "workspace": str(workspace.folder),
+            "name": held.name,
+            "stages": sorted(held.stages),
+            "unit": found.unit,
+            "axes": ["east", "north"] if found.placed else ["along x", "along y"],
+            "placed": found.placed,
+            "origin": found.origin,
+            "simulated": held.simulated,
+            "plane": None if held.plane is None else held.plane.name,
+            "datum": None if datum is None else [datum.latitude_deg, datum.longitude_deg],
+            "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},
+            "log": self.studio.log,
+            "tabs": [name for name in TABS if (web / f"{name}.js").is_file()],
+        }
+
+    def map(self, call: Call) -> dict[str, Any]:
+        """The layers of what the workspace holds, as the map's script takes them."""
+        before = self.studio.workspace.state(())
+        try:
+            return self._map()
+        except (AliceError, FileNotFoundError):
+            if self.studio.workspace.state(()) == before:
+                raise
+            raise ChangedError from None
+
+    def _map(self) -> dict[str, Any]:
+        held = Held.of(self.studio.workspace.folder)
+        pictures = self.studio.layers.picture_layers()
+        layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
+        if not layers:
+            return {"extent": [-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M], "layers": []}
+        found: dict[str, Any] = json.loads(map_data(survey_map(held, layers))[0])
+        for described, layer in zip(found["layers"], layers, strict=True):
+            described |= _listed(layer)
+        return found
+
+
+def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
+    """What the list of layers says of one."""
+    scale = layer.scale if isinstance(layer, PictureLayer) else None
+    is_base = isinstance(layer, PictureLayer) and layer.base
+    return {
+        "title": layer.title,
+        "about": layer.about,
+        "shown": layer.shown,
+        "group": "Picture" if is_base else layer.group,
+        "scale": None if scale is None else {
+            "label": scale.label, "low": scale.low, "high": scale.high,
+            "colours": list(scale.colours),
+        },
+    }  # fmt: skip
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """State and map."""
+    shell = _Shell(studio)
+    return (
+        Endpoint(path="/api/state", answer=shell.state),
+        Endpoint(path="/api/map", answer=shell.map),
+    )
+
+
+def all_endpoints(studio: Studio) -> Iterable[Endpoint]:
+    """The endpoints of every module here."""
+    import importlib
+    import pkgutil
+
+    from alice_survey.studio import endpoints as package
+
+    for module in sorted(found.name for found in pkgutil.iter_modules(package.__path__)):
+        of_module = importlib.import_module(f"{package.__name__}.{module}")
+        if hasattr(of_module, "endpoints"):
+            yield from of_module.endpoints(studio)
