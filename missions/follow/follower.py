@@ -258,21 +258,30 @@ class Follower:
             return "back at the surface"
         if not self.progress.has_begun:
             return "on the way down"
-        if not self.progress.left and not self._is_low(self.fix):
-            return "on the way up"
+        if not self.progress.left:
+            return "on the way home" if self._is_low(self.fix) else "on the way up"
         if not self.progress.is_on_route:
             return "off the route"
         line = self.progress.line
         if line >= 0:
             kind = self.progress.plan.lines[line].kind
             return f"on line {line + 1}" + ("" if kind == "survey" else f" ({kind})")
-        return "between lines" if self.progress.left else "on the way home"
+        return "between lines"
 
     def to_finish(self) -> Estimate:
         """What is left of the plan, and of a proposal that was accepted, to the surface."""
         if self._clock.came_up_s is not None and self.progress.has_begun:
             return Estimate(time_s=0.0, sigma_s=0.0, energy_wh=0.0)
-        return self.progress.to_finish()
+        return self.progress.to_finish(self._surface_ways())
+
+    def _surface_ways(self) -> float:
+        """Ways down or up that are left: 2 at the surface before the dive, 0 after it."""
+        depth_m = 0.0 if self.fix is None else self.fix.depth_m
+        share = depth_m / (self.plan.seafloor_depth_m - self.plan.altitude_m)
+        share = min(max(share, 0.0), 1.0) if math.isfinite(share) else 1.0
+        if not self.progress.has_begun:
+            return 2.0 - share
+        return share if not self.progress.left else 1.0
 
     def to_spare(self) -> Budget:
         """What the dive has left beyond that."""

@@ -371,9 +371,7 @@ class PictureTrack:
             more = np.zeros((max(256, last), len(READINGS)), bool)
             self._used = np.concatenate([self._used, more])
         self._used[first:last] = usable
-        at = {
-            name: np.where(usable[:, i], values[:, i], np.nan) for i, name in enumerate(READINGS)
-        }
+        at = {name: np.where(usable[:, i], values[:, i], np.nan) for i, name in enumerate(READINGS)}
         located = np.isfinite(at["latitude_deg"] + at["longitude_deg"])
         ranged = np.isfinite(at["depth_m"]) | np.isfinite(at["altitude_m"])
         kept = np.flatnonzero(located & ranged)

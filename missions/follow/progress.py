@@ -5,7 +5,7 @@ nearest place ahead of the last one, as far ahead as the time since may have tak
 farther off the route than half a line spacing for some pictures, it is looked for along all lines
 that it may be on by its heading.
 
-The pace is the true time over the plan's, from the end of one line to the end of the next. It is
+The pace is the true time over the plan's, from the middle of one line to that of the next. It is
 taken as a random walk: what is off adds up as the root of the time, so that of `T` planned seconds
 that are left the true ones have the mean `r T` and the variance `q T + (s T)^2`, with the pace `r`,
 its own sigma `s`, and `q` the variance per planned second that the lines so far have shown.
@@ -24,11 +24,14 @@ from missions.values.costs import Costs, leg_costs
 from missions.values.legs import Route
 from missions.values.plan_file import Dive, Plan
 
-_STEP_M = 0.1
-"""Places of a route are looked at so far apart."""
-_BACK_S, _AHEAD_S, _FASTER = 5.0, 10.0, 3.0
+_STEP_M, _STEP_S = 0.1, 0.5
+"""Places of a route are looked at no farther apart, in metres and in planned seconds."""
+_BACK_S, _AHEAD_S, _FASTER = 5.0, 10.0, 1.5
 """A vehicle is looked for so many planned seconds behind the last place, and ahead: some seconds,
 and so many times the time that has passed (inferred)."""
+_DOUBT = 0.25
+"""Of two places as near the one is taken that is nearer to where the plan expects the vehicle by
+now: the whole window counts as this share of half a line spacing."""
 _OFF_PICTURES = 3.0
 """So many intervals off the route the vehicle is looked for elsewhere."""
 PRIOR_SIGMA = 0.1
@@ -77,7 +80,8 @@ def route_times(route: Route, costs: Costs, depth_m: float) -> RouteTimes:
     ends: dict[int, tuple[float, float]] = {}
     passed_s, passed_j = 0.0, 0.0
     for leg, leg_j, leg_s in zip(route.legs, energy.tolist(), time.tolist(), strict=True):
-        share = np.linspace(0.0, 1.0, max(2, math.ceil(leg.length_m / _STEP_M) + 1))
+        steps = max(leg.length_m / _STEP_M, leg_s / _STEP_S)
+        share = np.linspace(0.0, 1.0, math.ceil(steps) + 2)
         places.append(leg.places(share * leg.length_m))
         course.append(leg.heading_rad + leg.curvature_per_m * share * leg.length_m)
         seconds.append(passed_s + share * leg_s)
@@ -244,7 +248,9 @@ class Progress:
         last = min(max(last + 1, first + 1), len(route.seconds))
         first = min(first, last - 1)
         away_m = np.hypot(*(route.places_ne[first:last] - place_ne).T)
-        nearest = int(np.argmin(away_m))
+        early_s = np.abs(route.seconds[first:last] - self.at_s - passed_s)
+        doubt_m = _DOUBT * self._near_m * early_s / max(float(early_s.max()), 1.0)
+        nearest = int(np.argmin(away_m + doubt_m))
         if away_m[nearest] > self._near_m:
             return None
         return float(route.seconds[first + nearest])
@@ -265,29 +271,36 @@ class Progress:
             # Of one pass along a line the nearest place; of several passes that nearest in time.
             for run in np.split(which, np.flatnonzero(np.diff(which) > 1) + 1):
                 place = int(run[np.argmin(away_m[run])])
-                apart_s = abs(float(route.seconds[place]) - self.at_s) if index == self.dive else 1e9
-                score = (apart_s, index, float(route.seconds[place]))
+                at_s = float(route.seconds[place])
+                apart_s = abs(at_s - self.at_s) if index == self.dive else math.inf
+                score = (apart_s, index, at_s)
                 best = score if best is None else min(best, score)
         return None if best is None else (best[1], best[2])
 
     def _measure_pace(self, before_s: float, time_s: float) -> None:
-        """Note the time that was taken where a line's end is passed."""
-        passed = [end_s for _, end_s in self.route.ends.values() if before_s < end_s <= self.at_s]
-        if self._reference is None:
-            if passed or self.line >= 0:
-                self._reference = (self.at_s, time_s)
-            return
-        if passed:
-            self.pace.add(self.at_s - self._reference[0], time_s - self._reference[1])
-            self._reference = (self.at_s, time_s)
+        """Note the time that was taken where the middle of a line is passed.
 
-    def to_finish(self) -> Estimate:
-        """What is left of the dive, to the surface."""
+        There the vehicle goes at its speed: at the ends it brakes, and is for a while in one place.
+        """
+        middles = [sum(ends) / 2 for ends in self.route.ends.values()]
+        if not any(before_s < middle_s <= self.at_s for middle_s in middles):
+            return
+        if self._reference is not None:
+            self.pace.add(self.at_s - self._reference[0], time_s - self._reference[1])
+        self._reference = (self.at_s, time_s)
+
+    def to_finish(self, surface_ways: float = 1.0) -> Estimate:
+        """What is left of the dive, to the surface.
+
+        Args:
+            surface_ways: ways down or up that are left: 2 at the surface, 1 at depth, less on the
+                way up.
+        """
         route = self.route
         spent_j = float(np.interp(self.at_s, route.seconds, route.joules))
         return self.pace.left(
-            route.whole_s - self.at_s + route.surface_s,
-            float(route.joules[-1]) - spent_j + route.surface_j,
+            route.whole_s - self.at_s + surface_ways * route.surface_s,
+            float(route.joules[-1]) - spent_j + surface_ways * route.surface_j,
         )
 
     def spent_wh(self) -> float:

@@ -4,8 +4,8 @@ Holes near one another are seen by the same lines and make a group. Groups are t
 the area that they give for a second of flight, as long as the route through all that are taken -
 from where the last planned line ends, inside the allowed area, with its turns, and home - takes no
 more time and energy than there is. Of a group that does not fit as a whole those of its lines are
-taken that do. What the lines give is counted, not guessed: by the certificate of all pictures so
-far, those that are still planned, and theirs.
+taken that do, and of one more line the part that does. What the lines give is counted, not guessed:
+by the certificate of all pictures so far, those that are still planned, and theirs.
 """
 
 from collections.abc import Callable, Sequence
@@ -157,11 +157,12 @@ def propose(
         0.0 if flown is None else group.area_m2 / max(flown.time_s, 1e-3)
         for group, flown in zip(groups, alone, strict=True)
     ]
+    least = 1 + expected.pattern.pictures  # fewer give no place the overlap requested
     best: _Flown | None = None
     taken: list[_Group] = []
     for index in np.argsort(worth, kind="stable")[::-1].tolist():
         if worth[index] > 0.0:
-            more = _with_group(flying, best, groups[index], budget)
+            more = _with_group(flying, best, groups[index], budget, least)
             if more is not None:
                 best = more
                 taken.append(groups[index])
@@ -194,20 +195,55 @@ def _groups(plan: Plan, expected: Certificate, holes: Sequence[Hole]) -> list[_G
 
 
 def _with_group(
-    flying: Flying, before: _Flown | None, group: _Group, budget: Budget
+    flying: Flying, before: _Flown | None, group: _Group, budget: Budget, least: int
 ) -> _Flown | None:
-    """What is flown already and a group, or as many of its lines as fit; None: none of them."""
+    """What is flown already and a group, or what of its lines fits; None: nothing of it.
+
+    Args:
+        flying: how.
+        before: what is flown already.
+        group: to add.
+        budget: of all.
+        least: pictures of a line that is cut short.
+    """
     kept = () if before is None else before.lines
     best = _fitting(flying, (*kept, *group.lines), budget)
     if best is not None:
         return best
-    low, high = 0, len(group.lines)
-    while high - low > 1:  # more lines take longer: the most that fit are between these two
-        middle = (low + high) // 2
-        tried = _fitting(flying, (*kept, *group.lines[:middle]), budget)
-        low, high = (low, middle) if tried is None else (middle, high)
-        best = best if tried is None else tried
+    # More lines, and longer ones, take longer: the most that fit are found by halving.
+    count, best = _most(
+        len(group.lines), lambda n: _fitting(flying, (*kept, *group.lines[:n]), budget)
+    )
+    kept = (*kept, *group.lines[:count])
+    cut, longest = group.lines[count], 0
+    for line in (cut, cut.reversed()):
+
+        def part(stations: int, line: Line = line) -> _Flown | None:
+            return _fitting(flying, (*kept, _shortened(line, stations)), budget)
+
+        stations, flown = _most(line.stations, part, least=least)
+        if flown is not None and stations > longest:
+            longest, best = stations, flown
     return best
+
+
+def _most(
+    count: int, tried: Callable[[int], _Flown | None], least: int = 1
+) -> tuple[int, _Flown | None]:
+    """The most, under `count`, of something that fits, and what is flown then; 0 of none."""
+    low, high, best = least - 1, count, None
+    while high - low > 1:
+        middle = (low + high) // 2
+        flown = tried(middle)
+        low, high = (low, middle) if flown is None else (middle, high)
+        best = best if flown is None else flown
+    return (low if best is not None else 0), best
+
+
+def _shortened(line: Line, stations: int) -> Line:
+    """The first pictures of a line."""
+    end = line.stations_ne[stations - 1]
+    return replace(line, end_ne_m=(float(end[0]), float(end[1])), stations=stations)
 
 
 def _fitting(flying: Flying, lines: tuple[Line, ...], budget: Budget) -> _Flown | None:

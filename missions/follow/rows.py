@@ -198,11 +198,9 @@ def row_of_text(text: str, datum: Datum) -> Array:
 
 def _of_json(text: str, datum: Datum) -> Array:
     try:
-        data: Any = json.loads(text)
+        data: dict[str, Any] = json.loads(text)  # it begins with a brace
     except (ValueError, RecursionError):
         raise ValueError("JSON that is cut or wrong") from None
-    if not isinstance(data, dict):
-        raise ValueError("JSON that is no object")
     named = {_SHORT.get(name, name): value for name, value in data.items()}
     values = {name: finite_number(named[name]) for name in named if name in ROW}
     if "latitude_deg" not in values and "north_m" in named:

@@ -57,53 +57,50 @@ class NavigationTail:
             self._file = None
 
     def _poll(self) -> list[Piece]:
-        if self._file is None and not self._open():
+        file = self._file or self._open()
+        if file is None:
             return []
-        assert self._file is not None
-        if self._was_cut():
-            self._begin_again(0)
-        data = self._file.read(_CHUNK)
+        if self._was_cut(file):
+            self._begin_again(file)
+        data = file.read(_CHUNK)
         if data:
             if len(self._head) < _HEAD:
                 self._head += data[: _HEAD - len(self._head)]
             return self._pieces(data)
-        if self._was_replaced():
-            self._file.close()
-            self._file = None
-            if self._open():
-                self._begin_again(0)
+        if self._was_replaced(file):
+            self.close()
+            again = self._open()
+            if again is not None:
+                self._begin_again(again)
         return []
 
-    def _open(self) -> bool:
+    def _open(self) -> BinaryIO | None:
+        """Open the file; None: it is not there yet."""
         try:
-            file = self.path.open("rb")
+            self._file = self.path.open("rb")
         except FileNotFoundError:
-            return False
-        self._file, self._head = file, b""
-        return True
+            return None
+        self._head = b""
+        return self._file
 
-    def _was_cut(self) -> bool:
+    def _was_cut(self, file: BinaryIO) -> bool:
         """Whether the file is shorter than what was read, or begins in another way."""
-        assert self._file is not None
-        number = self._file.fileno()
-        if os.fstat(number).st_size < self._file.tell():
+        if os.fstat(file.fileno()).st_size < file.tell():
             return True
-        return os.pread(number, len(self._head), 0) != self._head
+        return os.pread(file.fileno(), len(self._head), 0) != self._head
 
-    def _was_replaced(self) -> bool:
-        assert self._file is not None
+    def _was_replaced(self, file: BinaryIO) -> bool:
         try:
             there = self.path.stat()
         except FileNotFoundError:
             return False
-        here = os.fstat(self._file.fileno())
+        here = os.fstat(file.fileno())
         return (there.st_dev, there.st_ino) != (here.st_dev, here.st_ino)
 
-    def _begin_again(self, place: int) -> None:
-        assert self._file is not None
+    def _begin_again(self, file: BinaryIO) -> None:
         if self._half:
             self.left_out["half a line at the end of a file that was replaced"] += 1
-        self._file.seek(place)
+        file.seek(0)
         self._half, self._head, self._starts = b"", b"", True
 
     def _pieces(self, data: bytes) -> list[Piece]:
@@ -139,9 +136,7 @@ class NavigationTail:
             return None
         padded = [*cells, *[""] * (len(self._columns) - len(cells))]
         try:
-            time, values, wrong = self._parser.parse(
-                dict(zip(self._columns, padded, strict=False))
-            )
+            time, values, wrong = self._parser.parse(dict(zip(self._columns, padded, strict=False)))
         except ValueError:
             self.left_out["a row without a time"] += 1
             return None

@@ -130,7 +130,7 @@ def test_times_that_repeat_or_jump_are_left_out_and_a_clock_that_was_set_is_foll
     back = rows[60:].copy()
     back[:, 0] -= 3600.0
     pieces = [p for row in back for p in times.passed(Piece(rows=row[None]))]
-    assert [piece.starts for piece in pieces if len(piece.rows)][0]
+    assert next(piece.starts for piece in pieces if len(piece.rows))
     np.testing.assert_array_equal(np.concatenate([p.rows for p in pieces]), back)
 
 
