@@ -37,7 +37,13 @@ def report(
 
 
 @app.command("view", hidden=True)
-@app.command(epilog=examples("studio -w reef", "studio -w reef --port 8000 --no-browser"))
+@app.command(
+    epilog=examples(
+        "studio -w reef",
+        "studio -w reef --port 8000 --no-browser",
+        "studio -w reef --log nav.csv",
+    )
+)
 def studio(
     workspace: Workspace = WORK,
     port: Annotated[
@@ -46,6 +52,13 @@ def studio(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
+    log: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOG",
+            help="Dive to follow: growing navigation CSV, udp[:PORT], mavlink:URL, ros[:TOPIC].",
+        ),
+    ] = None,
 ) -> None:
     """Show a survey in a browser, however large.
 
@@ -54,4 +67,4 @@ def studio(
     """
     from alice_survey.studio.server import run_studio
 
-    run_studio(workspace, port, browser=browser, show=typer.echo)
+    run_studio(workspace, port, browser=browser, show=typer.echo, log=log)
