@@ -1,5 +1,6 @@
 """Commands that show a survey: the report, and the server for what is too large for one page."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -40,8 +41,13 @@ def report(
 @app.command(
     epilog=examples(
         "studio -w reef",
+<<<<<<< HEAD
         "studio -w reef --port 8000 --no-browser",
         "studio -w reef --log nav.csv",
+=======
+        "studio -w reef --chart harbour.tif",
+        "studio -w reef --port 8000 --no-browser",
+>>>>>>> main
     )
 )
 def studio(
@@ -49,6 +55,10 @@ def studio(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="To listen on; 0 for any that is free.")
     ] = 0,
+    chart: Annotated[
+        Path | None,
+        typer.Option(help="GeoTIFF, BAG or other raster, to lie under the survey."),
+    ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
@@ -60,11 +70,16 @@ def studio(
         ),
     ] = None,
 ) -> None:
-    """Show a survey in a browser, however large.
+    """Plan, run, look at and measure a survey in a browser.
 
-    Serves map, mesh and files of a workspace to this machine alone, at full resolution, until
-    Ctrl-C. A GIS can open its rasters by their addresses.
+    Serves one page for a workspace to this machine alone, until Ctrl-C: draw the area and watch
+    the plan, start the stages, look at rasters and mesh at full resolution, measure. A GIS can open
+    its rasters by their addresses.
     """
     from alice_survey.studio.server import run_studio
 
+<<<<<<< HEAD
     run_studio(workspace, port, browser=browser, show=typer.echo, log=log)
+=======
+    run_studio(workspace, port, browser=browser, show=typer.echo, chart=chart)
+>>>>>>> main

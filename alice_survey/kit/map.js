@@ -17,6 +17,7 @@ function startMap(data, root) {
     zoomSnap: 0.25, wheelPxPerZoomLevel: 90, scrollWheelZoom: false, zoomAnimation: !still,
     fadeAnimation: false, renderer: leaflet.canvas({tolerance: 6, padding: 0.3}),
   });
+  map.createPane("under").style.zIndex = 150;
   map.createPane("pictures").style.zIndex = 200;
   map.createPane("over").style.zIndex = 300;
   const layers = new Map();
@@ -39,8 +40,8 @@ function startMap(data, root) {
   /* Take a layer, instead of another of its name. */
   function put(about) {
     remove(about.name);
-    const layer = about.kind === "picture"
-      ? new Pyramid(about, about.base ? "pictures" : "over") : shapesOf(about);
+    const pane = about.under ? "under" : about.base ? "pictures" : "over";
+    const layer = about.kind === "picture" ? new Pyramid(about, pane) : shapesOf(about);
     layers.set(about.name, layer);
     return layer;
   }

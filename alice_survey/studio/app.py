@@ -15,6 +15,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from alice_survey.base.errors import AliceError, WorkspaceError, known_fault
+from alice_survey.studio.chart import CHART
 from alice_survey.studio.endpoints.base import (
     Call,
     Content,
@@ -31,7 +32,7 @@ from alice_survey.studio.page import MeshCopies, listing
 from alice_survey.studio.paths import RefusedError, names_of
 
 _TILE = re.compile(
-    rf"/tiles/({'|'.join(FILES)})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
+    rf"/tiles/({'|'.join((*FILES, CHART))})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
 )
 _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
 _CHANGED = "the survey was worked on meanwhile: load the page again"

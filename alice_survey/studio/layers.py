@@ -17,8 +17,10 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from rasterio.crs import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
+from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from alice_survey.base.contents import one_line
@@ -39,7 +41,8 @@ from alice_survey.report.colours import (
     scale_of,
 )
 from alice_survey.report.held import Held
-from alice_survey.studio.paths import Workspace
+from alice_survey.studio.chart import CHART, CHART_TITLE, chart_crs, chart_numbers
+from alice_survey.studio.paths import Workspace, token_of
 
 _KEPT_TILES = 1000
 _KEPT_PYRAMIDS = 12
@@ -76,22 +79,24 @@ class Level:
 class Pyramid:
     """All levels of one raster in its colours."""
 
-    def __init__(self, path: Path, numbers: Numbers | None) -> None:
+    def __init__(self, path: Path, numbers: Numbers | None, crs: CRS | None = None) -> None:
         """Open a raster.
 
         Args:
             path: path of the file.
             numbers: its colouring; None for a mosaic, which has its own colours.
+            crs: system to warp it to; None leaves it as it is.
 
         Raises:
             rasterio.errors.RasterioError: it cannot be read.
         """
-        self._path, self.numbers = path, numbers
+        self._path, self.numbers, self._crs = path, numbers, crs
         with self._opened() as raster:
             self.west, self.north = raster.transform.c, raster.transform.f
             self.pixel = raster.transform.a
             self.limits = None if numbers is None else limits_of(raster, numbers)
-            sizes, factors = [(raster.width, raster.height)], raster.overviews(1)
+            sizes = [(raster.width, raster.height)]
+            factors = raster.overviews(1) if crs is None else []  # a warp chooses its own
         while max(sizes[-1]) > TILE_PX:
             if 2 ** len(sizes) in factors:
                 with self._opened(overview_level=factors.index(2 ** len(sizes))) as raster:
@@ -106,11 +111,21 @@ class Pyramid:
 
     @contextmanager
     def _opened(self, **options: int) -> Iterator[Any]:
+        driver = "GTiff" if self._crs is None else None
         with (
             rasterio.Env(**_GDAL),
-            rasterio.open(self._path, driver="GTiff", sharing=False, **options) as raster,
+            rasterio.open(self._path, driver=driver, sharing=False, **options) as raster,
         ):
-            yield raster
+            if self._crs is None:
+                yield raster
+                return
+            unknown: dict[str, Any] = {"nodata": np.nan, "dtype": "float32"}
+            if self.numbers is None:
+                unknown = {"add_alpha": raster.count < 4}
+            with WarpedVRT(
+                raster, crs=self._crs, resampling=Resampling.bilinear, **unknown
+            ) as warped:
+                yield warped
 
     def tile(self, level: int, x: int, y: int) -> Rgba:
         """Pixels of a tile of a level.
@@ -173,9 +188,14 @@ class ChangedError(Exception):
 class Layers:
     """Layers of a map of a workspace; threads may share it."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        """Take a workspace."""
-        self._workspace = workspace
+    def __init__(self, workspace: Workspace, chart: Path | None = None) -> None:
+        """Take a workspace.
+
+        Args:
+            workspace: whose rasters are shown.
+            chart: a raster of the user's own that lies under them.
+        """
+        self._workspace, self._chart = workspace, chart
         self._most_renderers = min(_MOST_RENDERERS, os.cpu_count() or 1)
         self._renderers = threading.BoundedSemaphore(self._most_renderers)
         # By the token of the file, so that a changed raster is read again.
@@ -185,21 +205,36 @@ class Layers:
     def picture_layers(self) -> Sequence[PictureLayer]:
         """The layers that are there, for a page that requests their tiles."""
         found: list[PictureLayer] = []
-        for name in FILES:
+        for name in (*FILES, CHART):
             try:
-                found.append(self._picture_layer(name, shown=not found))
+                shown = not found or name == CHART
+                found.append(self._picture_layer(name, shown=shown))
             except FileNotFoundError:
                 continue
         return found
+
+    def _path(self, name: str) -> Path:
+        """File of a layer.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
+        if name != CHART:
+            return self._workspace.file(FILES[name].split("/"))
+        if self._chart is None or Held.of(self._workspace.folder).frame.datum is None:
+            raise FileNotFoundError(name)
+        return self._chart
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
         with self._unchanged(name, None) as token:
             pyramid = self._pyramid(name, token)
         numbers, limits, full = pyramid.numbers, pyramid.limits, pyramid.levels[0]
+        title, about = (MOSAIC_TITLE, MOSAIC_ABOUT) if name != CHART else (CHART_TITLE, "")
         return PictureLayer(
             name=name,
-            title=MOSAIC_TITLE if numbers is None else numbers.title,
-            about=MOSAIC_ABOUT if numbers is None else numbers.about,
+            title=title if numbers is None else numbers.title,
+            about=about if numbers is None else numbers.about,
+            base=name != CHART,
             west_m=pyramid.west, north_m=pyramid.north, pixel_m=pyramid.pixel,
             width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
             levels=len(pyramid.levels), tiles={}, shown=shown,
@@ -234,25 +269,30 @@ class Layers:
     @contextmanager
     def _unchanged(self, name: str, token: str | None) -> Iterator[str]:
         """The token of a layer's file, which is read within this block."""
-        now = self._workspace.token(FILES[name])
+        now = token_of(self._path(name).stat())
         try:
             if token not in (None, now):
                 raise ChangedError
             yield now
         except _DAMAGES as error:
-            if self._workspace.token(FILES[name]) != now:
+            path = self._path(name)
+            if token_of(path.stat()) != now:
                 raise ChangedError from None
-            path = self._workspace.folder / FILES[name]
             raise WorkspaceError(
                 f"{path}: is damaged ({one_line(error)}): delete it and run again"
             ) from error
-        if self._workspace.token(FILES[name]) != now:
+        if token_of(self._path(name).stat()) != now:
             raise ChangedError
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
+        if name == CHART:
+            place, path = Held.of(self._workspace.folder).frame.datum, self._path(name)
+            if place is None:
+                raise FileNotFoundError(name)
+            return Pyramid(path, chart_numbers(path), chart_crs(place))
         unit = Held.of(self._workspace.folder).unit
         numbers = next((one for one in number_rasters(unit) if one.name == name), None)
-        return Pyramid(self._workspace.file(FILES[name].split("/")), numbers)
+        return Pyramid(self._path(name), numbers)
 
     def _read_tile(self, name: str, token: str, level: int, x: int, y: int) -> bytes:
         with self._renderers:

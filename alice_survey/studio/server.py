@@ -11,6 +11,7 @@ from typing import Any
 
 from alice_survey.base.errors import WorkspaceError, why
 from alice_survey.base.run.interrupts import for_other_programs
+from alice_survey.studio.chart import check_chart
 from alice_survey.studio.layers import Layers
 from alice_survey.studio.paths import Workspace
 
@@ -70,21 +71,24 @@ class _TimedConnection(H11Protocol):
 class Server:
     """Serves one workspace until it is shut down."""
 
-    def __init__(self, folder: Path, port: int = 0, *, log: str | None = None) -> None:
+    def __init__(
+        self, folder: Path, port: int = 0, *, log: str | None = None, chart: Path | None = None
+    ) -> None:
         """Listen.
 
         Args:
             folder: folder of the workspace.
             port: 0 for any that is free.
             log: where the navigation of a dive comes from.
+            chart: raster to lie under the survey.
 
         Raises:
-            WorkspaceError: the port is not available.
+            WorkspaceError: the port is not available, or the chart cannot be shown.
         """
         workspace = Workspace(folder)
         self.studio = Studio(
             workspace=workspace,
-            layers=Layers(workspace),
+            layers=Layers(workspace, None if chart is None else check_chart(chart)),
             token=secrets.token_urlsafe(24),
             log=log,
         )
@@ -156,6 +160,7 @@ def run_studio(
     browser: bool,
     show: Callable[[str], Any],
     log: str | None = None,
+    chart: Path | None = None,
 ) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
@@ -165,11 +170,12 @@ def run_studio(
         browser: open one.
         show: prints a line.
         log: where the navigation of a dive comes from.
+        chart: raster to lie under the survey.
 
     Raises:
-        WorkspaceError: the port is taken.
+        WorkspaceError: the port is taken, or the chart cannot be shown.
     """
-    server = Server(workspace, port, log=log)
+    server = Server(workspace, port, log=log, chart=chart)
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:

@@ -193,7 +193,7 @@ def read_bathymetry(
     from rasterio.errors import RasterioError
     from rasterio.windows import Window
 
-    _check_kind(path)
+    check_raster(path)
     try:
         with rasterio.open(path) as file:
             _check_filled(path, file)
@@ -224,7 +224,7 @@ def read_bathymetry(
     )
 
 
-def _check_kind(path: Path) -> None:
+def check_raster(path: Path) -> None:
     """Refuse descriptions of rasters, such as VRT and WMS: GDAL would fetch what they name.
 
     Raises:

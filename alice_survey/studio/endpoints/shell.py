@@ -8,10 +8,11 @@ from typing import Any
 
 from alice_survey.base.errors import AliceError
 from alice_survey.kit.document import PictureLayer, ShapeLayer
-from alice_survey.kit.map import map_data
+from alice_survey.kit.map import map_data, map_extent
 from alice_survey.report.held import Held
 from alice_survey.report.run import survey_map
 from alice_survey.report.shapes import shape_layers
+from alice_survey.studio.chart import CHART
 from alice_survey.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.studio.layers import ChangedError
 
@@ -67,9 +68,13 @@ class _Shell:
         held = Held.of(self.studio.workspace.folder)
         pictures = self.studio.layers.picture_layers()
         layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
-        if not layers:
-            return {"extent": [-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M], "layers": []}
-        found: dict[str, Any] = json.loads(map_data(survey_map(held, layers))[0])
+        found: dict[str, Any] = {"layers": []}
+        if layers:
+            found = json.loads(map_data(survey_map(held, layers))[0])
+        surveyed = [layer for layer in layers if layer.name != CHART]
+        found["extent"] = [-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M]
+        if surveyed:
+            found["extent"] = map_extent(survey_map(held, surveyed))
         for described, layer in zip(found["layers"], layers, strict=True):
             described |= _listed(layer)
         return found
@@ -83,7 +88,8 @@ def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
         "title": layer.title,
         "about": layer.about,
         "shown": layer.shown,
-        "group": "Picture" if is_base else layer.group,
+        "group": "Picture" if is_base else "Under it" if layer.name == CHART else layer.group,
+        "under": layer.name == CHART,
         "scale": None if scale is None else {
             "label": scale.label, "low": scale.low, "high": scale.high,
             "colours": list(scale.colours),

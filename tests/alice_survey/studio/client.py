@@ -29,9 +29,9 @@ class Reply:
 
 
 @contextlib.contextmanager
-def serving(folder: Path) -> Iterator[Server]:
-    """A server that runs in a thread within this block."""
-    server = Server(folder)
+def serving(folder: Path, **options: Any) -> Iterator[Server]:
+    """A server that runs in a thread within this block; options are the server's."""
+    server = Server(folder, **options)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:

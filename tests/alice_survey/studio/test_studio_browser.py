@@ -1,27 +1,26 @@
-"""The page in Chromium: its map loads tiles from the server, zooms, and the mesh is drawn."""
+"""The studio's shell in Chromium: its map loads tiles and zooms, layers are chosen, tabs turn."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from PIL import Image
+from axe_playwright_python.sync_playwright import Axe
 from rasterio.transform import Affine
 
-from alice_survey.base.artefacts import write_json
 from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.kit.sketch import encoded, seafloor, sketch_mesh
+from tests.alice_survey.kit.sketch import seafloor
 from tests.alice_survey.report.tiny import tiny_workspace
 from tests.alice_survey.studio.client import serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
+PICTURES = f"{MAP} img.leaflet-image-layer"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A workspace with a mosaic of four levels, and a mesh."""
+    """A workspace with a mosaic of four levels."""
     import rasterio
 
     workspace = tiny_workspace(tmp_path / "reef")
@@ -33,20 +32,7 @@ def folder(tmp_path: Path) -> Path:
         transform=Affine(0.0005, 0, 0, 0, -0.0005, 1.2),
     ) as raster:  # fmt: skip
         raster.write(bands)
-    mesh = workspace / "mesh"
-    mesh.mkdir()
-    sketch_mesh(mesh).glb.rename(mesh / "mesh.glb")
-    triangles = sum(
-        len(part.faces) for part in trimesh.load_scene(mesh / "mesh.glb").geometry.values()
-    )
-    about = {"area": 12.0, "textured_share": 1.0, "offset_east_north_up": [0.0, 0.0, 0.0]}
-    write_json(mesh / "mesh.json", {"triangles": triangles, **about})
-    (mesh / "mesh.png").write_bytes(encoded(Image.fromarray(floor[:300, :400]), "PNG"))
-    write_json(mesh / "stage.json", {"stage": "mesh"})
     return workspace
-
-
-PICTURES = f"{MAP} img.leaflet-image-layer"
 
 
 def tiles(page: Any) -> list[tuple[str, int]]:
@@ -76,9 +62,9 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         page = browser.new_page(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
         heard = Heard()
         heard.listen(page)
-        page.goto(server.url)
-        page.wait_for_selector("#map[data-ready]", timeout=20_000)
-        page.locator(MAP).scroll_into_view_if_needed()
+        page.goto(server.address)
+        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        assert "token" not in page.url
         first = int(page.locator(MAP).get_attribute("data-level"))
         shown = all_loaded(page, first)
         assert shown and all(path.startswith("/tiles/mosaic/") for path, _ in shown)
@@ -91,6 +77,7 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         assert int(page.locator(MAP).get_attribute("data-level")) == 3 > first
         assert all(width > 0 for _, width in all_loaded(page, 3))
 
+        page.get_by_text("Layers", exact=True).click()
         page.get_by_label("Height", exact=True).check()
         page.wait_for_function(
             "() => document.querySelector('img[src*=\"/tiles/height/\"]')?.naturalWidth > 0",
@@ -100,11 +87,35 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         for name in ("Mosaic", "Sigma of height", "Height") * 3:  # faster than tiles come
             page.get_by_label(name, exact=True).check()
         page.get_by_role("button", name="Show all").click()
-        page.locator("#mesh").scroll_into_view_if_needed()
-        page.wait_for_selector("#mesh[data-ready]", state="attached", timeout=20_000)
-        assert page.locator("#mesh-canvas").is_visible()
         assert heard.complaints == []
         assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
             server.url.split("/")[2]
         }
+        page.close()
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "light"), (1280, "dark")])
+def test_every_tab_is_accessible(folder: Path, width: int, scheme: str) -> None:
+    with serving(folder) as server, chromium() as browser:
+        page = browser.new_page(
+            viewport={"width": width, "height": 900}, reduced_motion="reduce", color_scheme=scheme
+        )
+        heard = Heard()
+        heard.listen(page)
+        page.goto(server.address)
+        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        names = page.locator("#tabs [role=tab]").all_inner_texts()
+        for name in names:
+            page.get_by_role("tab", name=name, exact=True).click()
+            page.wait_for_timeout(300)
+            assert page.locator("[role=tabpanel]:visible").count() == 1
+            found = Axe().run(page)
+            assert (name, found.violations_count) == (name, 0), found.generate_report()
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert (name, wide <= width) == (name, True)
+        page.locator("#tabs [role=tab]").first.focus()
+        for name in names[1:]:
+            page.keyboard.press("ArrowRight")
+            assert page.locator("[role=tab][aria-selected=true]").inner_text() == name
+        assert heard.complaints == []
         page.close()
