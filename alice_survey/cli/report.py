@@ -41,13 +41,9 @@ def report(
 @app.command(
     epilog=examples(
         "studio -w reef",
-<<<<<<< HEAD
-        "studio -w reef --port 8000 --no-browser",
-        "studio -w reef --log nav.csv",
-=======
         "studio -w reef --chart harbour.tif",
+        "studio -w reef --log nav.csv",
         "studio -w reef --port 8000 --no-browser",
->>>>>>> main
     )
 )
 def studio(
@@ -78,8 +74,4 @@ def studio(
     """
     from alice_survey.studio.server import run_studio
 
-<<<<<<< HEAD
-    run_studio(workspace, port, browser=browser, show=typer.echo, log=log)
-=======
-    run_studio(workspace, port, browser=browser, show=typer.echo, chart=chart)
->>>>>>> main
+    run_studio(workspace, port, browser=browser, show=typer.echo, log=log, chart=chart)

@@ -240,6 +240,7 @@ class DiveSession:
             "fault": self.fault,
             "phase": follower.phase,
             "silent_s": age_s,
+            "patience_s": patience_s,
             "is_silent": age_s is not None and age_s > patience_s,
             "fix": None if follower.fix is None else _fix_json(follower.fix),
             "planned_altitude_m": self.plan.altitude_m,

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from alice_survey.base.errors import AliceError, NavigationError
-from alice_survey.report.colours import encoded
 from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
-from alice_survey.studio.paths import names_of
 from missions.exports.options import options_of
 from missions.exports.registry import format_names
 from missions.exports.write import write_exports
@@ -61,7 +60,7 @@ class FollowTab:
     """The dive that a studio follows, if any, with the thread that reads its source."""
 
     def __init__(self, studio: Studio) -> None:
-        """Nothing is followed yet; the log of the command line is opened when a page asks."""
+        """Open the log of the command line, if there is one."""
         self._studio = studio
         self._lock = threading.Lock()
         self._session: DiveSession | None = None
@@ -71,7 +70,8 @@ class FollowTab:
         self._number = 0
         """Counts proposals, so that what is accepted is what was shown."""
         self._tried: tuple[int, float] | None = None
-        self._looking_wanted = False
+        if self._is_new:  # links are heard from the start, pages or not
+            threading.Thread(target=self._current, daemon=True).start()
 
     # ---- One session at a time -------------------------------------------------------------
 
@@ -160,7 +160,7 @@ class FollowTab:
                 **state,
                 "following": True,
                 "number": self._number,
-                "hole_key": hash(tuple(hole.place_ne + (hole.area_m2,) for hole in session.holes))
+                "hole_key": hash(tuple((*hole.place_ne, hole.area_m2) for hole in session.holes))
                 & 0xFFFFFFFF,
                 "blocks": [
                     [*block, version, *blocks.bounds(block)]
@@ -182,7 +182,9 @@ class FollowTab:
     def open(self, call: Call) -> dict[str, Any]:
         """Follow a log of the workspace, or replay it."""
         ask = call.read(_Open)
-        path = self._studio.workspace.file(names_of(ask.log))
+        if ask.log not in self._logs():
+            raise FileNotFoundError(ask.log)
+        path = self._studio.workspace.file(ask.log.split("/"))
         with self._lock:
             self._is_new = False
             self._open(str(path), ask.replay, ask.dive)
@@ -230,7 +232,8 @@ class FollowTab:
             raise FileNotFoundError(f"block {call.path}") from None
         with session.lock:
             classes = session.blocks.classes(block)
-        return Content(data=encoded(_COLOURS[classes], "PNG"), kind="image/png")
+        bgra = cv2.cvtColor(_COLOURS[classes], cv2.COLOR_RGBA2BGRA)
+        return Content(data=cv2.imencode(".png", bgra)[1].tobytes(), kind="image/png")
 
     def propose(self, call: Call) -> dict[str, Any]:
         """Lines that close the holes, within what is to spare or the minutes given."""
