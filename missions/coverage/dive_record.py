@@ -137,8 +137,8 @@ def plan_triggers(start_s: float, end_s: float, interval_s: float, first: int = 
         interval_s: between pictures.
         first: number of the first picture of those wanted.
     """
-    number = np.arange(first, max(first, math.ceil((end_s - start_s) / interval_s) + 1))
-    times: Array = start_s + interval_s * number
+    last = max(first, math.ceil((end_s - start_s) / interval_s) + 1)
+    times: Array = start_s + interval_s * np.arange(first, last, dtype=np.float64)
     return times[times < end_s]
 
 

@@ -195,9 +195,9 @@ class GrowingCoverage:
             pictures = counts.pictures[(slice(None), *part)]
             often = pictures.min(axis=0) >= self.pattern.passes * self.pattern.pictures
             often &= counts.lines[(slice(None), *part)].min(axis=0) >= self.pattern.passes
-            found = SEEN * (pictures > 0).any(axis=0).astype(np.uint8)
-            found[counts.pairs[part] > 0] |= STEREO
-            found[often] |= AT_OVERLAP
+            found = np.where((pictures > 0).any(axis=0), np.uint8(SEEN), np.uint8(0))
+            found |= np.where(counts.pairs[part] > 0, np.uint8(STEREO), np.uint8(0))
+            found |= np.where(often, np.uint8(AT_OVERLAP), np.uint8(0))
             within = self.inside[here]
             old = self.classes[here][within]
             self._cells = (

@@ -18,7 +18,7 @@ from missions.coverage.growing import GrowingCoverage
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import Stations, at_once, plan_pattern, stations_of_plan
 from missions.follow.pictures import PictureTrack
-from missions.follow.progress import Estimate, Progress
+from missions.follow.progress import Progress, TimeLeft
 from missions.follow.proposal import Budget, Flying, Proposal, propose
 from missions.follow.rows import (
     ALTITUDE,
@@ -100,7 +100,7 @@ class _Clock:
         return self.passed_s + time_s - self.first_s
 
 
-class Follower:
+class DiveFollower:
     """A dive as far as it is known.
 
     Its methods are for one thread at a time.
@@ -268,10 +268,10 @@ class Follower:
             return f"on line {line + 1}" + ("" if kind == "survey" else f" ({kind})")
         return "between lines"
 
-    def to_finish(self) -> Estimate:
+    def to_finish(self) -> TimeLeft:
         """What is left of the plan, and of a proposal that was accepted, to the surface."""
         if self._clock.came_up_s is not None and self.progress.has_begun:
-            return Estimate(time_s=0.0, sigma_s=0.0, energy_wh=0.0)
+            return TimeLeft(time_s=0.0, sigma_s=0.0, energy_wh=0.0)
         return self.progress.to_finish(self._surface_ways())
 
     def _surface_ways(self) -> float:

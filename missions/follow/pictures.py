@@ -143,7 +143,7 @@ class _Column:
 
 
 @dataclass
-class _Run:
+class _PictureRun:
     """The run of pictures outside of the plan's lines that goes on now (`assign_lines`)."""
 
     held: list[int] = field(default_factory=list)
@@ -178,7 +178,7 @@ class PictureTrack:
         self.tally = Tally()
         self._before: list[Stations] = []
         self._runs = 0
-        self._run = _Run()
+        self._run = _PictureRun()
         self._begin()
 
     def _begin(self) -> None:
@@ -332,7 +332,7 @@ class PictureTrack:
             self._follow_run(station, found)
         held = self._run.held
         if final:
-            self._run = _Run()
+            self._run = _PictureRun()
         elif held:
             self._held = found[len(found) - len(held) :]
             found = found[: len(found) - len(held)]
@@ -344,7 +344,7 @@ class PictureTrack:
         place, heading = station.glass_ne[0], float(station.attitude_rad[0, 2])
         run = self._run
         if station.line[0] >= 0:
-            self._run = _Run()
+            self._run = _PictureRun()
             return
         goes_on = (
             run.length > 0
@@ -352,7 +352,7 @@ class PictureTrack:
             and math.cos(heading - run.heading_rad) >= math.cos(ALIKE_RAD)
         )
         if not goes_on:
-            run = self._run = _Run(heading_rad=heading)
+            run = self._run = _PictureRun(heading_rad=heading)
         run.length += 1
         run.place_ne = (float(place[0]), float(place[1]))
         run.held.append(len(found) - 1)

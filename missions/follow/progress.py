@@ -103,7 +103,7 @@ def route_times(route: Route, costs: Costs, depth_m: float) -> RouteTimes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimate:
+class TimeLeft:
     """A time with its sigma, and an energy."""
 
     time_s: float
@@ -111,7 +111,7 @@ class Estimate:
     energy_wh: float
 
 
-class Pace:
+class FlightPace:
     """True time over planned time, and how both differ from line to line."""
 
     def __init__(self) -> None:
@@ -144,10 +144,10 @@ class Pace:
         seen, prior = total / q, 1.0 / PRIOR_SIGMA**2
         return (plain * seen + prior) / (seen + prior), (seen + prior) ** -0.5, q
 
-    def left(self, planned_s: float, energy_j: float) -> Estimate:
+    def left(self, planned_s: float, energy_j: float) -> TimeLeft:
         """What a planned time will take."""
         pace, sigma, q = self.fitted()
-        return Estimate(
+        return TimeLeft(
             time_s=pace * planned_s,
             sigma_s=math.sqrt(max(q * planned_s, 0.0) + (sigma * planned_s) ** 2),
             energy_wh=pace * energy_j / 3600.0,
@@ -169,7 +169,7 @@ class Progress:
         self._near_m = plan.line_spacing_m / 2
         self._patience_s = _OFF_PICTURES * plan.interval_s
         self._asked = dive
-        self.pace = Pace()
+        self.pace = FlightPace()
         self.plan, self.dive = plan, 0 if dive is None else dive
         self.at_s = 0.0
         """Planned seconds of the vehicle's place on the route."""
@@ -289,7 +289,7 @@ class Progress:
             self.pace.add(self.at_s - self._reference[0], time_s - self._reference[1])
         self._reference = (self.at_s, time_s)
 
-    def to_finish(self, surface_ways: float = 1.0) -> Estimate:
+    def to_finish(self, surface_ways: float = 1.0) -> TimeLeft:
         """What is left of the dive, to the surface.
 
         Args:

@@ -119,7 +119,7 @@ class _Group:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Flown:
+class _OrderedLines:
     """Lines in the order of flight, and what they take beyond the way home."""
 
     lines: tuple[Line, ...]
@@ -158,7 +158,7 @@ def propose(
         for group, flown in zip(groups, alone, strict=True)
     ]
     least = 1 + expected.pattern.pictures  # fewer give no place the overlap requested
-    best: _Flown | None = None
+    best: _OrderedLines | None = None
     taken: list[_Group] = []
     for index in np.argsort(worth, kind="stable")[::-1].tolist():
         if worth[index] > 0.0:
@@ -195,8 +195,8 @@ def _groups(plan: Plan, expected: Certificate, holes: Sequence[Hole]) -> list[_G
 
 
 def _with_group(
-    flying: Flying, before: _Flown | None, group: _Group, budget: Budget, least: int
-) -> _Flown | None:
+    flying: Flying, before: _OrderedLines | None, group: _Group, budget: Budget, least: int
+) -> _OrderedLines | None:
     """What is flown already and a group, or what of its lines fits; None: nothing of it.
 
     Args:
@@ -218,7 +218,7 @@ def _with_group(
     cut, longest = group.lines[count], 0
     for line in (cut, cut.reversed()):
 
-        def part(stations: int, line: Line = line) -> _Flown | None:
+        def part(stations: int, line: Line = line) -> _OrderedLines | None:
             return _fitting(flying, (*kept, _shortened(line, stations)), budget)
 
         stations, flown = _most(line.stations, part, least=least)
@@ -228,8 +228,8 @@ def _with_group(
 
 
 def _most(
-    count: int, tried: Callable[[int], _Flown | None], least: int = 1
-) -> tuple[int, _Flown | None]:
+    count: int, tried: Callable[[int], _OrderedLines | None], least: int = 1
+) -> tuple[int, _OrderedLines | None]:
     """The most, under `count`, of something that fits, and what is flown then; 0 of none."""
     low, high, best = least - 1, count, None
     while high - low > 1:
@@ -246,12 +246,12 @@ def _shortened(line: Line, stations: int) -> Line:
     return replace(line, end_ne_m=(float(end[0]), float(end[1])), stations=stations)
 
 
-def _fitting(flying: Flying, lines: tuple[Line, ...], budget: Budget) -> _Flown | None:
+def _fitting(flying: Flying, lines: tuple[Line, ...], budget: Budget) -> _OrderedLines | None:
     flown = _flown(flying, lines)
     return flown if flown is not None and flown.within(budget) else None
 
 
-def _flown(flying: Flying, lines: tuple[Line, ...]) -> _Flown | None:
+def _flown(flying: Flying, lines: tuple[Line, ...]) -> _OrderedLines | None:
     """The best order of lines; None where they cannot be reached or flown."""
     plan, costs = flying.plan, flying.costs
     try:
@@ -266,7 +266,7 @@ def _flown(flying: Flying, lines: tuple[Line, ...]) -> _Flown | None:
     extra_j, extra_s = energy_j - flying.home_j, time_s - flying.home_s
     if not np.isfinite(extra_j):
         return None
-    return _Flown(
+    return _OrderedLines(
         lines=tuple(order),
         route=route,
         time_s=flying.pace * extra_s,
@@ -279,7 +279,7 @@ def _proposal(
     expected: Certificate,
     holes: Sequence[Hole],
     with_more: Callable[[Stations], Certificate],
-    flown: _Flown,
+    flown: _OrderedLines,
     taken: Sequence[_Group],
     groups: int,
 ) -> Proposal:

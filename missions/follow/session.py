@@ -22,7 +22,7 @@ from missions.exports.write import counted
 from missions.fly.check import rig_of
 from missions.fly.refly import write_refly
 from missions.follow.blocks import CoverageBlocks
-from missions.follow.follower import Fix, Follower
+from missions.follow.follower import DiveFollower, Fix
 from missions.follow.links import (
     UDP_PORT,
     MavlinkSource,
@@ -32,7 +32,7 @@ from missions.follow.links import (
 )
 from missions.follow.proposal import Budget, Proposal
 from missions.follow.rows import NavigationSource
-from missions.follow.tail import NavigationTail, Replay
+from missions.follow.tail import NavigationTail, ReplayedLog
 from missions.values.plan_file import Plan, read_plan
 
 _BUSY = 4.0
@@ -96,14 +96,14 @@ class DiveSession:
         self.config, self.workspace = config, workspace
         self.plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
         self.rig = rig_of(workspace, config.camera, config.water)
-        self.follower = Follower(self.plan, self.rig, config, dive)
+        self.follower = DiveFollower(self.plan, self.rig, config, dive)
         self.source: NavigationSource
         if replay is None:
             self.source = open_source(source_name, self.plan, self.rig, config)
         else:
             if not Path(source_name).is_file():
                 raise NavigationError(f"{source_name}: is no file: give a finished navigation CSV")
-            self.source = Replay(Path(source_name), replay)
+            self.source = ReplayedLog(Path(source_name), replay)
         self.blocks = CoverageBlocks(self.follower.coverage)
         self.lock = threading.RLock()
         self.proposal: Proposal | None = None
@@ -334,21 +334,21 @@ def follow_report(
             if not isinstance(session.source, NavigationTail):
                 raise NavigationError(f"{log}: a link has to be listened to: give --every")
             session.read_all()
-            yield _told(session, out)
+            yield _report_of(session, out)
             return
         due_s = time.monotonic()
         while session.fault is None:
             session.step()
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + every_s
-                yield _told(session, out)
+                yield _report_of(session, out)
             time.sleep(min(0.2, every_s))
-        yield _told(session, out)
+        yield _report_of(session, out)
     finally:
         session.close()
 
 
-def _told(session: DiveSession, out: Path | None) -> tuple[str, dict[str, Any]]:
+def _report_of(session: DiveSession, out: Path | None) -> tuple[str, dict[str, Any]]:
     if session.fault is not None:
         raise NavigationError(session.fault)
     if session.follower.fix is not None:
@@ -417,6 +417,7 @@ def _fix_json(fix: Fix) -> dict[str, float]:
     return {name: getattr(fix, name) for name in Fix.__dataclass_fields__}
 
 
-def _finite(values: Any) -> Any:
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
     """Values in which numbers that are not finite are None."""
-    return json.loads(json.dumps(values), parse_constant=lambda _: None)
+    found: dict[str, Any] = json.loads(json.dumps(values), parse_constant=lambda _: None)
+    return found

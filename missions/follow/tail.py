@@ -146,7 +146,7 @@ class NavigationTail:
         return [time, *(found.get(name, np.nan) for name in READINGS)]
 
 
-class Replay:
+class ReplayedLog:
     """A finished navigation CSV as if it were written now, at a number of times the true pace."""
 
     def __init__(self, path: Path, pace: float) -> None:

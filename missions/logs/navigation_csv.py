@@ -253,7 +253,7 @@ def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
     ]
 
 
-def _number(row: dict[str, str], name: str) -> float:
+def _number(row: Mapping[str, str], name: str) -> float:
     cell = row[name]
     try:
         value = float(cell)

@@ -111,7 +111,7 @@ class FollowTab:
 
     def _work(self, session: DiveSession, ended: threading.Event) -> None:
         """Read the source until another one is opened, or the studio ends."""
-        told_s, news = -math.inf, True
+        sent_s, news = -math.inf, True
         while not (ended.is_set() or self._studio.ending.is_set()):
             try:
                 news = session.step() or news
@@ -120,8 +120,8 @@ class FollowTab:
                 session.fault = f"{type(error).__name__}: {error}"
                 news = True
             now_s = time.monotonic()
-            if now_s - told_s >= (_PUBLISH_S if news else _ALIVE_S):
-                told_s, news = now_s, False
+            if now_s - sent_s >= (_PUBLISH_S if news else _ALIVE_S):
+                sent_s, news = now_s, False
                 self._studio.publish("follow", self._state_of(session))
             if session.fault is not None:
                 break

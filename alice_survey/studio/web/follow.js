@@ -337,7 +337,7 @@ export function tab(studio) {
   function showHoles(holes) {
     const outlines = holes.flatMap((hole) => hole.rings_ne.map((ring) => ring.map(flat)));
     shapes("follow-holes", "polygon", "Holes", COLOURS.hole, outlines);
-    holeTable.replaceChildren(holes.length ? table("Holes, worst first", ["", "m²", "unseen m²", "north, east m"],
+    holeTable.replaceChildren(holes.length ? table("Holes, worst first", ["hole", "m²", "unseen m²", "north, east m"],
       holes.slice(0, 6).map((hole, i) => [
         el("button", {type: "button", onclick: () => map.leaflet.panTo([hole.north_m, hole.east_m])}, "Hole " + (i + 1)),
         hole.area_m2.toFixed(2), hole.unseen_m2.toFixed(2), hole.north_m.toFixed(1) + ", " + hole.east_m.toFixed(1)])) : "");

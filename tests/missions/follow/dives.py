@@ -30,6 +30,28 @@ def route_rows(
     time_s = np.arange(0.0, route.length_m / plan.speed_mps, interval_s)
     places = route.places(time_s * plan.speed_mps)
     ahead = route.places(time_s * plan.speed_mps + 0.05)
+    return _rows(plan, time_s, places, ahead, rng, sigma_m)
+
+
+def rows_along(places_ne: list[list[float]], plan: Plan, start_s: float) -> Array:
+    """Rows of a vehicle that flies from place to place at the plan's speed."""
+    places = np.array(places_ne)
+    passed = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+    time_s = np.arange(0.0, passed[-1] / plan.speed_mps, 0.5)
+
+    def at(along_m: Array) -> Array:
+        return np.column_stack([np.interp(along_m, passed, axis) for axis in places.T])
+
+    along_m = time_s * plan.speed_mps
+    rows = _rows(plan, time_s, at(along_m), at(along_m + 0.05), np.random.default_rng(0), 0.0)
+    rows[:, 0] += start_s - rows[0, 0]
+    return rows
+
+
+def _rows(
+    plan: Plan, time_s: Array, places: Array, ahead: Array, rng: np.random.Generator,
+    sigma_m: float,
+) -> Array:  # fmt: skip
     course = np.arctan2(*(ahead - places).T[::-1])
     places = places + rng.normal(0, sigma_m, places.shape)
     depth = np.full(len(time_s), plan.seafloor_depth_m - plan.altitude_m)

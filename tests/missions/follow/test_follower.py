@@ -15,7 +15,7 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import read_dive_record
 from missions.coverage.holes import find_holes
 from missions.coverage.stations import plan_pattern
-from missions.follow.follower import Follower
+from missions.follow.follower import DiveFollower
 from missions.follow.proposal import Budget
 from missions.follow.rows import TIME, Piece
 from missions.values.navigation import write_navigation
@@ -54,14 +54,14 @@ def whole(rows: Array, path: Path) -> Certificate:
     """The certificate that `plan check` has of a log."""
     path.write_bytes(text_of(rows))
     record = read_dive_record(path, plan(), RIG)
-    follower = Follower(plan(), RIG, CONFIG)
+    follower = DiveFollower(plan(), RIG, CONFIG)
     return certificate(
         plan().area, RIG, record.stations, plan_pattern(plan(), RIG),
         cell_m=follower.coverage.grid.cell_m,
     )  # fmt: skip
 
 
-def fed(follower: Follower, rows: Array, every: int = 50) -> list[dict]:
+def fed(follower: DiveFollower, rows: Array, every: int = 50) -> list[dict]:
     """Feed rows part by part; what is known after each."""
     known = []
     for first in range(0, len(rows), every):
@@ -79,7 +79,7 @@ def fed(follower: Follower, rows: Array, every: int = 50) -> list[dict]:
 
 
 def test_a_dive_as_planned_leaves_no_holes_on_its_way(rows: Array, tmp_path: Path) -> None:
-    follower = Follower(plan(), RIG, CONFIG)
+    follower = DiveFollower(plan(), RIG, CONFIG)
     found = []
     for first in range(0, len(rows), 100):
         follower.add([Piece(rows=rows[first : first + 100])])
@@ -96,7 +96,7 @@ def test_a_dive_as_planned_leaves_no_holes_on_its_way(rows: Array, tmp_path: Pat
 
 
 def test_progress_and_what_is_left_are_those_of_the_flight(rows: Array) -> None:
-    known = fed(Follower(plan(), RIG, CONFIG), rows)
+    known = fed(DiveFollower(plan(), RIG, CONFIG), rows)
     # What is left when it comes up to half a metre under the surface.
     end_s = rows[-1, TIME]
     off = np.array([(k["s"] + k["finish_s"] - end_s, k["sigma_s"]) for k in known if k["left"]])
@@ -123,7 +123,7 @@ def with_gap(rows: Array) -> Array:
 @cache
 def _fed_lines(data: bytes) -> Array:
     rows = np.frombuffer(data).reshape(-1, 8)
-    follower = Follower(plan(), RIG, CONFIG)
+    follower = DiveFollower(plan(), RIG, CONFIG)
     line = np.full(len(rows), -1)
     for first in range(0, len(rows), 5):
         follower.add([Piece(rows=rows[first : first + 5])])
@@ -143,7 +143,7 @@ def test_a_gap_is_found_while_the_dive_goes_on_and_the_lines_proposed_close_it(
     line = fed_lines(rows)
     # Half way along the third line: the dive goes on.
     until_s = rows[np.flatnonzero(line == 2)[len(np.flatnonzero(line == 2)) // 2], TIME]
-    follower = Follower(plan(), RIG, CONFIG)
+    follower = DiveFollower(plan(), RIG, CONFIG)
     before = lost[lost[:, TIME] <= until_s]
     fed(follower, before)
     assert follower.gap_count == 1
@@ -191,7 +191,7 @@ def test_a_gap_is_found_while_the_dive_goes_on_and_the_lines_proposed_close_it(
 def test_a_proposal_keeps_to_its_budget(rows: Array) -> None:
     line = fed_lines(rows)
     kept = ~np.isin(line, [0, 2])  # two gaps
-    follower = Follower(plan(), RIG, CONFIG)
+    follower = DiveFollower(plan(), RIG, CONFIG)
     fed(follower, rows[kept])
     _, holes = follower.expected()
     assert sum(hole.area_m2 for hole in holes) > 4.0
