@@ -35,8 +35,8 @@ now: the whole window counts as this share of half a line spacing."""
 _OFF_PICTURES = 3.0
 """So many intervals off the route the vehicle is looked for elsewhere."""
 PRIOR_SIGMA = 0.1
-"""Sigma of the pace before any line was flown (inferred: simulated flights of ALICE take 0.97 to
-1.10 of their plan's time)."""
+"""Sigma of the pace before any line was flown (twelve simulated flights of ALICE, in currents up to
+0.3 m/s, took 1.02 to 1.14 of the time of their plans)."""
 _PRIOR_LINES = 2.0
 """Before lines have shown how the pace varies, its variance counts as seen on so many lines."""
 

@@ -107,6 +107,8 @@ class DiveSession:
         self.blocks = CoverageBlocks(self.follower.coverage)
         self.lock = threading.RLock()
         self.proposal: Proposal | None = None
+        self.may_take_s: float | None = None
+        """What lines over holes may take; None: what the dive has to spare."""
         self.fault: str | None = None
         """Why nothing more can come."""
         self._heard_wall_s: float | None = None
@@ -162,21 +164,12 @@ class DiveSession:
             took_s = time.perf_counter() - began
             self._look_wall_s = wall_s + max(_LEAST_S, _BUSY * took_s)
 
-    def propose(self, time_s: float | None = None) -> Proposal | None:
-        """Lines that close the holes.
-
-        Args:
-            time_s: what they may take; None: what the dive has to spare.
-
-        Raises:
-            PlanError: `time_s` is not positive.
-        """
+    def propose(self) -> Proposal | None:
+        """Lines that close the holes, in `may_take_s` or what the dive has to spare."""
         with self.lock:
             budget = self.follower.to_spare()
-            if time_s is not None:
-                if not time_s > 0:
-                    raise PlanError(f"{time_s:g} s for lines over holes: give more than 0")
-                budget = Budget(time_s=time_s, energy_wh=budget.energy_wh)
+            if self.may_take_s is not None:
+                budget = Budget(time_s=self.may_take_s, energy_wh=budget.energy_wh)
             self.proposal = self.follower.propose(budget)
             return self.proposal
 

@@ -24,6 +24,9 @@ from missions.follow.session import DiveSession
 _POLL_S, _PUBLISH_S, _ALIVE_S = 0.2, 0.5, 5.0
 """A source is asked five times a second; pages hear of it twice a second at most, and of a silent
 one every few seconds."""
+_PROPOSE_S, _BUSY = 5.0, 4.0
+"""Lines are looked for by themselves every so many seconds at most, and no more often than after so
+many times the time that it took."""
 _LOG_FOLDERS = ("", "flight", "logs")
 _MOST_LOGS = 50
 _HEAD = 4096
@@ -70,6 +73,7 @@ class FollowTab:
         self._number = 0
         """Counts proposals, so that what is accepted is what was shown."""
         self._tried: tuple[int, float] | None = None
+        self._again_s = -math.inf
         if self._is_new:  # links are heard from the start, pages or not
             threading.Thread(target=self._current, daemon=True).start()
 
@@ -129,14 +133,16 @@ class FollowTab:
         session.close()
 
     def _propose_if_new(self, session: DiveSession) -> None:
-        """Look for lines by itself when holes have appeared and nothing is proposed."""
+        """Look for lines again when holes have changed, every few seconds at most."""
         holes = (len(session.holes), round(sum(hole.area_m2 for hole in session.holes), 1))
-        if not session.holes:
-            self._tried = None
-        elif session.proposal is None and holes != self._tried:
-            self._tried = holes
-            if session.propose() is not None:
-                self._number += 1
+        now_s = time.monotonic()
+        if holes == self._tried or now_s < self._again_s:
+            return
+        self._tried = holes
+        before = session.proposal
+        if (session.propose() or before) is not None:
+            self._number += 1
+        self._again_s = now_s + max(_PROPOSE_S, _BUSY * (time.monotonic() - now_s))
 
     # ---- What pages ask ----------------------------------------------------------------------
 
@@ -240,7 +246,8 @@ class FollowTab:
         minutes = call.read(_Minutes).minutes
         session = self._needed()
         with session.lock:
-            session.propose(None if minutes is None else 60.0 * minutes)
+            session.may_take_s = None if minutes is None else 60.0 * minutes
+            session.propose()
             self._number += 1
         self._studio.publish("follow", self._state_of(session))
         return self.proposal(call)

@@ -13,8 +13,8 @@ background:var(--wash);font:650 19px/1.3 system-ui,sans-serif}
 #panel-follow .big{display:grid;grid-template-columns:1fr 1fr;gap:8px;margin:0 0 12px}
 #panel-follow .big div{border:1px solid var(--line);border-radius:8px;padding:8px 10px;min-width:0}
 #panel-follow .big dt{font-size:14px;color:var(--soft);font-weight:600}
-#panel-follow .big dd{margin:0;font:750 31px/1.15 system-ui,sans-serif;font-variant-numeric:tabular-nums;color:var(--ink)}
-#panel-follow .big dd small{display:block;font:500 14px/1.35 system-ui,sans-serif;color:var(--soft)}
+#panel-follow .big dd{margin:0;white-space:nowrap;font:750 31px/1.15 system-ui,sans-serif;font-variant-numeric:tabular-nums;color:var(--ink)}
+#panel-follow .big dd small{display:block;white-space:normal;font:500 14px/1.35 system-ui,sans-serif;color:var(--soft)}
 #panel-follow .big .bad dd{color:var(--bad)}
 #panel-follow svg.profile{display:block;width:100%;height:110px;background:var(--wash);border-radius:6px}
 #panel-follow .profile text{font:12px system-ui,sans-serif;fill:var(--soft)}
@@ -221,10 +221,11 @@ export function tab(studio) {
     const {finish, spare, coverage, holes, lines, pictures} = state;
     put("finish", clock(finish.time_s), "± " + clock(finish.sigma_s) + ", " + number(finish.energy_wh, "Wh", 3));
     const tight = (spare.time_s !== null && spare.time_s < 0) || (spare.energy_wh !== null && spare.energy_wh < 0);
-    put("spare", spare.time_s === null ? number(spare.energy_wh, "Wh", 4) : clock(spare.time_s),
-      spare.time_s === null ? "no limit of time" : number(spare.energy_wh, "Wh", 4), tight);
+    put("spare", spare.time_s === null ? number(spare.energy_wh, "", 3) : clock(spare.time_s),
+      spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3), tight);
     put("overlap", percent(coverage.at_overlap), "then " + percent(coverage.expected_at_overlap) + "; seen " + percent(coverage.seen));
-    put("holes", String(holes.count), holes.count ? number(holes.area_m2, "m²", 3) + ", unseen " + number(holes.unseen_m2, "m²", 3) : "none", holes.count > 0);
+    put("holes", holes.count ? holes.area_m2.toFixed(holes.area_m2 < 99.5 ? 1 : 0) + " m²" : "none",
+      holes.count ? holes.count + (holes.count === 1 ? " hole" : " holes") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "what is left is not one", holes.area_m2 >= 0.05);
     put("lines", lines.left + " of " + (lines.left + lines.done), "dive " + state.dive.number + " of " + state.dive.of);
     const left = Object.entries(state.left_out).filter(([, count]) => count);
     more.replaceChildren(table("So far", [], [
@@ -259,7 +260,8 @@ export function tab(studio) {
     const age = state.silent_s + (performance.now() - heardAt) / 1000;
     const silent = age > state.patience_s;
     now.className = silent ? "now bad" : state.proposal || state.holes.count ? "now" : "now good";
-    now.textContent = silent ? "No news for " + Math.round(age) + " s" : state.phase[0].toUpperCase() + state.phase.slice(1);
+    now.textContent = silent ? "No news for " + (age < 100 ? Math.round(age) + " s" : clock(age) + " min") + "; it was " + state.phase
+      : state.phase[0].toUpperCase() + state.phase.slice(1);
     put("fix", silent ? Math.round(age) + " s ago" : "now", number(fix.depth_m, "m deep", 3) + ", " + number(fix.altitude_m, "m up", 3), silent);
     if (silent !== wasSilent) {
       wasSilent = silent;
@@ -349,9 +351,9 @@ export function tab(studio) {
     shapes("follow-proposal", "line", "Proposed lines", COLOURS.proposal,
       proposal ? proposal.lines.map((line) => [flat(line.start_ne), flat(line.end_ne)]) : [], {width: 5});
     if (proposal) {
-      const lines = proposal.lines.length + (proposal.lines.length === 1 ? " line" : " lines");
-      proposalText.textContent = lines + " more take " + clock(proposal.extra_s) + " min and " + number(proposal.extra_wh, "Wh", 2)
-        + ", and close " + number(proposal.gain_m2, "m²", 3) + " of " + number(proposal.holes_m2, "m²", 3) + ": then "
+      const lines = proposal.lines.length === 1 ? "1 more line takes " : proposal.lines.length + " more lines take ";
+      proposalText.textContent = lines + clock(proposal.extra_s) + " min and " + number(proposal.extra_wh, "Wh", 2)
+        + " for " + number(proposal.gain_m2, "m²", 3) + " of the " + number(proposal.holes_m2, "m²", 3) + " of holes: then "
         + percent(proposal.share_at_overlap) + " is at the overlap. They are flown after the planned lines, on the way home.";
     } else if (state.accepted) {
       proposalText.textContent = state.accepted.lines + " accepted lines are flown after the planned ones.";
