@@ -238,7 +238,7 @@ class RosSource:
     """`nav_msgs/Odometry` from the plan's datum, and a `sensor_msgs/Range`, of ROS 2."""
 
     def __init__(
-        self, datum: Datum, altimeter_from_glass_m: Array,
+        self, datum: Datum, altimeter_from_glass_m: Array, vehicle: str,
         odometry: str = "navigation/odometry", altitude: str = "altimeter",
     ) -> None:  # fmt: skip
         """Subscribe.
@@ -246,11 +246,12 @@ class RosSource:
         Args:
             datum: of the plan.
             altimeter_from_glass_m: as `altimeter_from_glass`.
+            vehicle: its name, below which topics are that do not begin with a slash.
             odometry: topic.
             altitude: topic.
 
         Raises:
-            VehicleError: ROS 2 is not installed.
+            VehicleError: ROS 2 is not installed, or a topic cannot have its name.
         """
         from missions.live.ros_messages import load_ros, message_class
         from missions.logs.ros_builder import ODOMETRY, RANGE
@@ -263,10 +264,16 @@ class RosSource:
         self._rows = OdometryRows(datum, altimeter_from_glass_m)
         self._ordered, self._heard = Reordered(WINDOW_S, self.left_out), list[Array]()
         self._ros.rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        self._node = self._ros.rclpy.create_node("alice_survey_follow")
+        from rclpy.exceptions import InvalidTopicNameException
+
+        self._node = self._ros.rclpy.create_node("follow", namespace=vehicle)
         subscribe, qos = self._node.create_subscription, self._ros.qos
-        subscribe(message_class(ODOMETRY), odometry, self._on_odometry, qos)
-        subscribe(message_class(RANGE), altitude, self._on_range, qos)
+        try:
+            subscribe(message_class(ODOMETRY), odometry, self._on_odometry, qos)
+            subscribe(message_class(RANGE), altitude, self._on_range, qos)
+        except InvalidTopicNameException as error:
+            self.close()
+            raise VehicleError(" ".join(str(error).split())) from None
 
     def poll(self, wall_s: float) -> list[Piece]:
         """What was heard since."""

@@ -33,6 +33,7 @@ from missions.follow.links import (
 from missions.follow.proposal import Budget, Proposal
 from missions.follow.rows import NavigationSource
 from missions.follow.tail import NavigationTail, ReplayedLog
+from missions.route.energy import craft_of
 from missions.values.plan_file import Plan, read_plan
 
 _BUSY = 4.0
@@ -68,7 +69,8 @@ def open_source(name: str, plan: Plan, rig: Rig, config: SurveyConfig) -> Naviga
     if kind == "mavlink":
         return MavlinkSource(rest or "udpin:127.0.0.1:14550", plan.datum, place)
     if kind == "ros":
-        return RosSource(plan.datum, place, **({"odometry": rest} if rest else {}))
+        vehicle = craft_of(config.vehicle).name
+        return RosSource(plan.datum, place, vehicle, **({"odometry": rest} if rest else {}))
     if Path(name).is_dir():
         raise NavigationError(f"{name}: is a folder: give the navigation CSV that grows")
     return NavigationTail(Path(name))
