@@ -123,25 +123,25 @@ class DiveSession:
         with self.lock:
             self.source.close()
 
-    def step(self, wall_s: float | None = None) -> bool:
+    def step(self, wall_s: float | None = None) -> int:
         """Take what has come, and look for holes where it is time.
 
         Args:
             wall_s: time of this machine's steady clock.
 
         Returns:
-            Whether something has come.
+            How many rows have come.
         """
         wall_s = time.monotonic() if wall_s is None else wall_s
         with self.lock:
             if self.fault is not None:
-                return False
+                return 0
             try:
                 pieces = self.source.poll(wall_s)
             except NavigationError as error:
                 self.fault = str(error)
-                return True
-            came = any(len(piece.rows) for piece in pieces)
+                return 0
+            came = sum(len(piece.rows) for piece in pieces)
             for window in self.follower.add(pieces):
                 self.blocks.touch(window)
             if came:
@@ -150,7 +150,7 @@ class DiveSession:
                 came or self._expected is None
             ):  # fmt: skip
                 self.look(wall_s)
-            return bool(pieces)
+            return came
 
     def read_all(self) -> None:
         """Take all that a file holds now."""

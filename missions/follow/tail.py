@@ -62,11 +62,12 @@ class NavigationTail:
             return []
         if self._was_cut(file):
             self._begin_again(file)
-        data = file.read(_CHUNK)
-        if data:
+        while data := file.read(_CHUNK):
             if len(self._head) < _HEAD:
                 self._head += data[: _HEAD - len(self._head)]
-            return self._pieces(data)
+            pieces = self._pieces(data)
+            if pieces:
+                return pieces
         if self._was_replaced(file):
             self.close()
             again = self._open()

@@ -24,6 +24,8 @@ from missions.follow.session import DiveSession
 _POLL_S, _PUBLISH_S, _ALIVE_S = 0.2, 0.5, 5.0
 """A source is asked five times a second; pages hear of it twice a second at most, and of a silent
 one every few seconds."""
+_MANY_ROWS = 1000
+"""After so many rows at once there are more: a log that is opened late is read without a pause."""
 _PROPOSE_S, _BUSY = 5.0, 4.0
 """Lines are looked for by themselves every so many seconds at most, and no more often than after so
 many times the time that it took."""
@@ -117,8 +119,10 @@ class FollowTab:
         """Read the source until another one is opened, or the studio ends."""
         sent_s, news = -math.inf, True
         while not (ended.is_set() or self._studio.ending.is_set()):
+            came = 0
             try:
-                news = session.step() or news
+                came = session.step()
+                news = news or came > 0 or session.fault is not None
                 self._propose_if_new(session)
             except Exception as error:  # a thread's bug must be seen on the page
                 session.fault = f"{type(error).__name__}: {error}"
@@ -129,7 +133,7 @@ class FollowTab:
                 self._studio.publish("follow", self._state_of(session))
             if session.fault is not None:
                 break
-            ended.wait(_POLL_S)
+            ended.wait(0.0 if came > _MANY_ROWS else _POLL_S)
         session.close()
 
     def _propose_if_new(self, session: DiveSession) -> None:
