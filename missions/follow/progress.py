@@ -330,9 +330,9 @@ class Progress:
         return stations.some(place >= np.array(skipped, dtype=np.intp)[which])
 
     def _taken(self, number: int) -> int:
-        """How many pictures of a line are behind the vehicle."""
+        """How many pictures of a line have surely been taken: not the one that was due last."""
         start_s, end_s = self.route.ends[number]
         if self.at_s <= start_s:
             return 0
         flown = (self.at_s - start_s) / (end_s - start_s)
-        return math.floor(flown * (self.plan.lines[number].stations - 1) + 1e-9) + 1
+        return math.floor(flown * (self.plan.lines[number].stations - 1) + 1e-9)

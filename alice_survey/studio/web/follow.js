@@ -210,6 +210,7 @@ export function tab(studio) {
         showProposal(await get("/api/follow/proposal"));
         drawn.proposal = proposalKey;
       }
+      showArrow();
     } finally {
       fetching = false;
     }
@@ -225,7 +226,7 @@ export function tab(studio) {
       spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3), tight);
     put("overlap", percent(coverage.at_overlap), "then " + percent(coverage.expected_at_overlap) + "; seen " + percent(coverage.seen));
     put("holes", holes.count ? holes.area_m2.toFixed(holes.area_m2 < 99.5 ? 1 : 0) + " m²" : "none",
-      holes.count ? holes.count + (holes.count === 1 ? " hole" : " holes") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "what is left is not one", holes.area_m2 >= 0.05);
+      holes.count ? holes.count + (holes.count === 1 ? " hole" : " holes") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "nothing is missed", holes.area_m2 >= 0.05);
     put("lines", lines.left + " of " + (lines.left + lines.done), "dive " + state.dive.number + " of " + state.dive.of);
     const left = Object.entries(state.left_out).filter(([, count]) => count);
     more.replaceChildren(table("So far", [], [
@@ -305,7 +306,6 @@ export function tab(studio) {
 
   function showTrack() {
     shapes("follow-track", "line", "Track", COLOURS.track, [fixes.map((fix) => [fix[2], fix[1]])], {width: 1.6});
-    showArrow();
     showProfile();
     const fix = fixes[fixes.length - 1];
     const place = leaflet.latLng(fix[1], fix[2]);

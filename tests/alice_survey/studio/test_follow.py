@@ -162,3 +162,16 @@ def test_a_log_that_cannot_be_used_is_said_in_a_line(tmp_path: Path) -> None:
         found = state(server)
         assert not found["following"]
         assert "plan" in found["fault"]
+
+
+def test_pages_hear_of_it_twice_a_second_at_most(dive: tuple[Server, Path]) -> None:
+    server, _ = dive
+    wait_for(server, lambda found: found["coverage"]["seen"] > 0)
+    heard: list[float] = []
+    publish = server.studio.events.publish
+    server.studio.events.publish = lambda event, data: (  # type: ignore[method-assign]
+        heard.append(time.monotonic()), publish(event, data))[1]  # fmt: skip
+    assert call(server, "/api/follow/open", {"log": "nav.csv", "replay": 50}).status == 200
+    wait_for(server, lambda found: found["lines"]["done"] >= 2)
+    assert len(heard) >= 3
+    assert np.diff(heard).min() > 0.45
