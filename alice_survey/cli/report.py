@@ -55,6 +55,12 @@ def studio(
         Path | None,
         typer.Option(help="GeoTIFF, BAG or other raster, to lie under the survey."),
     ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="Tiles of a web map under it, with {z}, {x} and {y}: network."
+        ),
+    ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
@@ -74,4 +80,7 @@ def studio(
     """
     from alice_survey.studio.server import run_studio
 
-    run_studio(workspace, port, browser=browser, show=typer.echo, log=log, chart=chart)
+    run_studio(
+        workspace, port, browser=browser, show=typer.echo, log=log, chart=chart,
+        background=background,
+    )  # fmt: skip

@@ -15,7 +15,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from alice_survey.base.errors import AliceError, WorkspaceError, known_fault
-from alice_survey.studio.chart import CHART
+from alice_survey.studio.chart import CHART, server_of
 from alice_survey.studio.endpoints.base import (
     Call,
     Content,
@@ -42,13 +42,14 @@ _BODY_S = 30.0
 """Time for the body of a request to arrive."""
 _MOST_STREAMS = 100
 _STUDIO_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:{}; "
     "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'"
 )
+"""Policy of the studio's page, with the server of a web map where one is named."""
 _TOKEN = "X-Studio-Token"  # noqa: S105 (the name of a header)
 _JSON = "application/json"
 _APP = re.compile(r"/app/([a-z_]+\.(?:js|css))")
-_KIT = ("map.js", "map_tiles.js", "mesh.js", "page.css")
+_KIT = ("map.js", "map_stations.js", "map_tiles.js", "mesh.js", "page.css")
 _VENDORED = ("vendor_map.js", "vendor_map.css", "vendor_mesh.js")
 
 
@@ -157,6 +158,8 @@ class _Answers:
     def __init__(self, studio: Studio) -> None:
         self._workspace, self._layers = studio.workspace, studio.layers
         self._meshes = MeshCopies(studio.workspace)
+        web_map = "" if studio.background is None else f" {server_of(studio.background)}"
+        self._policy = _STUDIO_POLICY.format(web_map)
 
     def answer(self, request: Request) -> Response:
         """Answer a request; runs in a thread of its own."""
@@ -182,7 +185,7 @@ class _Answers:
         token = requested.group(1) if requested else None
         tile, own = _TILE.fullmatch(path), _APP.fullmatch(path)
         if path == "/":
-            return _made(_web("index.html"), _STUDIO_POLICY)
+            return _made(_web("index.html"), self._policy)
         if own:
             headers = {"Cache-Control": REVALIDATE}
             return Response(_web(own.group(1)), headers=headers, media_type=content_type(path))

@@ -1,5 +1,6 @@
 """A chart of the user's own under a survey: how its values are coloured, and where it lies."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -78,3 +79,26 @@ def _middle(values: Array) -> tuple[float, float]:
 def chart_crs(place: PlaceRecord) -> CRS:
     """The system of a survey's map, that its chart is warped to."""
     return local_crs(datum_of(place))
+
+
+_TILES = re.compile(r"(https?://[a-z0-9.-]+(?::[0-9]{1,5})?)/[A-Za-z0-9/._~{}?=&%+-]*")
+"""Address of tiles; no character that could end a content security policy's source."""
+
+
+def server_of(background: str) -> str:
+    """Scheme, host and port of a web map's tiles.
+
+    Args:
+        background: their address, with {z}, {x} and {y}.
+
+    Raises:
+        WorkspaceError: it is none.
+    """
+    found = _TILES.fullmatch(background)
+    parts = re.findall(r"\{.*?\}", background)
+    if found is None or sorted(parts) != ["{x}", "{y}", "{z}"]:
+        raise WorkspaceError(
+            f"--background {background}: give the address of tiles, such as "
+            "https://tiles.example.org/{z}/{x}/{y}.png"
+        )
+    return found.group(1)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import secrets
 import socket
 import threading
@@ -72,7 +73,13 @@ class Server:
     """Serves one workspace until it is shut down."""
 
     def __init__(
-        self, folder: Path, port: int = 0, *, log: str | None = None, chart: Path | None = None
+        self,
+        folder: Path,
+        port: int = 0,
+        *,
+        log: str | None = None,
+        chart: Path | None = None,
+        background: str | None = None,
     ) -> None:
         """Listen.
 
@@ -81,6 +88,7 @@ class Server:
             port: 0 for any that is free.
             log: where the navigation of a dive comes from.
             chart: raster to lie under the survey.
+            background: address of a web map's tiles to lie under it.
 
         Raises:
             WorkspaceError: the port is not available, or the chart cannot be shown.
@@ -91,6 +99,7 @@ class Server:
             layers=Layers(workspace, None if chart is None else check_chart(chart)),
             token=secrets.token_urlsafe(24),
             log=log,
+            background=background,
         )
         try:
             self.socket = socket.create_server((ADDRESS, port), backlog=128)
@@ -135,11 +144,18 @@ class Server:
             target=self._uvicorn.run, kwargs={"sockets": [self.socket]}, daemon=True
         )
         answering.start()
+        log = logging.getLogger("uvicorn.error")
+        log.addFilter(self._is_shown)
         try:
             answering.join()
         finally:
             self.shutdown()
             answering.join(2 * _ENDING_S)
+            log.removeFilter(self._is_shown)
+
+    def _is_shown(self, _: logging.LogRecord) -> bool:
+        """Whether uvicorn may speak: of what is dropped at the end nobody needs to hear."""
+        return not self.studio.ending.is_set()
 
     def shutdown(self) -> None:
         """End `serve_forever`."""
@@ -161,6 +177,7 @@ def run_studio(
     show: Callable[[str], Any],
     log: str | None = None,
     chart: Path | None = None,
+    background: str | None = None,
 ) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
@@ -171,11 +188,12 @@ def run_studio(
         show: prints a line.
         log: where the navigation of a dive comes from.
         chart: raster to lie under the survey.
+        background: address of a web map's tiles to lie under it.
 
     Raises:
         WorkspaceError: the port is taken, or the chart cannot be shown.
     """
-    server = Server(workspace, port, log=log, chart=chart)
+    server = Server(workspace, port, log=log, chart=chart, background=background)
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:

@@ -1,5 +1,6 @@
 /* The studio's shell: the one map, its list of layers, and the tabs. */
 
+import {background} from "./background.js";
 import {attempt, el, get, mayWrite, say} from "./core.js";
 
 const state = await get("/api/state");
@@ -78,6 +79,14 @@ function show(name, on) {
 
 const map = {...core, put, remove, show};
 described.forEach(put);
+if (state.background && state.datum) {
+  const tiles = background(state.datum, state.background).addTo(core.leaflet);
+  const input = el("input", {type: "checkbox", value: "background", checked: true});
+  input.addEventListener("change", () => (input.checked ? tiles.addTo(core.leaflet) : tiles.remove()));
+  const host = new URL(state.background).host;
+  groupOf("Under it").append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
+    el("small", {}, "From the network, as --background says; its terms are those of " + host + ".")));
+}
 
 /* ---- Tabs ---- */
 
