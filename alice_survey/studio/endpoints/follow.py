@@ -76,6 +76,8 @@ class FollowTab:
         """Counts proposals, so that what is accepted is what was shown."""
         self._tried: tuple[int, float] | None = None
         self._again_s = -math.inf
+        self._sent_s, self._news = -math.inf, True
+        """When pages heard of it, and whether there is something that they have not heard."""
         if self._is_new:  # links are heard from the start, pages or not
             threading.Thread(target=self._current, daemon=True).start()
 
@@ -117,19 +119,19 @@ class FollowTab:
 
     def _work(self, session: DiveSession, ended: threading.Event) -> None:
         """Read the source until another one is opened, or the studio ends."""
-        sent_s, news = -math.inf, True
         while not (ended.is_set() or self._studio.ending.is_set()):
             came = 0
             try:
                 came = session.step()
-                news = news or came > 0 or session.fault is not None
+                self._news = self._news or came > 0 or session.fault is not None
                 self._propose_if_new(session)
             except Exception as error:  # a thread's bug must be seen on the page
                 session.fault = f"{type(error).__name__}: {error}"
-                news = True
+                self._news = True
             now_s = time.monotonic()
-            if now_s - sent_s >= (_PUBLISH_S if news else _ALIVE_S):
-                sent_s, news = now_s, False
+            due_s = self._sent_s + (_PUBLISH_S if self._news else _ALIVE_S)
+            if (now_s >= due_s or session.fault is not None) and not ended.is_set():
+                self._sent_s, self._news = now_s, False
                 self._studio.publish("follow", self._state_of(session))
             if session.fault is not None:
                 break
@@ -253,7 +255,7 @@ class FollowTab:
             session.may_take_s = None if minutes is None else 60.0 * minutes
             session.propose()
             self._number += 1
-        self._studio.publish("follow", self._state_of(session))
+            self._news = True
         return self.proposal(call)
 
     def proposal(self, call: Call) -> dict[str, Any]:
@@ -274,7 +276,7 @@ class FollowTab:
             if number != self._number:
                 raise StaleError("other lines are proposed by now: look at them first")
             session.accept()
-        self._studio.publish("follow", self._state_of(session))
+            self._news = True
         return self._state_of(session)
 
     def allow(self, call: Call) -> dict[str, Any]:
@@ -283,6 +285,7 @@ class FollowTab:
         session = self._needed()
         with session.lock:
             session.allow(math.inf if minutes is None else 60.0 * minutes)
+            self._news = True
         return self._state_of(session)
 
     def export(self, call: Call) -> Content:

@@ -119,6 +119,15 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, width: int, heig
         assert figure(page, "holes") in ("none", "0.0 m²", "0.1 m²")
         page.screenshot(path=str(tmp_path / f"closed-{width}.png"), full_page=width < 700)
         assert violations(page) == []
+        # A finished log is flown again, for training.
+        page.click("#panel-follow summary:has-text('Choose a log')")
+        page.click("#panel-follow button:has-text('Stop')")
+        page.wait_for_selector("#panel-follow .now:has-text('No dive is followed')")
+        page.screenshot(path=str(tmp_path / f"choose-{width}.png"), full_page=width < 700)
+        assert violations(page) == []
+        page.select_option("#panel-follow select >> nth=-1", "50")
+        page.click("#panel-follow button:has-text('Replay it')")
+        page.wait_for_selector("#panel-follow .now:has-text('On line 2')", timeout=30_000)
         overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")
         assert overflow <= 0
     assert heard.complaints == []
