@@ -1,5 +1,6 @@
 """The `plan` commands: plan a survey, and what goes with it before and after a dive."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +32,7 @@ app = typer.Typer(
         "plan precision -w reef",
         "plan gain 'control/*.jpg'",
         "plan check navigation.csv -w reef",
+        "plan follow nav.csv -w reef --every 5",
         "plan revisit -w reef",
         "plan export -w reef --format cola2 --format wpl",
     ),
@@ -209,6 +211,52 @@ def check(
         ),
         as_json,
     )  # fmt: skip
+
+
+@app.command(
+    epilog=examples(
+        "plan follow nav.csv -w reef",
+        "plan follow nav.csv -w reef --every 5",
+        "plan follow udp:14600 -w reef --every 10 --json",
+        "plan follow mavlink:udpin:127.0.0.1:14550 -w reef --every 5 -o holes",
+    )
+)
+def follow(
+    log: Annotated[
+        str,
+        typer.Argument(
+            metavar="LOG", help="Navigation CSV that grows, udp[:PORT], mavlink:URL or ros[:TOPIC]."
+        ),
+    ],
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    every: Annotated[
+        float | None,
+        typer.Option(min=0.2, max=3600, help="s between states; once if not given."),
+    ] = None,
+    dive: Annotated[
+        int | None, typer.Option(min=1, help="Which dive of the plan; found if not given.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Folder for a plan over the holes, with its exports."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Follow a dive while it is flown.
+
+    What it has seen, holes behind the vehicle, time and energy left, and lines that would close the
+    holes before it comes up. The studio shows the same on a map ('studio --log').
+    """
+    from alice_survey.survey import settings
+    from missions.follow.session import follow_report
+
+    config = settings(workspace, survey, needed=False)
+    for text, data in follow_report(workspace, config, log, every_s=every, dive=dive, out=output):
+        if as_json and every is not None:
+            typer.echo(json.dumps(data))  # a line for each state
+        else:
+            print_result(text, data, as_json)
 
 
 @app.command(epilog=examples("plan revisit -w reef", "plan revisit -w reef --sigma 5 --json"))

@@ -42,6 +42,7 @@ def report(
     epilog=examples(
         "studio -w reef",
         "studio -w reef --chart harbour.tif",
+        "studio -w reef --log nav.csv",
         "studio -w reef --port 8000 --no-browser",
     )
 )
@@ -63,6 +64,13 @@ def studio(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
+    log: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOG",
+            help="Dive to follow: growing navigation CSV, udp[:PORT], mavlink:URL, ros[:TOPIC].",
+        ),
+    ] = None,
 ) -> None:
     """Plan, run, look at and measure a survey in a browser.
 
@@ -73,5 +81,6 @@ def studio(
     from alice_survey.studio.server import run_studio
 
     run_studio(
-        workspace, port, browser=browser, show=typer.echo, chart=chart, background=background
-    )
+        workspace, port, browser=browser, show=typer.echo, log=log, chart=chart,
+        background=background,
+    )  # fmt: skip

@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -174,7 +174,7 @@ class _GridTask:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _TileCounts:
+class TileSummary:
     """What was counted in a part of the area."""
 
     maps: dict[str, Counts]
@@ -182,6 +182,85 @@ class _TileCounts:
     """For each camera: how many cells of the area are in 0, 1, ... pictures."""
     lines: list[NDArray[np.intp]]
     """For each camera: how many cells of the area are on 0, 1, ... lines."""
+
+
+@dataclass(kw_only=True, eq=False)
+class TileCounts:
+    """Views of each cell of a part of the area, counted station by station."""
+
+    grid: Grid
+    pictures: Counts
+    """(cameras, rows, columns)"""
+    lines: Counts
+    """(cameras, rows, columns)"""
+    pairs: Counts
+    """(rows, columns)"""
+    last: NDArray[np.int32]
+    """(cameras, rows, columns) the line that saw it last."""
+    stamp: NDArray[np.int32]
+    """(rows, columns) the picture that saw it last."""
+    stations: int = 0
+
+    @classmethod
+    def of(cls, grid: Grid, cameras: int) -> "TileCounts":
+        """Nothing seen yet."""
+        shape = (cameras, *grid.shape)
+        return cls(
+            grid=grid,
+            pictures=np.zeros(shape, np.uint16),
+            lines=np.zeros(shape, np.uint16),
+            pairs=np.zeros(grid.shape, np.uint16),
+            last=np.full(shape, -1, np.int32),
+            stamp=np.full(grid.shape, -1, np.int32),
+        )
+
+    def copy(self) -> "TileCounts":
+        """The same counts, to go on from here in another way."""
+        return replace(
+            self,
+            **{name: getattr(self, name).copy()
+               for name in ("pictures", "lines", "pairs", "last", "stamp")},
+        )  # fmt: skip
+
+    def add(self, rays: tuple[Array, Array], stations: Stations) -> None:
+        """Count stations: all of one line before those of the next, and none that is blind."""
+        for rows in _chunks(len(stations)):
+            offsets, which = _offsets(rays, stations, rows)
+            count_pictures(
+                self.grid.cells_of(offsets + np.array(self.grid.origin_ne)), which,
+                np.ascontiguousarray(self.grid.cells_of(stations.glass_ne[rows])),
+                stations.line[rows], self.stations, self.pictures, self.lines, self.last,
+                self.stamp, self.pairs,
+            )  # fmt: skip
+            self.stations += len(which)
+
+    def return_to(self, rays: tuple[Array, Array], stations: Stations) -> None:
+        """Go back to a line that was left: what its stations have seen counts on it no more.
+
+        Args:
+            rays: as of `add`.
+            stations: of that line, all that were counted.
+        """
+        aside = replace(TileCounts.of(self.grid, len(self.pictures)), last=self.last)
+        aside.add(rays, stations)
+
+    def summary(self, inside: NDArray[np.bool_]) -> TileSummary:
+        """The counts of all cameras together.
+
+        Args:
+            inside: (rows, columns) cells whose middle lies in the survey area.
+        """
+        total = self.pictures.sum(axis=0, dtype=np.uint32)
+        return TileSummary(
+            maps={
+                "pictures": np.minimum(total, 65535).astype(np.uint16),
+                "least_pictures": self.pictures.min(axis=0),
+                "least_lines": self.lines.min(axis=0),
+                "pairs": self.pairs,
+            },
+            pictures=[np.bincount(counts[inside]) for counts in self.pictures],
+            lines=[np.bincount(counts[inside]) for counts in self.lines],
+        )
 
 
 def certificate(
@@ -220,45 +299,71 @@ def certificate(
     stations = stations.some(order)
     coarse = most_cells is not None and grid.rows * grid.columns > _COARSE * most_cells
     rays = border_rays_body(rig, _FEW_POINTS) if coarse else border_rays_body(rig)
-    reach_m = _reaches_m(rays, stations)
+    reach_m = reaches_m(rays, stations)
     blind = int(np.count_nonzero(np.isnan(reach_m)))
-    names = tuple(rig.cameras)
     # Beyond its reach a place may be by rounding.
     glass, reach = grid.cells_of(stations.glass_ne), (reach_m + 1e-6) / grid.cell_m
+    places, tasks = [], []
+    for here, part in tiles_of(grid, mask):
+        near = _near(glass, reach, here[0].start, here[1].start, part.rows, part.columns)
+        places.append(here)
+        tasks.append(
+            _GridTask(grid=part, rays=rays, stations=stations.some(near), inside=mask[here])
+        )
+    found = executor.map(
+        count_tile, tasks, label="count the views of each place", task_mib=_TILE_MIB
+    )
+    return assembled(
+        area, pattern, tuple(rig.cameras), grid, mask, zip(places, found, strict=True),
+        stations=len(stations), blind=blind, estimated=coarse,
+    )  # fmt: skip
+
+
+def tiles_of(grid: Grid, inside: NDArray[np.bool_]) -> Iterator[tuple[tuple[slice, slice], Grid]]:
+    """Parts of a grid that are worked on at once, where the area is: rows and columns, and grid."""
+    for row, column in itertools.product(range(0, grid.rows, _TILE), range(0, grid.columns, _TILE)):
+        part = grid.part(row, column, _TILE, _TILE)
+        here = (slice(row, row + part.rows), slice(column, column + part.columns))
+        if inside[here].any():
+            yield here, part
+
+
+def assembled(
+    area: Area,
+    pattern: Pattern,
+    cameras: tuple[str, ...],
+    grid: Grid,
+    inside: NDArray[np.bool_],
+    tiles: Iterable[tuple[tuple[slice, slice], TileSummary]],
+    *,
+    stations: int,
+    blind: int,
+    estimated: bool = False,
+) -> Certificate:
+    """A certificate from what was counted in the parts of an area."""
     result = {
         name: np.zeros(grid.shape, np.uint16)
         for name in ("pictures", "least_pictures", "least_lines", "pairs")
     }
-
-    places, tasks = [], []
-    for row, column in itertools.product(range(0, grid.rows, _TILE), range(0, grid.columns, _TILE)):
-        part = grid.part(row, column, _TILE, _TILE)
-        here = (slice(row, row + part.rows), slice(column, column + part.columns))
-        if mask[here].any():
-            near = stations.some(_near(glass, reach, row, column, part.rows, part.columns))
-            places.append(here)
-            tasks.append(_GridTask(grid=part, rays=rays, stations=near, inside=mask[here]))
-    tiles = []
-    found = executor.map(
-        count_tile, tasks, label="count the views of each place", task_mib=_TILE_MIB
-    )
-    for here, tile in zip(places, found, strict=True):
+    counted = []
+    for here, tile in tiles:
         for name, counts in tile.maps.items():
             result[name][here] = counts
-        tiles.append(tile)
+        counted.append(tile)
     return Certificate(
         area=area,
         pattern=pattern,
-        cameras=names,
-        stations=len(stations),
+        cameras=cameras,
+        stations=stations,
         blind=blind,
-        estimated=coarse,
+        estimated=estimated,
         grid=grid,
-        inside=mask,
-        histograms={n: _histogram([t.pictures[i] for t in tiles]) for i, n in enumerate(names)},
-        line_histograms={n: _histogram([t.lines[i] for t in tiles]) for i, n in enumerate(names)},
+        inside=inside,
+        histograms={n: _histogram([t.pictures[i] for t in counted]) for i, n in enumerate(cameras)},
+        line_histograms={n: _histogram([t.lines[i] for t in counted])
+                         for i, n in enumerate(cameras)},
         **result,
-    )
+    )  # fmt: skip
 
 
 def _cell_m(
@@ -324,7 +429,7 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
-def _reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
+def reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
     """How far from the glass, (S,), a station sees; NaN where it looks past the sea floor."""
     reaches = [np.empty(0)]
     for rows in _chunks(len(stations)):
@@ -367,37 +472,11 @@ def _near(
     return near[:count].copy()
 
 
-def count_tile(task: _GridTask) -> _TileCounts:
+def count_tile(task: _GridTask) -> TileSummary:
     """Count the views of each cell of a part of the area."""
-    pictures, lines, pairs = _counts(task.grid, task.rays, task.stations)
-    return _TileCounts(
-        maps={
-            "pictures": np.minimum(pictures.sum(axis=0, dtype=np.uint32), 65535).astype(np.uint16),
-            "least_pictures": pictures.min(axis=0),
-            "least_lines": lines.min(axis=0),
-            "pairs": pairs,
-        },
-        pictures=[np.bincount(counts[task.inside]) for counts in pictures],
-        lines=[np.bincount(counts[task.inside]) for counts in lines],
-    )
-
-
-def _counts(
-    grid: Grid, rays: tuple[Array, Array], stations: Stations
-) -> tuple[Counts, Counts, Counts]:
-    """Pictures and lines, (cameras, rows, columns) each, and pairs, (rows, columns)."""
-    shape = (len(rays[0]), *grid.shape)
-    pictures, lines = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
-    last, stamp = np.full(shape, -1, np.int32), np.full(grid.shape, -1, np.int32)
-    pairs = np.zeros(grid.shape, np.uint16)
-    for rows in _chunks(len(stations)):
-        offsets, which = _offsets(rays, stations, rows)
-        count_pictures(
-            grid.cells_of(offsets + np.array(grid.origin_ne)), which,
-            np.ascontiguousarray(grid.cells_of(stations.glass_ne[rows])), stations.line[rows],
-            rows.start, pictures, lines, last, stamp, pairs,
-        )  # fmt: skip
-    return pictures, lines, pairs
+    counts = TileCounts.of(task.grid, len(task.rays[0]))
+    counts.add(task.rays, task.stations)
+    return counts.summary(task.inside)
 
 
 def _histogram(counts: list[NDArray[np.intp]]) -> Array:

@@ -5,6 +5,7 @@ rig. What cannot be used is left out and reported, never silently filled in.
 """
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from camera_calib.rig import Rig
 from missions.coverage.stations import MOST_ALTITUDES, Stations
 from missions.logs.navigation_csv import (
     POSITION,
+    READINGS,
     NavigationLog,
     find_zone,
     read_navigation,
@@ -29,11 +31,13 @@ from missions.logs.navigation_csv import (
 )
 from missions.values.plan_file import Plan
 
-_ALIKE_RAD = math.radians(45.0)
+ALIKE_RAD = math.radians(45.0)
 """A vehicle that crabs or yaws by less than this still flies its line (inferred: half way to a line
 across)."""
-_LEAST_RUN = 3
+LEAST_RUN = 3
 """Pictures that make a straight run outside of the plan."""
+RUN_STEPS = 3.0
+"""Pictures of a run are no more steps apart."""
 
 _MOST_TRIGGERS = 1_000_000
 """More than a month of pictures every 3 s: times or intervals beyond are wrong."""
@@ -115,13 +119,27 @@ def read_dive_record(
                 f"{log}: spans {span_s:.3g} s, over {_MOST_TRIGGERS} pictures every "
                 f"{plan.interval_s:.3g} s: check its times, or give the triggers"
             )
-        times = np.arange(nav.time_s[0], nav.time_s[-1], plan.interval_s)
+        times = plan_triggers(nav.time_s[0], nav.time_s[-1], plan.interval_s)
         when = Triggers(
             source=f"the plan's interval, {plan.interval_s:.3g} s, from the start of the log",
             time_s=times,
             line=None,
         )
     return _logged(log, nav, when, plan, rig)
+
+
+def plan_triggers(start_s: float, end_s: float, interval_s: float, first: int = 0) -> Array:
+    """Times, (N,), of the pictures every interval from a start on, before an end.
+
+    Args:
+        start_s: time of picture 0.
+        end_s: none at or after it.
+        interval_s: between pictures.
+        first: number of the first picture of those wanted.
+    """
+    last = max(first, math.ceil((end_s - start_s) / interval_s) + 1)
+    times: Array = start_s + interval_s * np.arange(first, last, dtype=np.float64)
+    return times[times < end_s]
 
 
 def _read_log(path: Path) -> NavigationLog:
@@ -244,7 +262,6 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     """Stations of a log at the times of its triggers."""
     at = nav.at(triggers.time_s)
     left_out: dict[str, int] = {}
-    notes: list[str] = []
     beyond = (triggers.time_s < nav.time_s[0]) | (triggers.time_s > nav.time_s[-1])
     lost = ~np.isfinite(at["latitude_deg"] + at["longitude_deg"])
     _count(left_out, f"beyond the log ({nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s)", beyond)
@@ -267,20 +284,17 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         )
     at = {name: values[kept] for name, values in at.items()}
     time_s = triggers.time_s[kept]
-    geodetic = np.nan_to_num([at[name] for name in POSITION]).T
-    body_ned = plan.datum.ned_from_geodetic(geodetic)
-    attitude = _attitude(nav, at, time_s, plan, notes)
-    lever = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
-    glass_ned = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
-    glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
-    altitude = at["altitude_m"].copy()
-    unknown = ~np.isfinite(altitude)
-    if unknown.any():
-        altitude[unknown] = plan.seafloor_depth_m - glass_ned[unknown, 2]
-        notes.append(
-            f"{int(unknown.sum())} of {len(kept)} stations have no altitude: it is taken from "
-            f"their depth and a sea floor at {plan.seafloor_depth_m:g} m"
-        )
+
+    def courses(unknown: NDArray[np.bool_]) -> Array:
+        places = [nav.columns[name] for name in POSITION[:2]]
+        ned = plan.datum.ned_from_geodetic(np.column_stack([*places, np.zeros(len(nav.time_s))]))
+        return _courses(nav.time_s, ned[:, :2], time_s[unknown], plan)
+
+    attitude, assumed = attitude_of(at, courses)
+    glass_ned = glass_places(at, attitude, plan, rig)
+    altitude, unknown = altitude_of(at, glass_ned[:, 2], plan)
+    assumed["no_altitude"] = unknown
+    notes = notes_of(assumed, len(kept), plan)
     stations = Stations(
         glass_ne=glass_ned[:, :2],
         altitude_m=altitude,
@@ -289,8 +303,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         time_s=time_s,
     )
     _check_place(path, plan, stations)
-    high = stations.altitude_m > MOST_ALTITUDES * plan.altitude_m
-    below = stations.altitude_m <= 0
+    high, below = too_high(stations.altitude_m, plan), stations.altitude_m <= 0
     stations = stations.some(~(high | below))
     if triggers.line is None:
         stations = replace(stations, line=assign_lines(stations, plan))
@@ -305,7 +318,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         triggered=len(triggers.time_s),
         left_out=left_out,
         on_way=int(on_way.sum()),
-        notes=tuple(notes),
+        notes=notes,
         gaps=_gaps(nav),
     )
     # What was left out or assumed is in the caller's report.
@@ -316,35 +329,62 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     return record
 
 
-def _attitude(
-    nav: NavigationLog, at: dict[str, Array], time_s: Array, plan: Plan, notes: list[str]
-) -> Array:
-    """Roll, pitch, heading, (S, 3) radians; level, and along the track, where they are unknown."""
-    nothing = np.full(len(time_s), np.nan)
-    degrees = np.column_stack(
-        [at.get(name, nothing) for name in ("roll_deg", "pitch_deg", "heading_deg")]
-    )
+def attitude_of(
+    at: Mapping[str, Array], courses: Callable[[NDArray[np.bool_]], Array]
+) -> tuple[Array, dict[str, int]]:
+    """Roll, pitch, heading, (S, 3) radians; level, and along the track, where they are unknown.
+
+    Args:
+        at: columns of the log at the stations, (S,) each.
+        courses: courses made good, radians, of the stations of a mask (S,).
+
+    Returns:
+        The attitude, and how many stations had no tilt and no heading.
+    """
+    nothing = np.full(len(at["depth_m"]), np.nan)
+    degrees = np.column_stack([at.get(name, nothing) for name in READINGS[3:6]])
     tilt_unknown = ~np.isfinite(degrees[:, :2]).all(axis=1)
     heading_unknown = ~np.isfinite(degrees[:, 2])
-    if tilt_unknown.any():
-        degrees[tilt_unknown, :2] = 0.0
-        notes.append(f"{int(tilt_unknown.sum())} stations have no roll and pitch: taken as level")
+    degrees[tilt_unknown, :2] = 0.0
     if heading_unknown.any():
-        ned = plan.datum.ned_from_geodetic(
-            np.column_stack(
-                [nav.columns[name] for name in ("latitude_deg", "longitude_deg")]
-                + [np.zeros(len(nav.time_s))]
-            )
-        )
-        degrees[heading_unknown, 2] = np.rad2deg(
-            _courses(nav.time_s, ned[:, :2], time_s[heading_unknown], plan)
-        )
-        notes.append(
-            f"{int(heading_unknown.sum())} stations have no heading: taken as the course, without "
-            "crab"
-        )
+        degrees[heading_unknown, 2] = np.rad2deg(courses(heading_unknown))
     attitude: Array = np.deg2rad(degrees)
-    return attitude
+    return attitude, {
+        "no_tilt": int(tilt_unknown.sum()), "no_heading": int(heading_unknown.sum())
+    }  # fmt: skip
+
+
+def glass_places(at: Mapping[str, Array], attitude: Array, plan: Plan, rig: Rig) -> Array:
+    """North, east and depth, (S, 3), of the left port's glass at logged places of the body."""
+    body_ned = plan.datum.ned_from_geodetic(np.nan_to_num([at[name] for name in POSITION]).T)
+    lever = rig.body_from_cam(rig.reference).apply(rig.cameras[rig.reference].front_cam)
+    glass_ned: Array = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
+    glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
+    return glass_ned
+
+
+def altitude_of(at: Mapping[str, Array], glass_depth_m: Array, plan: Plan) -> tuple[Array, int]:
+    """Altitude, (S,), from the plan's sea floor where the log has none; and how often that is."""
+    unknown = ~np.isfinite(at["altitude_m"])
+    altitude: Array = np.where(unknown, plan.seafloor_depth_m - glass_depth_m, at["altitude_m"])
+    return altitude, int(unknown.sum())
+
+
+def too_high(altitude_m: Array, plan: Plan) -> NDArray[np.bool_]:
+    """(S,) whether pictures from altitudes are too coarse to count."""
+    high: NDArray[np.bool_] = altitude_m > MOST_ALTITUDES * plan.altitude_m
+    return high
+
+
+def notes_of(assumed: Mapping[str, int], stations: int, plan: Plan) -> tuple[str, ...]:
+    """What was assumed of stations, in words."""
+    texts = {
+        "no_tilt": "stations have no roll and pitch: taken as level",
+        "no_heading": "stations have no heading: taken as the course, without crab",
+        "no_altitude": f"of {stations} stations have no altitude: it is taken from their depth and "
+        f"a sea floor at {plan.seafloor_depth_m:g} m",
+    }
+    return tuple(f"{assumed[key]} {text}" for key, text in texts.items() if assumed.get(key))
 
 
 def _courses(log_s: Array, place_ne: Array, time_s: Array, plan: Plan) -> Array:
@@ -406,6 +446,16 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     three pictures or more on one course without a pause count as separate lines, numbered on
     from the plan's; the rest is -1: seen, but on no line.
     """
+    line = planned_lines(stations, plan)
+    runs = _runs(line, stations, RUN_STEPS * plan.station_spacing_m)
+    long = [run for run in runs if len(run) >= LEAST_RUN]
+    for number, run in enumerate(long, len(plan.lines)):
+        line[run] = number
+    return line
+
+
+def planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
+    """The plan's line of each station, (S,), as of `assign_lines`; -1 of none."""
     line = np.full(len(stations), -1, dtype=np.intp)
     nearest_m = np.full(len(stations), plan.line_spacing_m / 2 + 1e-9)
     heading = stations.attitude_rad[:, 2]
@@ -415,14 +465,10 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
         off = stations.glass_ne - planned.start_ne_m
         along, across = off @ ahead, np.abs(off @ np.array([-ahead[1], ahead[0]]))
         here = (along >= -step_m) & (along <= planned.length_m + step_m)
-        here &= np.abs(np.cos(heading - planned.heading_rad)) >= math.cos(_ALIKE_RAD)
+        here &= np.abs(np.cos(heading - planned.heading_rad)) >= math.cos(ALIKE_RAD)
         here &= across < nearest_m
         line[here] = index
         nearest_m[here] = across[here]
-    runs = _runs(line, stations, 3.0 * step_m)
-    long = [run for run in runs if len(run) >= _LEAST_RUN]
-    for number, run in enumerate(long, len(plan.lines)):
-        line[run] = number
     return line
 
 
@@ -437,7 +483,7 @@ def _runs(line: NDArray[np.intp], stations: Stations, longest_m: float) -> list[
             last is not None
             and last[-1] == i - 1
             and math.dist(places[i], places[i - 1]) <= longest_m
-            and math.cos(heading[i] - heading[last[0]]) >= math.cos(_ALIKE_RAD)
+            and math.cos(heading[i] - heading[last[0]]) >= math.cos(ALIKE_RAD)
         ):
             last.append(i)
         else:

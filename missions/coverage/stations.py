@@ -131,15 +131,21 @@ def stations_of_flight(flight: "Flight") -> Stations:
     )
 
 
+def at_once(parts: Sequence[Stations]) -> Stations:
+    """The stations of several parts of one dive, in their order, without times."""
+    return Stations(
+        glass_ne=np.concatenate([part.glass_ne for part in parts]),
+        altitude_m=np.concatenate([part.altitude_m for part in parts]),
+        attitude_rad=np.concatenate([part.attitude_rad for part in parts]),
+        line=np.concatenate([part.line for part in parts]),
+    )
+
+
 def joined(first: Stations, second: Stations) -> Stations:
     """The stations of two dives, without times; lines of the second count on."""
     after = int(first.line.max(initial=-1)) + 1
-    return Stations(
-        glass_ne=np.concatenate([first.glass_ne, second.glass_ne]),
-        altitude_m=np.concatenate([first.altitude_m, second.altitude_m]),
-        attitude_rad=np.concatenate([first.attitude_rad, second.attitude_rad]),
-        line=np.concatenate([first.line, np.where(second.line < 0, -1, second.line + after)]),
-    )
+    counted_on = np.where(second.line < 0, -1, second.line + after)
+    return at_once([first, replace(second, line=counted_on)])
 
 
 def plan_pattern(plan: Plan, rig: Rig) -> Pattern:

@@ -29,7 +29,7 @@ from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
-from missions.values.plan_file import Plan
+from missions.values.plan_file import Dive, Plan
 
 
 def refly_plan(
@@ -74,8 +74,7 @@ def refly_plan(
         for line in ties
     ]
     seen = pieces if pieces.area else shapely.union_all(swaths).intersection(plan.area.survey)
-    area = replace(plan.area, survey=multipolygon(seen))
-    ways = Ways(area.allowed)
+    ways = Ways(plan.area.allowed)
     lines = ordered(lines, ways, costs, plan.home_ne_m)
     dives = split_dives(
         lines,
@@ -90,20 +89,35 @@ def refly_plan(
         depth_m=plan.seafloor_depth_m - plan.altitude_m,
         split=settings.split_dives,
     )
-    again = replace(
+    again = again_over(plan, multipolygon(seen), lines, dives, name)
+    seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)
+    return replace(again, coverage=seen_alone.share_at_overlap)
+
+
+def again_over(
+    plan: Plan, seen: MultiPolygon, lines: Sequence[Line], dives: tuple[Dive, ...], name: str
+) -> Plan:
+    """A plan of other lines over a part of the survey area, with all else as it was.
+
+    Args:
+        plan: what was flown.
+        seen: the part, the new survey area.
+        lines: in the order of flight.
+        dives: along them.
+        name: of the new plan.
+    """
+    return replace(
         plan,
         name=name,
-        area=area,
+        area=replace(plan.area, survey=seen),
         lines=tuple(lines),
         dives=dives,
         length_m=sum(dive.route.length_m for dive in dives),
         duration_s=sum(dive.duration_s for dive in dives),
         energy_wh=sum(dive.energy_wh for dive in dives),
         line_depths_m=(),
-        details={"refly_of": plan.name, "area_m2": area.survey.area},
+        details={"refly_of": plan.name, "area_m2": seen.area},
     )
-    seen_alone = certificate(area, rig, stations_of_plan(again), pattern)
-    return replace(again, coverage=seen_alone.share_at_overlap)
 
 
 def _longer(line: Line, overrun_m: float, plan: Plan) -> Line:

@@ -1,7 +1,7 @@
 """A navigation log of a real dive, and what it gives at the time of each picture."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -17,9 +17,14 @@ from missions.values.navigation import COLUMNS
 
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
 """What a navigation log can measure; the other columns are sigmas."""
+TURNING = ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
+"""Columns of angles that turn the short way round."""
 _RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
 """A gap is longer than both this many seconds and this many median intervals."""
+FEW = 5
+"""So many known values show no interval of their own."""
+_MS = 1000.0
 _NAMED = 8
 
 
@@ -48,18 +53,28 @@ class NavigationLog:
         return {name: self._at(name, values, time_s) for name, values in self.columns.items()}
 
     def _at(self, name: str, values: Array, at_s: Array) -> Array:
-        turning = name in ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
-        found = interpolated(self.time_s, values, at_s, turning=turning)
-        if name == "heading_deg":
-            return found % 360.0
-        return (found + 180.0) % 360.0 - 180.0 if turning else found
+        turning = name in TURNING
+        return within_turn(name, interpolated(self.time_s, values, at_s, turning=turning))
+
+
+def within_turn(name: str, values: Array) -> Array:
+    """Values of a column, (N,), with angles in 0 to 360 degrees (headings), or within 180."""
+    if name == "heading_deg":
+        return values % 360.0
+    return (values + 180.0) % 360.0 - 180.0 if name in TURNING else values
 
 
 def longest_gap_s(time_s: Array) -> float:
     """Seconds between rows, at times (T,), beyond which nothing is interpolated."""
     if len(time_s) < 2:
         return _GAP_S
-    return max(_GAP_S, _GAP_INTERVALS * float(np.median(np.diff(time_s))))
+    steps_ms = np.rint(np.diff(time_s) * _MS)
+    return gap_of_interval_s(float(np.median(steps_ms)) / _MS)
+
+
+def gap_of_interval_s(interval_s: float) -> float:
+    """The same of rows whose median interval, in whole milliseconds, is known."""
+    return max(_GAP_S, _GAP_INTERVALS * interval_s)
 
 
 def _longest_gap_of(known_s: Array, time_s: Array) -> float:
@@ -67,7 +82,7 @@ def _longest_gap_of(known_s: Array, time_s: Array) -> float:
 
     Positions may be rarer than depths in one log; few of them show no rate of their own.
     """
-    return longest_gap_s(known_s if len(known_s) > _GAP_INTERVALS else time_s)
+    return longest_gap_s(known_s if len(known_s) > FEW else time_s)
 
 
 def interpolated(time_s: Array, values: Array, at_s: Array, *, turning: bool) -> Array:
@@ -139,51 +154,86 @@ def read_navigation(path: Path, zone: tzinfo, needed: Sequence[str] = POSITION) 
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
     header, rows = read_csv(path, needed)
-    time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
-    if time_name is None:
-        raise NavigationError(
-            f"{path}: no column time_s or time_utc; it has {shown(', '.join(header))}"
-        )
-    names = [*needed, *(name for name in COLUMNS if name in header and name not in needed)]
-    if not set(names) & set(READINGS):
-        raise NavigationError(f"{path}: none of the columns {', '.join(READINGS)}")
-    start: datetime | None = None
+    parser = RowParser(header, zone, needed, str(path))
     times: list[float] = []
     table: list[list[float]] = []
     faults: list[tuple[int, str]] = []
     for line, row in rows:
         try:
-            date = _date(row[time_name], zone) if time_name == "time_utc" else None
-            if date is not None and start is None:
-                start = date
-            since = date - start if date is not None and start is not None else None
-            time = since.total_seconds() if since is not None else _number(row, time_name)
-            first = [_number(row, name) for name in needed]
+            time, values, wrong = parser.parse(row)
         except ValueError as error:
             faults.append((line, str(error)))
             continue
         if times and time <= times[-1]:
             faults.append((line, "time does not follow that of the row before"))
             continue
-        rest = []
-        for name in names[len(needed) :]:
-            try:
-                rest.append(_number(row, name) if row[name] else math.nan)
-            except ValueError as error:
-                faults.append((line, f"{error} (that value only)"))
-                rest.append(math.nan)
+        faults += [(line, f"{fault} (that value only)") for fault in wrong]
         times.append(time)
-        table.append([*first, *rest])
+        table.append(values)
+    names = parser.names
     if faults:
         texts = _by_ranges(faults)
         more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
         warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
-    values = np.array(table).reshape(len(times), len(names))
-    columns = {name: values[:, i] for i, name in enumerate(names)}
+    cells = np.array(table).reshape(len(times), len(names))
+    columns = {name: cells[:, i] for i, name in enumerate(names)}
     if not any(np.isfinite(columns[name]).any() for name in READINGS if name in columns):
         what = "a position" if needed else "a reading"
         raise NavigationError(f"{path}: no row with a time and {what}")
-    return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start)
+    return NavigationLog(time_s=np.array(times), columns=columns, start_utc=parser.start_utc)
+
+
+class RowParser:
+    """Rows of a navigation CSV as numbers, one by one."""
+
+    def __init__(
+        self, header: Sequence[str], zone: tzinfo, needed: Sequence[str], source: str
+    ) -> None:
+        """A parser of the rows below a header.
+
+        Args:
+            header: names of the columns.
+            zone: of dates that name none.
+            needed: columns without which a row is of no use.
+            source: the file, in words.
+
+        Raises:
+            NavigationError: there is no column of times, or none of readings.
+        """
+        times = [name for name in ("time_s", "time_utc") if name in header]
+        if not times:
+            raise NavigationError(
+                f"{source}: no column time_s or time_utc; it has {shown(', '.join(header))}"
+            )
+        self._time, self._zone, self._needed = times[0], zone, len(needed)
+        self.names = [*needed, *(name for name in COLUMNS if name in header and name not in needed)]
+        """Columns of values."""
+        if not set(self.names) & set(READINGS):
+            raise NavigationError(f"{source}: none of the columns {', '.join(READINGS)}")
+        self.start_utc: datetime | None = None
+        """Date of the first row, from which seconds count; None of a log without dates."""
+
+    def parse(self, row: Mapping[str, str]) -> tuple[float, list[float], list[str]]:
+        """Seconds, values by `names`, and what is wrong with values that are not needed.
+
+        Raises:
+            ValueError: the row is of no use.
+        """
+        if self._time == "time_utc":
+            date = _date(row["time_utc"], self._zone)
+            self.start_utc = self.start_utc or date
+            time = (date - self.start_utc).total_seconds()
+        else:
+            time = _number(row, "time_s")
+        values = [_number(row, name) for name in self.names[: self._needed]]
+        wrong = []
+        for name in self.names[self._needed :]:
+            try:
+                values.append(_number(row, name) if row[name] else math.nan)
+            except ValueError as error:
+                wrong.append(str(error))
+                values.append(math.nan)
+        return time, values, wrong
 
 
 def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
@@ -203,7 +253,7 @@ def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
     ]
 
 
-def _number(row: dict[str, str], name: str) -> float:
+def _number(row: Mapping[str, str], name: str) -> float:
     cell = row[name]
     try:
         value = float(cell)

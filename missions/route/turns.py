@@ -39,6 +39,7 @@ def route_through(
     costs: Costs | None = None,
     turns: Turns = "auto",
     home_ne: tuple[float, float] | None = None,
+    start_ne: tuple[float, float] | None = None,
     first_line: int = 0,
 ) -> Route:
     """The route along all lines in order.
@@ -53,6 +54,7 @@ def route_through(
         turns: how to turn wherever that is possible; auto: the cheapest way.
         home_ne: where the route begins and ends; None: at the first line's run-in, and run-out
             behind the last.
+        start_ne: where it begins, if that is not home.
         first_line: index of the first of these lines in the plan.
 
     Raises:
@@ -68,6 +70,7 @@ def route_through(
             costs=costs,
             turns=turns,
             home_ne=home_ne,
+            start_ne=start_ne,
             first_line=first_line,
         )
     )
@@ -92,6 +95,7 @@ def legs_through(
     costs: Costs | None = None,
     turns: Turns = "auto",
     home_ne: tuple[float, float] | None = None,
+    start_ne: tuple[float, float] | None = None,
     first_line: int = 0,
 ) -> Array:
     """As `route_through`, of a `line_table` and with (L, 8) legs, columns as of `joins.COLUMNS`."""
@@ -110,9 +114,10 @@ def legs_through(
         first, last = _run_in(fence, start, run_in_m), _run_out(fence, end, run_in_m)
     else:
         home = np.array([*home_ne, _FREE])
+        begin = home if start_ne is None else np.array([*start_ne, _FREE])
         first, last = (
             _single(ways, costs, a, b, turn_radius_m, run_in_m, wanted)
-            for a, b in ((home, start), (end, home))
+            for a, b in ((begin, start), (end, home))
         )
     pieces = [first]
     done = 0

@@ -1,0 +1,402 @@
+/* Follow a dive: figures to read on deck, the map of what is seen, holes, and lines that close them. */
+
+import {attempt, button, el, field, get, number, on, say, send, table} from "./core.js";
+
+/* Safe for the colour-blind (Okabe and Ito 2008), as the coverage's own. */
+const COLOURS = {left: "#0072b2", done: "#6b6b6b", track: "#1a1a1a", hole: "#d55e00", proposal: "#cc79a7"};
+const LEGEND = [["#009e73", "at the requested overlap"], ["#56b4e9", "in stereo"], ["#e69f00", "in a picture"]];
+const STYLE = `
+#panel-follow .now{margin:0 0 10px;padding:10px 12px;border-radius:8px;border:1px solid var(--line);
+background:var(--wash);font:650 19px/1.3 system-ui,sans-serif}
+#panel-follow .now.bad{background:var(--badwash);border-color:var(--bad);color:var(--bad)}
+#panel-follow .now.good{background:var(--goodwash);border-color:var(--good)}
+#panel-follow .big{display:grid;grid-template-columns:1fr 1fr;gap:8px;margin:0 0 12px}
+#panel-follow .big div{border:1px solid var(--line);border-radius:8px;padding:8px 10px;min-width:0}
+#panel-follow .big dt{font-size:14px;color:var(--soft);font-weight:600}
+#panel-follow .big dd{margin:0;white-space:nowrap;font:750 31px/1.15 system-ui,sans-serif;font-variant-numeric:tabular-nums;color:var(--ink)}
+#panel-follow .big dd small{display:block;white-space:normal;font:500 14px/1.35 system-ui,sans-serif;color:var(--soft)}
+#panel-follow .big .bad dd{color:var(--bad)}
+#panel-follow svg.profile{display:block;width:100%;height:110px;background:var(--wash);border-radius:6px}
+#panel-follow .profile text{font:12px system-ui,sans-serif;fill:var(--soft)}
+#panel-follow .legend-row{display:flex;flex-wrap:wrap;gap:4px 14px;list-style:none;margin:6px 0 12px;padding:0;font-size:14px}
+#panel-follow .legend-row li{display:flex;align-items:center;gap:6px;margin:0}
+img.follow-block{image-rendering:pixelated}
+`;
+const PROFILE_S = 300;
+const KEPT = 6000;
+
+const clock = (seconds) => {
+  if (seconds === null || seconds === undefined) return "–";
+  const whole = Math.round(Math.abs(seconds));
+  const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+  const two = (n) => String(n).padStart(2, "0");
+  return (seconds < -0.5 ? "−" : "") + (h ? h + ":" + two(m) : m) + ":" + two(s);
+};
+const percent = (share) => {
+  if (share === null || share === undefined) return "–";
+  /* Never more than there is: 99.96 % is no 100 %. */
+  return (share >= 1 ? "100" : (Math.floor(share * 1000) / 10).toFixed(1)) + " %";
+};
+
+export function tab(studio) {
+  const sheet = new CSSStyleSheet();
+  sheet.replaceSync(STYLE);
+  document.adoptedStyleSheets.push(sheet);
+
+  const {map} = studio;
+  let state = null;
+  let heardAt = 0;
+  let fixes = [];
+  let blocks = new Map();
+  let arrow = null;
+  let drawn = {};
+  let wasSilent = false;
+  let shownNumber = null;
+  let isHere = false;
+  let centred = false;
+  let fetching = false;
+
+  /* ---- The panel ---- */
+
+  const now = el("p", {class: "now"}, "Loading");
+  const figure = (name, title) => {
+    const value = el("dd", {"data-figure": name}, "–");
+    return {box: el("div", {}, el("dt", {}, title), value), value};
+  };
+  const figures = {
+    finish: figure("finish", "To the surface"),
+    spare: figure("spare", "To spare"),
+    overlap: figure("overlap", "At the overlap"),
+    holes: figure("holes", "Holes behind it"),
+    lines: figure("lines", "Lines left"),
+    fix: figure("fix", "Last fix"),
+  };
+  const big = el("dl", {class: "big"}, Object.values(figures).map((one) => one.box));
+  const put = (name, text, small, bad = false) => {
+    const {box, value} = figures[name];
+    value.replaceChildren(text, el("small", {}, small || "\u00a0"));
+    box.classList.toggle("bad", bad);
+  };
+
+  const profile = el("svg", {class: "profile", viewBox: "0 0 340 110", role: "img", "aria-label": "Altitude over time"});
+  const holeTable = el("div", {});
+  const proposalText = el("p", {}, "");
+  const minutes = el("input", {type: "number", min: "0.5", max: "6000", step: "0.5", inputmode: "decimal"});
+  const format = el("select", {});
+  const accept = button("Accept and download", acceptIt, {class: "primary", disabled: true});
+  const again = el("a", {href: "/api/follow/export", download: "", hidden: true}, "Download again");
+  const upIn = el("input", {type: "number", min: "1", max: "6000", step: "1", inputmode: "decimal"});
+  const more = el("div", {});
+  const keep = el("input", {type: "checkbox", checked: true});
+  const logs = el("select", {});
+  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map((n) => el("option", {value: n}, n + " times")));
+  const choose = el("details", {}, el("summary", {}, "Choose a log"),
+    field("Navigation CSV of this workspace", logs),
+    field("Replay, for training", pace, "A finished log as if it were flown now"),
+    el("div", {class: "buttons"}, button("Follow it", () => opened({log: logs.value})),
+      button("Replay it", () => opened({log: logs.value, replay: Number(pace.value)})),
+      button("Stop", () => change("/api/follow/end", {}))),
+    el("p", {class: "note"}, "For files elsewhere and for vehicles: alice-survey studio --log nav.csv, udp:14600, mavlink:udpin:127.0.0.1:14550 or ros."));
+
+  const live = el("div", {hidden: true}, big,
+    el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"}, LEGEND.map(([colour, text]) => el("li", {},
+      el("span", {class: "swatch", style: {background: colour}}), text))),
+    el("div", {class: "field"}, el("label", {}, keep, " Keep the vehicle in view")),
+    el("h3", {}, "Altitude against the plan"), profile,
+    el("h3", {}, "Lines that close the holes"), proposalText,
+    el("div", {class: "row"}, field("May take, minutes", minutes, "Empty: what is to spare"), field("Format", format)),
+    el("div", {class: "buttons"}, button("Look for lines", propose), accept, again),
+    holeTable,
+    el("details", {}, el("summary", {}, "Time, energy, log"),
+      el("div", {class: "row"}, field("Up in, minutes", upIn, "When the vehicle has to be at the surface")),
+      el("div", {class: "buttons"}, button("Set", () => change("/api/follow/allow", {minutes: upIn.value ? Number(upIn.value) : null}))),
+      more));
+  const panel = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
+
+  /* ---- What the server says ---- */
+
+  async function change(path, body) {
+    return attempt(async () => {
+      const answer = await send(path, body);
+      await take(await get("/api/follow/state"));
+      return answer;
+    });
+  }
+
+  async function opened(body) {
+    if (!body.log) {
+      say("No navigation CSV lies in this workspace", "warn");
+      return;
+    }
+    if (await change("/api/follow/open", body)) choose.open = false;
+  }
+
+  async function propose() {
+    const body = minutes.value ? {minutes: Number(minutes.value)} : {};
+    const found = await change("/api/follow/propose", body);
+    if (found) say(found.proposal ? "Lines are proposed" : "No lines fit, or nothing is left to close", found.proposal ? "note" : "warn");
+  }
+
+  async function acceptIt() {
+    const done = await change("/api/follow/accept", {number: shownNumber});
+    if (!done) return;
+    again.href = "/api/follow/export?" + new URLSearchParams(format.value ? {format: format.value} : {});
+    again.hidden = false;
+    again.click();
+    say("The lines are counted on: load the mission into the vehicle before it comes up");
+  }
+
+  on("follow", (heard) => { if (isHere) attempt(() => take(heard)); });
+
+  async function take(heard) {
+    heardAt = performance.now();
+    const source = state && state.source;
+    state = {...(state || {}), ...heard};
+    if (heard.logs) fillChoices(heard);
+    live.hidden = !state.following;
+    choose.open = choose.open || !state.following;
+    if (!state.following) {
+      forget();
+      now.className = state.fault ? "now bad" : "now";
+      now.textContent = state.fault || (state.has_plan ? "No dive is followed: choose its log" : "There is no plan yet: plan the survey first");
+      return;
+    }
+    if (source !== state.source) forget();
+    showFigures();
+    showBlocks();
+    await catchUp();
+  }
+
+  function fillChoices(heard) {
+    logs.replaceChildren(...heard.logs.map((name) => el("option", {value: name}, name)));
+    if (!format.children.length) {
+      format.append(el("option", {value: ""}, "all formats"), ...heard.formats.map((name) => el("option", {value: name}, name)));
+    }
+  }
+
+  function forget() {
+    fixes = [];
+    drawn = {};
+    centred = false;
+    shownNumber = null;
+    blocks.forEach((block) => block.overlay.remove());
+    blocks = new Map();
+    arrow?.remove();
+    arrow = null;
+    ["follow-left", "follow-done", "follow-track", "follow-holes", "follow-proposal"].forEach((name) => map.remove(name));
+  }
+
+  /* Fixes, lines, holes and the proposal are asked for where they have changed. */
+  async function catchUp() {
+    if (fetching) return;
+    fetching = true;
+    try {
+      const last = fixes.length ? {after: fixes[fixes.length - 1][0]} : {};
+      const {fixes: came} = await get("/api/follow/track", last);
+      fixes.push(...came);
+      if (fixes.length > KEPT) fixes = fixes.filter((_, i) => i % 2 || i > KEPT / 2);
+      if (came.length) showTrack();
+      const lineKey = JSON.stringify([state.lines, state.accepted && state.accepted.extra_s]);
+      if (drawn.lines !== lineKey) {
+        showLines((await get("/api/follow/lines")).lines);
+        drawn.lines = lineKey;
+      }
+      if (drawn.holes !== state.hole_key) {
+        showHoles((await get("/api/follow/holes")).holes);
+        drawn.holes = state.hole_key;
+      }
+      const proposalKey = JSON.stringify([state.number, state.proposal && state.proposal.extra_s]);
+      if (drawn.proposal !== proposalKey) {
+        showProposal(await get("/api/follow/proposal"));
+        drawn.proposal = proposalKey;
+      }
+      showArrow();
+    } finally {
+      fetching = false;
+    }
+  }
+
+  /* ---- Figures ---- */
+
+  function showFigures() {
+    const {finish, spare, coverage, holes, lines, pictures} = state;
+    put("finish", clock(finish.time_s), "± " + clock(finish.sigma_s) + ", " + number(finish.energy_wh, "Wh", 3));
+    const tight = (spare.time_s !== null && spare.time_s < 0) || (spare.energy_wh !== null && spare.energy_wh < 0);
+    put("spare", spare.time_s === null ? number(spare.energy_wh, "", 3) : clock(spare.time_s),
+      spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3), tight);
+    put("overlap", percent(coverage.at_overlap), "then " + percent(coverage.expected_at_overlap) + "; seen " + percent(coverage.seen));
+    put("holes", holes.count ? holes.area_m2.toFixed(holes.area_m2 < 99.5 ? 1 : 0) + " m²" : "none",
+      holes.count ? holes.count + (holes.count === 1 ? " hole" : " holes") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "nothing is missed", holes.area_m2 >= 0.05);
+    put("lines", lines.left + " of " + (lines.left + lines.done), "dive " + state.dive.number + " of " + state.dive.of);
+    const left = Object.entries(state.left_out).filter(([, count]) => count);
+    more.replaceChildren(table("So far", [], [
+      ["Under water", clock(state.elapsed_s)],
+      ["Pace, true over planned", number(state.pace.ratio, "", 3) + " ± " + number(state.pace.sigma, "", 2)],
+      ["Energy spent, by the plan", number(state.spent_wh, "Wh", 3)],
+      ["Time that a dive may take", state.limit.dive_s === null ? "not set" : clock(state.limit.dive_s)],
+      ["Pictures that count", number(pictures.counted, "", 6)],
+      ["Pictures lost in gaps", String(pictures.lost_in_gaps)],
+      ["Pictures too high", String(pictures.too_high)],
+      ["Gaps of the log", String(state.gaps)],
+      ...left.map(([why, count]) => ["Left out: " + why, String(count)]),
+    ]), el("p", {class: "note"}, state.source));
+    tick();
+  }
+
+  /* Every second: how old the last fix is. */
+  function tick() {
+    if (!state || !state.following) return;
+    const {fix} = state;
+    if (state.fault) {
+      now.className = "now bad";
+      now.textContent = state.fault;
+      return;
+    }
+    if (!fix || state.silent_s === null) {
+      now.className = "now";
+      now.textContent = "Waiting for the first position: " + state.source;
+      put("fix", "–", "none yet");
+      return;
+    }
+    const age = state.silent_s + (performance.now() - heardAt) / 1000;
+    const silent = age > state.patience_s;
+    now.className = silent ? "now bad" : state.proposal || state.holes.count ? "now" : "now good";
+    now.textContent = silent ? "No news for " + (age < 100 ? Math.round(age) + " s" : clock(age) + " min") + "; it was " + state.phase
+      : state.phase[0].toUpperCase() + state.phase.slice(1);
+    put("fix", silent ? Math.round(age) + " s ago" : "now", number(fix.depth_m, "m deep", 3) + ", " + number(fix.altitude_m, "m up", 3), silent);
+    if (silent !== wasSilent) {
+      wasSilent = silent;
+      say(silent ? "No news from the vehicle" : "News from the vehicle again", silent ? "warn" : "note");
+    }
+  }
+  setInterval(() => { if (isHere) tick(); }, 1000);
+
+  /* ---- The map ---- */
+
+  function showBlocks() {
+    state.blocks.forEach(([row, column, version, south, west, north, east]) => {
+      const name = row + "/" + column;
+      const address = "/api/follow/block/" + name + "?v=" + version;
+      const held = blocks.get(name);
+      if (!held) {
+        const overlay = leaflet.imageOverlay(address, [[south, west], [north, east]], {pane: "over", className: "follow-block"});
+        if (isHere) overlay.addTo(map.leaflet);
+        blocks.set(name, {overlay, version});
+      } else if (held.version !== version) {
+        held.overlay.setUrl(address);
+        held.version = version;
+      }
+    });
+  }
+
+  const flat = (ne) => [ne[1], ne[0]];
+  function shapes(name, kind, title, colour, list, others = {}) {
+    if (!list.length) {
+      map.remove(name);
+      return;
+    }
+    map.put({kind, name, title, colour, shapes: list, texts: [], group: "Dive", shown: true, fill: 0.35, ...others});
+  }
+
+  function showLines(lines) {
+    const ends = (wanted) => lines.filter(wanted).map((line) => [flat(line.start_ne), flat(line.end_ne)]);
+    shapes("follow-done", "line", "Lines done", COLOURS.done, ends((line) => line.state === "done"), {width: 1.5});
+    shapes("follow-left", "line", "Lines left", COLOURS.left, ends((line) => line.state !== "done"), {dashed: true});
+  }
+
+  function showTrack() {
+    shapes("follow-track", "line", "Track", COLOURS.track, [fixes.map((fix) => [fix[2], fix[1]])], {width: 1.6});
+    showProfile();
+    const fix = fixes[fixes.length - 1];
+    const place = leaflet.latLng(fix[1], fix[2]);
+    if (!centred) {
+      centred = true;
+      map.fit();
+    } else if (keep.checked && !map.leaflet.getBounds().pad(-0.1).contains(place)) {
+      map.leaflet.panTo(place, {animate: false});
+    }
+  }
+
+  function showArrow() {
+    const fix = fixes[fixes.length - 1];
+    if (!fix || !isHere) return;
+    const size = 15 / 2 ** map.leaflet.getZoom();
+    const heading = ((fix[4] ?? 0) * Math.PI) / 180;
+    const corner = (ahead, right) => [
+      fix[1] + size * (ahead * Math.cos(heading) - right * Math.sin(heading)),
+      fix[2] + size * (ahead * Math.sin(heading) + right * Math.cos(heading)),
+    ];
+    const corners = [corner(1.2, 0), corner(-0.8, 0.75), corner(-0.35, 0), corner(-0.8, -0.75)];
+    if (arrow) {
+      arrow.setLatLngs(corners);
+    } else {
+      arrow = leaflet.polygon(corners, {color: "#fff", weight: 2, fillColor: "#0072b2", fillOpacity: 1, interactive: false}).addTo(map.leaflet);
+    }
+    arrow.bringToFront();
+  }
+  map.leaflet.on("zoomend", showArrow);
+
+  function showHoles(holes) {
+    const outlines = holes.flatMap((hole) => hole.rings_ne.map((ring) => ring.map(flat)));
+    shapes("follow-holes", "polygon", "Holes", COLOURS.hole, outlines);
+    holeTable.replaceChildren(holes.length ? table("Holes, worst first", ["hole", "m²", "unseen m²", "north, east m"],
+      holes.slice(0, 6).map((hole, i) => [
+        el("button", {type: "button", onclick: () => map.leaflet.panTo([hole.north_m, hole.east_m])}, "Hole " + (i + 1)),
+        hole.area_m2.toFixed(2), hole.unseen_m2.toFixed(2), hole.north_m.toFixed(1) + ", " + hole.east_m.toFixed(1)])) : "");
+  }
+
+  function showProposal({number: shown, proposal}) {
+    shownNumber = shown;
+    accept.disabled = !proposal || !studio.mayWrite();
+    shapes("follow-proposal", "line", "Proposed lines", COLOURS.proposal,
+      proposal ? proposal.lines.map((line) => [flat(line.start_ne), flat(line.end_ne)]) : [], {width: 5});
+    if (proposal) {
+      const lines = proposal.lines.length === 1 ? "1 more line takes " : proposal.lines.length + " more lines take ";
+      proposalText.textContent = lines + clock(proposal.extra_s) + " min and " + number(proposal.extra_wh, "Wh", 2)
+        + " for " + number(proposal.gain_m2, "m²", 3) + " of the " + number(proposal.holes_m2, "m²", 3) + " of holes: then "
+        + percent(proposal.share_at_overlap) + " is at the overlap. They are flown after the planned lines, on the way home.";
+    } else if (state.accepted) {
+      proposalText.textContent = state.accepted.lines + " accepted lines are flown after the planned ones.";
+    } else {
+      proposalText.textContent = state.holes.count ? "No lines fit what is to spare, or can be reached." : "No holes so far: nothing to close.";
+    }
+  }
+
+  /* ---- Altitude ---- */
+
+  function showProfile() {
+    const last = fixes[fixes.length - 1][0];
+    const shown = fixes.filter((fix) => fix[0] > last - PROFILE_S && fix[3] !== null);
+    const plan = state.planned_altitude_m;
+    const [wide, high, left] = [340, 110, 34];
+    const top = 2 * plan;
+    const x = (s) => left + ((s - (last - PROFILE_S)) / PROFILE_S) * (wide - left);
+    const y = (m) => 8 + (1 - Math.min(Math.max(m / top, 0), 1)) * (high - 26);
+    const points = shown.map((fix) => x(fix[0]).toFixed(1) + "," + y(fix[3]).toFixed(1)).join(" ");
+    const latest = shown.length ? shown[shown.length - 1][3] : null;
+    profile.setAttribute("aria-label", "Altitude over the last five minutes: now " + number(latest, "m", 3) + ", planned " + number(plan, "m", 3));
+    profile.replaceChildren(
+      el("line", {x1: left, x2: wide, y1: y(plan), y2: y(plan), stroke: "var(--blue)", "stroke-dasharray": "6 4", "stroke-width": 1.5}),
+      el("text", {x: 2, y: y(plan) + 4}, number(plan, "m", 2)),
+      el("text", {x: 2, y: y(0) + 4}, "0 m"),
+      el("text", {x: left, y: high - 3}, "5 min ago"),
+      el("text", {x: wide - 26, y: high - 3}, "now"),
+      el("polyline", {points, fill: "none", stroke: "var(--ink)", "stroke-width": 1.8}));
+  }
+
+  return {
+    name: "follow",
+    title: "Follow",
+    panel,
+    enter() {
+      isHere = true;
+      blocks.forEach((block) => block.overlay.addTo(map.leaflet));
+      attempt(async () => take(await get("/api/follow/state")));
+    },
+    leave() {
+      isHere = false;
+      forget();
+    },
+    keys: {p: propose, v: () => { keep.checked = !keep.checked; }},
+  };
+}

@@ -1,0 +1,1 @@
+"""Follow a dive while it is flown: coverage, holes, time left, and lines that close the holes."""
