@@ -135,6 +135,7 @@ PARTS = (
         long=True,
         packages=("coverage_path_planner", "opencoverage"),
     ),
+    Part(name="studio", module="studio"),
     Part(name="vehicle", module="vehicle"),
     Part(name="missions", module="missions"),
     Part(name="features", module="features", arguments=_features, needs=_need_features),

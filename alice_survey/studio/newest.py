@@ -19,7 +19,8 @@ class Newest:
     """Work of which only the newest of each page counts: older ones that wait are dropped."""
 
     _condition: threading.Condition = field(default_factory=threading.Condition)
-    _tickets: dict[str, int] = field(default_factory=dict)
+    tickets: dict[str, int] = field(default_factory=dict)
+    """Requests of each page so far."""
     _busy: bool = False
 
     def run(self, page: str, work: Callable[[], T]) -> T:
@@ -29,10 +30,10 @@ class Newest:
             SupersededError: newer work came from the same page while this waited.
         """
         with self._condition:
-            mine = self._tickets[page] = self._tickets.get(page, 0) + 1
+            mine = self.tickets[page] = self.tickets.get(page, 0) + 1
             self._condition.notify_all()
-            self._condition.wait_for(lambda: not self._busy or self._tickets[page] != mine)
-            if self._tickets[page] != mine:
+            self._condition.wait_for(lambda: not self._busy or self.tickets[page] != mine)
+            if self.tickets[page] != mine:
                 raise SupersededError("a newer change is being planned")
             self._busy = True
         try:

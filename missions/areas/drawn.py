@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -44,7 +44,8 @@ _SAME_M = 6e-4
 """Corners this near are the same: whoever draws may round to a millimetre."""
 _MOST_CORNERS = 200_000
 
-Place = tuple[float, float]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Place = tuple[Metres, Metres]
 Open = tuple[Place, ...]
 
 
@@ -162,7 +163,7 @@ def drawing_of_file(
     role: Role = "survey",
     layer: str | None = None,
     crs: str | None = None,
-    at_datum: bool = True,
+    datum: Datum | None,
 ) -> AreaDrawing:
     """The shapes of a file, to be drawn.
 
@@ -172,13 +173,15 @@ def drawing_of_file(
         role: what the shapes are for.
         layer: of a file with several.
         crs: of a file that does not say.
-        at_datum: whether they count to the datum so far; else to the middle of the file.
+        datum: that they count to; None: the middle of the file, or the datum so far where the file
+            is in metres.
 
     Raises:
         PlanError: the file cannot be read, or lies too far from the datum.
     """
     raw = read_area_file(path, layer, crs, role=role)
-    datum = area_drawing(settings).datum if at_datum or not raw.geographic else middle(raw)
+    if datum is None:
+        datum = middle(raw) if raw.geographic else area_drawing(settings).datum
     frame = LocalFrame(datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True)
     given = GivenShapes(
         survey=raw if role == "survey" else replace(raw, polygons=(), lines=()),

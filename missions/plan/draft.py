@@ -131,8 +131,9 @@ def _check_files(changes: Values, before: Mapping[str, Any], folder: Path) -> No
     Raises:
         ConfigError: with the setting.
     """
+    named = set(settings_files(before))
     for section, key, name in settings_files(changes):
-        if before.get(section, {}).get(key) == name:
+        if (section, key, name) in named:
             continue
         try:
             within = (folder / name).resolve().is_relative_to(folder.resolve())

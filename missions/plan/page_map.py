@@ -385,10 +385,15 @@ def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, f
     return rgb, (float(high[0]), float(low[1])), pixel_m
 
 
-def counts_data(seen: Certificate) -> dict[str, Any]:
-    """The counts for the script, which reads those under the pointer."""
+def counts_data(seen: Certificate, *, optimized: bool = True) -> dict[str, Any]:
+    """The counts for the script, which reads those under the pointer.
+
+    Args:
+        seen: holds them.
+        optimized: whether time is taken to make the picture smaller.
+    """
     rgb, (north, west), pixel_m = counts_picture(seen)
-    png = base64.b64encode(_png(rgb)).decode("ascii")
+    png = base64.b64encode(_png(rgb, optimized=optimized)).decode("ascii")
     return {"png": f"data:image/png;base64,{png}", "north": north, "west": west, "pixel": pixel_m}
 
 
@@ -400,9 +405,9 @@ def _blocks(cells: NDArray[Any], block: int, *, fill: int | bool) -> NDArray[Any
     return padded.reshape(rows, block, columns, block)
 
 
-def _png(pixels: NDArray[np.uint8]) -> bytes:
+def _png(pixels: NDArray[np.uint8], *, optimized: bool = True) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", optimize=True)
+    Image.fromarray(pixels).save(buffer, format="PNG", optimize=optimized)
     return buffer.getvalue()

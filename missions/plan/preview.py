@@ -111,7 +111,7 @@ def planned_json(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, 
             )
         },
         "outline": np.round(footprint_outline(plan, rig), 4).tolist(),
-        "counts": counts_data(seen),
+        "counts": counts_data(seen, optimized=False),
         "certificate": {
             "cell_m": seen.grid.cell_m,
             "estimated": seen.estimated,
@@ -190,8 +190,8 @@ def _limits(planned: Planned, config: SurveyConfig) -> Iterator[dict[str, Any]]:
         "blur out of focus at the ends of the relief",
     )  # fmt: skip
     yield most(
-        "light", imaging.light.needed_light, 1.0, "of it",
-        "light that is needed, of what strobes and water give",
+        "light", imaging.light.needed_light, 1.0, "",
+        "light that is needed, as a share of what strobes and water give",
     )  # fmt: skip
     yield least(
         "plan.least_clearance_m", wanted.altitude_m - wanted.relief_m, wanted.least_clearance_m,

@@ -7,7 +7,7 @@ import math
 import tempfile
 import threading
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,7 +19,7 @@ from pydantic import Field
 from pydantic_core import to_json
 
 from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import Config, SurveyConfig, parse_settings, settings_in
+from alice_survey.base.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
 from alice_survey.base.errors import AliceError, ConfigError, PlanError, collected_by, heard
 from alice_survey.base.executor import local_executor
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
@@ -81,7 +81,7 @@ class _Settings:
 
 
 @dataclass(eq=False)
-class _Plan:
+class _PlanTab:
     studio: Studio
     newest: Newest = field(default_factory=Newest)
     saving: threading.Lock = field(default_factory=threading.Lock)
@@ -119,8 +119,11 @@ class _Plan:
         with _quiet():
             return drafted(self.settings().text, self.path, request.changes, request.shapes)
 
-    def overview(self, call: Call) -> dict[str, Any]:
+    def overview(self, call: Call) -> Content:
         """Settings, limits and shapes, and the plan that is saved."""
+        return _json(self._overview())
+
+    def _overview(self) -> dict[str, Any]:
         found = self.settings()
         common: dict[str, Any] = {
             "token": found.token,
@@ -168,7 +171,7 @@ class _Plan:
             found = self.newest.run(request.page, lambda: self._preview(request))
         except SupersededError as error:
             found = {**refusal_json(error), "superseded": True}
-        return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
+        return _json(found)
 
     def _preview(self, request: PlanRequest) -> dict[str, Any]:
         try:
@@ -238,7 +241,7 @@ class _Plan:
                 drawing = drawing_of_file(
                     file, config.area, role=role, layer=call.query.get("layer"),
                     crs=call.query.get("crs"),
-                    at_datum=bool(found.token) and call.query.get("datum") != "middle",
+                    datum=_datum_asked(call, found.token, config),
                 )  # fmt: skip
             except PlanError as error:
                 text = str(error).replace(str(file), name).replace(file.name, name)
@@ -250,7 +253,7 @@ class _Plan:
         """The settings file as it would be saved."""
         return {"survey_toml": self.draft(call.read(PlanRequest)).text}
 
-    def save(self, call: Call) -> dict[str, Any]:
+    def save(self, call: Call) -> Content:
         """Write the settings, and plan as the command line does."""
         request = call.read(PlanRequest)
         folder = self.studio.workspace.folder
@@ -273,7 +276,7 @@ class _Plan:
             shown = self.saved(token, config)
             if fault is not None and shown["ok"]:
                 shown = refusal_json(fault)
-        return {"token": token, "saved": shown}
+        return _json({"token": token, "saved": shown})
 
     def export(self, call: Call) -> Content:
         """A file of the saved plan; of one a dive all of them, zipped."""
@@ -296,6 +299,30 @@ class _Plan:
             for path in paths:
                 archive.write(path, path.relative_to(folder / "exports"))
         return Content(data=packed.getvalue(), kind="application/zip", name=f"{name}.zip")
+
+
+def _json(found: Mapping[str, Any]) -> Content:
+    """JSON, quicker than of the shell: plans have many thousand lines."""
+    return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
+
+
+def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:
+    """The datum that a dropped file is to count to; None for its own middle.
+
+    `datum` of the query is `middle`, or latitude and longitude with a comma between; where it is
+    left out that of the survey counts, and for a new survey the middle.
+    """
+    asked = call.query.get("datum", "" if token else "middle")
+    if asked == "middle":
+        return None
+    if not asked:
+        return area_drawing(config.area).datum
+    try:
+        latitude_deg, longitude_deg = map(float, asked.split(","))
+        area = AreaConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    except ValueError:
+        raise PlanError(f"datum {asked[:40]!r}: it is 'middle' or LATITUDE,LONGITUDE") from None
+    return Datum(area.latitude_deg, area.longitude_deg)
 
 
 @contextmanager
@@ -386,7 +413,7 @@ def _moments(
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """All of the tab Plan."""
-    plan = _Plan(studio)
+    plan = _PlanTab(studio)
 
     def post(name: str, answer: Callable[[Call], Any], **options: Any) -> Endpoint:
         return Endpoint(

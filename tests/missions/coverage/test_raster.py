@@ -12,7 +12,14 @@ from alice_survey.base.executor import local_executor
 from camera_calib.rig import design_rig
 from missions.coverage import certificate as module
 from missions.coverage.certificate import certificate
-from missions.coverage.raster import Grid, border_rays_body, footprints_ne, grid_over, inside
+from missions.coverage.raster import (
+    Grid,
+    border_rays_body,
+    footprint_offsets,
+    footprints_ne,
+    grid_over,
+    inside,
+)
 from missions.coverage.stations import Stations
 from missions.values.pattern import Pattern
 from tests.oracles_coverage import area_of, counts_at, footprint_polygons, middles_ne
@@ -44,6 +51,18 @@ def test_footprints_are_those_of_poses_and_rays() -> None:
     for camera, name in enumerate(RIG.cameras):
         for border, polygon in zip(borders[:, camera], expected[name], strict=True):
             np.testing.assert_allclose(border, polygon.exterior.coords[:-1], atol=1e-9)
+
+
+def test_borders_of_stations_that_are_alike_are_traced_once() -> None:
+    stations = wandering(5, 3)
+    alike = stations.some(np.repeat(np.arange(5), [1, 3, 2, 1, 4]))
+    rays = border_rays_body(RIG)
+    offsets, which = footprint_offsets(*rays, alike.altitude_m, alike.attitude_rad)
+    assert len(offsets) == 5
+    expected = footprints_ne(*rays, alike.glass_ne, alike.altitude_m, alike.attitude_rad)
+    np.testing.assert_allclose(offsets[which] + alike.glass_ne[:, None, None], expected, atol=1e-12)
+    none, _ = footprint_offsets(*rays, alike.altitude_m[:0], alike.attitude_rad[:0])
+    assert none.shape == (0, *offsets.shape[1:])
 
 
 def test_counts_are_those_of_polygons_at_every_cell() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import PlanError
 from missions.route.dives import DEAREST_TIE, split_dives
-from missions.route.turns import route_through
+from missions.route.turns import legs_alone, line_table, route_of, route_through
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
@@ -193,3 +193,26 @@ def test_thousands_of_lines_are_parted() -> None:
     dives = _split(lines, 10.0, ways=ways)
     assert 5 <= len(dives) <= 12
     assert sum(d.last_line - d.first_line + 1 for d in dives) == 2000
+
+
+@pytest.mark.parametrize("turns", ["auto", "arcs", "spot", "sway"])
+def test_ways_along_single_lines_are_the_routes_through_them(turns: Any) -> None:
+    room = shapely.box(-6, -6, 60, 40).difference(shapely.box(-3, 3, 4.5, 5))
+    ways, lines = Ways(shapely.MultiPolygon([room])), _lines(8, length_m=2.5)
+    for line in list(lines):
+        (n, e), (n_2, e_2) = line.start_ne_m, line.end_ne_m
+        lines.append(replace(line, start_ne_m=(n, e + 6.0), end_ne_m=(n_2, e_2 + 6.0)))
+    how: dict[str, Any] = {"ways": ways, "costs": COSTS, "turns": turns, "home_ne": HOME}
+    legs, begins = legs_alone(line_table(lines), 0.5, 0.5, **how)
+    assert (len(begins), begins[0], begins[-1]) == (2 * len(lines) + 1, 0, len(legs))
+    corners = 0
+    for i, line in enumerate(lines):
+        expected = route_through([line], 0.5, 0.5, first_line=i, **how)
+        out, back = (
+            legs[begins[2 * i] : begins[2 * i + 1]],
+            legs[begins[2 * i + 1] : begins[2 * i + 2]],
+        )
+        assert route_of(np.concatenate([out, back])) == expected
+        assert out[-1, 5] == i and not (out[:-1, 5] >= 0).any() and not (back[:, 5] >= 0).any()
+        corners += len(out) > 6
+    assert corners > 0 or turns == "arcs"

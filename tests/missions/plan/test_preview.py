@@ -1,0 +1,115 @@
+"""Previews and playbacks: the plan's own totals, and ways out that work."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alice_survey.base.config import SurveyConfig, changed, parse_config, with_settings
+from alice_survey.base.errors import collected_by
+from camera_calib.rig import design_rig
+from missions.coverage.certificate import certificate
+from missions.coverage.stations import plan_pattern, stations_of_plan
+from missions.plan.planner import Planned, plan_survey
+from missions.plan.playback import play
+from missions.plan.preview import preview
+from missions.route.ways import Ways
+
+SMALL = parse_config({"area": {"length_m": 8.0, "width_m": 6.0}}, "test")
+
+
+def planned(config: SurveyConfig) -> Planned:
+    with collected_by(lambda *_: None):
+        return plan_survey(config, design_rig(config.camera, config.water))
+
+
+def test_totals_and_warnings_are_those_of_the_plan() -> None:
+    config = with_settings(SMALL, {"plan.line_spacing_m": 1.45, "vehicle.battery_wh": 13.0})
+    found, made = preview(config), planned(config)
+    plan, totals = made.plan, found["totals"]
+    assert found["ok"] and len(plan.dives) == totals["dives"] == 2
+    for name in ("length_m", "duration_s", "energy_wh", "interval_s", "stations", "speed_mps"):
+        assert totals[name] == getattr(plan, name)
+    assert totals["at_overlap"] == plan.coverage
+    assert found["warnings"] == list(made.warnings) and found["warnings"]
+    assert not found["certificate"]["estimated"]
+    assert [line["dive"] for line in found["lines"]] == sorted(
+        line["dive"] for line in found["lines"]
+    )
+    for way, dive in zip(found["routes"], plan.dives, strict=True):
+        length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+        assert 0.98 * dive.route.length_m < length < dive.route.length_m + 0.01
+    assert found["profile"]["s_m"][-1] == pytest.approx(plan.length_m, abs=0.01)
+    assert {limit["name"] for limit in found["limits"] if limit["binds"]} >= {
+        "battery", "stereo swath",
+    }  # fmt: skip
+    json.dumps(found["lines"])
+
+
+def test_holes_are_where_the_area_is_not_covered() -> None:
+    room = [[-1, -1], [9, -1], [9, 4], [-1, 4]]
+    config = with_settings(SMALL, {"area.allowed_ne_m": room})
+    found = preview(config)
+    hole = max(found["holes"], key=lambda one: float(one["area_m2"]))
+    assert found["totals"]["at_overlap"] < 0.9
+    missing_m2 = sum(one["area_m2"] for one in found["holes"])
+    share = missing_m2 / found["totals"]["area_m2"]
+    assert share == pytest.approx(1.0 - found["totals"]["at_overlap"], abs=0.01)
+    assert min(east for _, east in hole["outer"]) > 3.5
+
+
+def test_ways_out_of_a_conflict_work() -> None:
+    config = changed(SMALL, "plan", forward_overlap=0.95, speed_mps=1.2)
+    found = preview(config)
+    assert not found["ok"] and len(found["error"].splitlines()) == 1
+    assert len(found["limits"]) == 2 and found["ways"]
+    for way in found["ways"]:
+        settings = {
+            f"{s}.{k}": v for s, values in way["changes"].items() for k, v in values.items()
+        }
+        assert preview(with_settings(config, settings))["ok"], way["change"]
+
+
+def test_an_error_without_ways_is_one_line() -> None:
+    found = preview(changed(SMALL, "area", seafloor_depth_m=1.5))
+    assert not found["ok"] and found["ways"] == [] and "altitude_m" in found["error"]
+
+
+@pytest.mark.parametrize("cells", [2_000, 20_000])
+def test_a_quick_look_estimates_the_certificate(cells: int) -> None:
+    config = changed(SMALL, "plan", line_spacing_m=1.45)
+    made, rig = planned(config), design_rig(config.camera, config.water)
+    stations, pattern = stations_of_plan(made.plan), plan_pattern(made.plan, rig)
+    quick = certificate(made.plan.area, rig, stations, pattern, most_cells=cells)
+    whole = made.certificate
+    assert quick.estimated and not whole.estimated
+    assert 0.4 * cells < quick.grid.rows * quick.grid.columns < 1.3 * cells
+    for share in ("share_at_overlap", "covered_share", "stereo_share"):
+        error = 1.5 / math.sqrt(cells)
+        assert getattr(quick, share) == pytest.approx(getattr(whole, share), abs=error)
+    assert whole.share_at_overlap < 0.99
+
+
+@pytest.mark.parametrize("values", [{}, {"vehicle.battery_wh": 13.0, "plan.turns": "spot"}])
+def test_a_playback_takes_as_long_as_the_plan_and_stays_inside(values: dict[str, Any]) -> None:
+    made = planned(with_settings(SMALL, values))
+    played = play(made.plan, made.costs, None)
+    assert np.all(np.diff(played.time_s) >= -1e-9)
+    down_s = made.costs.dive_s(made.plan.seafloor_depth_m - made.plan.altitude_m)
+    settled = played.time_s[-1] - made.plan.duration_s + down_s
+    assert settled == pytest.approx(made.costs.settle_s, abs=1e-6)
+    steps = np.linalg.norm(np.diff(played.glass_ne, axis=0), axis=1)
+    ahead = np.diff(played.time_s) > 1e-9
+    assert (steps[ahead] / np.diff(played.time_s)[ahead]).max() <= 0.2 + 1e-6
+    assert (
+        Ways(made.plan.area.allowed).free_many(played.glass_ne[:-1], played.glass_ne[1:]).mean()
+        > 0.7
+    )
+    assert (
+        len(played.pictures_s)
+        <= made.plan.stations
+        <= len(played.pictures_s) + len(made.plan.lines)
+    )
+    assert np.all(played.altitude_m == pytest.approx(2.0))
