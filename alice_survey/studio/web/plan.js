@@ -34,7 +34,7 @@ export function tab(studio) {
   const along = profileView((place) => view.mark(place));
   const play = playback({ask: () => send("/api/plan/play", body()), mark: view.mark});
   const controls = el("div");
-  const precision = el("p", {class: "note"}, "How well the model of this survey is expected to be known.");
+  const precision = el("p", {class: "note plan-precision"}, "How well the model of this survey is expected to be known.");
   const exports = el("ul");
   const back = button("Undo", () => step(undo), {title: "Ctrl+Z"});
   const forth = button("Redo", () => step(redo), {title: "Ctrl+Shift+Z"});
@@ -79,6 +79,7 @@ export function tab(studio) {
   }
 
   function settled(answer) {
+    if (answer.superseded) return;
     if (answer.ok) {
       preview = answer;
       view.sigma(null);
@@ -139,7 +140,7 @@ export function tab(studio) {
     exports.replaceChildren(...(file.formats || []).map((name) => el("li", {}, el("a", {
       href: "/api/plan/export?format=" + encodeURIComponent(name), download: "",
     }, name))));
-    if (!exports.children.length || !file.saved) exports.replaceChildren(el("li", {}, "Save the plan first."));
+    if (file.stage !== "up to date") exports.replaceChildren(el("li", {}, "Save the plan first."));
   }
 
   async function restart(state = AS_IN_FILE) {

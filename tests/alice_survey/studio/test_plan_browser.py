@@ -180,6 +180,11 @@ def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: 
         assert config.plan.altitude_m == plan.altitude()
         assert "As in survey.toml" in page.locator(".plan-top .note").inner_text()
         assert plan.heard.complaints == []
+        page.get_by_text("Export", exact=True).click()
+        links = page.locator("a[href^='/api/plan/export']")
+        assert links.count() > 5
+        sent = page.request.get(server.url.rstrip("/") + links.first.get_attribute("href"))
+        assert sent.ok and len(sent.body()) > 50
         page.close()
 
 
@@ -342,8 +347,15 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
 
         page.get_by_text("Expected precision").click()
         page.get_by_role("button", name="Compute it").click()
+        page.wait_for_function(
+            "() => /\\d mm/.test(document.querySelector('.plan-precision').textContent)",
+            timeout=120_000,
+        )
+        page.get_by_text("Layers").click()
+        expected = page.locator("[data-layer=plan-sigma]")
+        expected.wait_for()
+        assert expected.get_by_role("checkbox").is_checked()
         page.get_by_role("button", name="Compute it").scroll_into_view_if_needed()
-        page.wait_for_function("() => / mm/.test(document.body.innerText)", timeout=60_000)
         page.screenshot(path=tmp_path / "more.png")
         assert plan.violations() == []
         assert plan.heard.complaints == []
