@@ -113,6 +113,7 @@ function open(name, args) {
   }
   map.release();
   current?.leave?.();
+  if (current) say("");
   current = tab;
   bar.querySelectorAll("[role=tab]").forEach((button) => {
     const chosen = button.dataset.tab === tab.name;
