@@ -265,7 +265,8 @@ def init_survey(
 
     text = template_text(template)
     if name is not None:
-        text = re.sub(r'^name = ".*"', lambda _: f"name = {json.dumps(name)}", text, flags=re.M)
+        line = f"name = {json.dumps(name)}"  # the first, before all sections
+        text = re.sub(r'^name = ".*"', lambda _: line, text, count=1, flags=re.M)
     if values:
         text = with_settings_changed(text, values)
     parse_config(settings_in(text, "the new survey"), "the new survey")

@@ -162,6 +162,7 @@ def test_a_survey_is_begun_from_its_place_and_depth(server: Server, tmp_path: Pa
     made = load_config(tmp_path / "reef" / "survey.toml")
     assert (made.name, made.area.latitude_deg, made.area.longitude_deg) == ("Reef 2", 43.05, 5.92)
     assert (made.area.seafloor_depth_m, made.camera.focal_mm) == (22.5, 25.0)
+    assert made.vehicle.name == "alice"
     assert (made.area.length_m, made.area.width_m) == (8.0, 6.0)
     assert call(server, "/api/start/survey", values).status == 409  # there is one now
     assert load_config(tmp_path / "reef" / "survey.toml") == made
