@@ -241,9 +241,14 @@ class Progress:
     def _ahead(self, place_ne: Array, passed_s: float) -> float | None:
         """Planned seconds of the nearest place of the route round the last one; None: it is off."""
         route = self.route
+        # A line that is passed stays so: that it is flown again is for `_anywhere` to find.
+        passed = [end_s for _, end_s in route.ends.values() if end_s <= self.at_s]
         first, last = np.searchsorted(
             route.seconds,
-            [self.at_s - _BACK_S, self.at_s + _AHEAD_S + _FASTER * passed_s],
+            [
+                max(self.at_s - _BACK_S, *passed, 0.0),
+                self.at_s + _AHEAD_S + _FASTER * passed_s,
+            ],
         )
         last = min(max(last + 1, first + 1), len(route.seconds))
         first = min(first, last - 1)
@@ -256,13 +261,19 @@ class Progress:
         return float(route.seconds[first + nearest])
 
     def _anywhere(self, place_ne: Array, heading_rad: float) -> tuple[int, float] | None:
-        """Dive and planned seconds of a line that the vehicle may be on; the nearest in time."""
+        """Dive and planned seconds of where the vehicle may be; the nearest in time.
+
+        On any line, or on a way between lines that is still ahead.
+        """
         best: tuple[float, int, float] | None = None
         for index, route in enumerate(self._times):
             if self._asked is not None and index != self._asked:
                 continue
             away_m = np.hypot(*(route.places_ne - place_ne).T)
-            near = (away_m <= self._near_m) & (route.line >= 0)
+            ahead = self.has_begun and index == self.dive
+            ways = route.line >= 0
+            ways |= (route.seconds > self.at_s) if ahead else False
+            near = (away_m <= self._near_m) & ways
             if math.isfinite(heading_rad):
                 near &= np.cos(route.course_rad - heading_rad) >= math.cos(ALIKE_RAD)
             if not near.any():

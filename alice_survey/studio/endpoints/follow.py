@@ -131,8 +131,9 @@ class FollowTab:
             now_s = time.monotonic()
             due_s = self._sent_s + (_PUBLISH_S if self._news else _ALIVE_S)
             if (now_s >= due_s or session.fault is not None) and not ended.is_set():
-                self._sent_s, self._news = now_s, False
+                self._news = False
                 self._studio.publish("follow", self._state_of(session))
+                self._sent_s = time.monotonic()  # to find the state may have taken a while
             if session.fault is not None:
                 break
             ended.wait(0.0 if came > _MANY_ROWS else _POLL_S)
