@@ -21,7 +21,7 @@ from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.adjustment.uncertainty import Uncertainty, read_uncertainty
-from reconstruct.annotations.values import Annotation, Kind, Place, Shape
+from reconstruct.annotations.values import Annotation, DrawnShape, Kind, Place
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.planes import read_plane
 from reconstruct.raster import opened_raster
@@ -283,7 +283,7 @@ class Projector:
 
     def on_plane(
         self, annotation: Annotation, sigma_px: float = PIXEL_SIGMA_PX
-    ) -> tuple[Shape, list[OnPlane]]:
+    ) -> tuple[DrawnShape, list[OnPlane]]:
         """An annotation in a picture on the mosaic.
 
         Args:
@@ -310,7 +310,7 @@ class Projector:
             )
         outer, *holes = (_places(part.places) for part in spots.parts(lengths))
         kind: Kind = "polygon" if shape.is_area else shape.kind
-        moved = Shape(kind=kind, points=outer, holes=tuple(holes))
+        moved = DrawnShape(kind=kind, points=outer, holes=tuple(holes))
         return moved, spots.parts(lengths)
 
     def _picture(self, image: str) -> _Posed:

@@ -25,7 +25,7 @@ from alice_survey.base.frames import Array
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, OnPlane, Projector
 from reconstruct.annotations.store import read_annotations
 from reconstruct.annotations.transfer import frame_of
-from reconstruct.annotations.values import Annotation, AnnotationSet, Label, Shape, area_only
+from reconstruct.annotations.values import Annotation, AnnotationSet, DrawnShape, Label, area_only
 from reconstruct.raster import opened_raster
 
 _LONGEST_PX = 2000
@@ -44,7 +44,7 @@ class Measured:
     """An annotation on the mosaic."""
 
     annotation: Annotation
-    shape: Shape
+    shape: DrawnShape
     area: float
     """Of its plan, in squares of the unit; NaN of points and lines."""
     sigma: float
@@ -85,7 +85,7 @@ class Quadrat:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ground:
+class KnownGround:
     """Which of the mosaic is known, at most some thousand pixels a side."""
 
     known: NDArray[np.bool_]
@@ -118,7 +118,7 @@ class Ground:
         }
 
 
-def ground_of(workspace: Path) -> Ground:
+def ground_of(workspace: Path) -> KnownGround:
     """The known ground of a workspace, by its mosaic.
 
     Raises:
@@ -129,7 +129,7 @@ def ground_of(workspace: Path) -> Ground:
         shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
         mask = raster.dataset_mask(out_shape=shape, resampling=Resampling.average)
         t, wide, high = raster.transform, raster.width / shape[1], raster.height / shape[0]
-        return Ground(
+        return KnownGround(
             known=mask >= _OPAQUE, transform=Affine(t.a * wide, 0.0, t.c, 0.0, t.e * high, t.f),
             pixel=float(raster.transform.a),
         )  # fmt: skip
@@ -169,7 +169,7 @@ def measured(
     return found, lost
 
 
-def sigma_of_area(drawn: Shape, rings: Sequence[OnPlane]) -> float:
+def sigma_of_area(drawn: DrawnShape, rings: Sequence[OnPlane]) -> float:
     """Standard deviation of the area of a shape.
 
     Args:
@@ -199,7 +199,7 @@ def _slopes(ring: Array) -> Array:
 
 
 def quadrats(
-    values: AnnotationSet, marks: Sequence[Measured], ground: Ground, side: float | None = None
+    values: AnnotationSet, marks: Sequence[Measured], ground: KnownGround, side: float | None = None
 ) -> list[Quadrat]:
     """What each label has on the mosaic, or in each square of known ground.
 

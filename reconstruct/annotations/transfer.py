@@ -6,9 +6,9 @@ from typing import Any
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import AliceError, WorkspaceError, why
-from reconstruct.annotations.formats.common import Files
+from reconstruct.annotations.backdrops import Backdrops, backdrops_of
+from reconstruct.annotations.formats.common import ToolFiles
 from reconstruct.annotations.formats.registry import format_named
-from reconstruct.annotations.sheets import Sheets, sheets_of
 from reconstruct.annotations.store import change_annotations, geojson, read_annotations
 from reconstruct.annotations.values import AnnotationSet
 from reconstruct.views.model import WorldFrame, read_frame
@@ -53,13 +53,13 @@ def import_file(
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     try:
-        return import_data(workspace, data, format_name, sheets_of(workspace, tiles))[1:]
+        return import_data(workspace, data, format_name, backdrops_of(workspace, tiles))[1:]
     except AliceError as error:
         raise type(error)(f"{path}: {error}") from None
 
 
 def import_data(
-    workspace: Path, data: bytes, format_name: str, sheets: Sheets, token: str | None = None
+    workspace: Path, data: bytes, format_name: str, backdrops: Backdrops, token: str | None = None
 ) -> tuple[str, str, dict[str, Any]]:
     """Add the annotations of a tool's file; see `import_file`.
 
@@ -67,14 +67,14 @@ def import_data(
         workspace: folder of the survey.
         data: content of the file.
         format_name: of `FORMATS`.
-        sheets: pictures that it may name.
+        backdrops: pictures that it may name.
         token: of the annotations that the writer has seen; None for whatever is there.
 
     Returns:
         The token of what is there now, and what was added, as text and as JSON values.
     """
-    new = format_named(format_name).read(data, sheets)
-    pixel = next((s.plane.scale for s in sheets.mosaic if s.plane is not None), _NO_PIXEL)
+    new = format_named(format_name).read(data, backdrops)
+    pixel = next((s.plane.scale for s in backdrops.mosaic if s.plane is not None), _NO_PIXEL)
     counts = {"labels": 0, "known": 0}
 
     def add(values: AnnotationSet) -> AnnotationSet:
@@ -90,7 +90,7 @@ def import_data(
     return now, text, {"added": added, "known": counts["known"], "labels": counts["labels"]}
 
 
-def exported(workspace: Path, format_name: str, sheets: Sheets) -> Files:
+def exported(workspace: Path, format_name: str, backdrops: Backdrops) -> ToolFiles:
     """The files of a tool with all annotations of a workspace."""
     frame = frame_of(workspace)
     values = read_annotations(workspace, frame)
@@ -99,8 +99,8 @@ def exported(workspace: Path, format_name: str, sheets: Sheets) -> Files:
         count = len(found["features"])
         left = len(values.annotations) - count
         lines = (f"{left} left out: they are in pictures, not on the mosaic",) if left else ()
-        return Files(texts={"": json.dumps(found) + "\n"}, written=count, left_out=lines)
-    return format_named(format_name).write(values, sheets)
+        return ToolFiles(texts={"": json.dumps(found) + "\n"}, written=count, left_out=lines)
+    return format_named(format_name).write(values, backdrops)
 
 
 def export_file(
@@ -121,7 +121,7 @@ def export_file(
         ConfigError: there is no such format.
         WorkspaceError: there is nothing to write.
     """
-    files = exported(workspace, format_name, sheets_of(workspace, tiles))
+    files = exported(workspace, format_name, backdrops_of(workspace, tiles))
     if not files.written:
         reasons = "".join(f"; {line}" for line in files.left_out)
         raise WorkspaceError(f"{workspace} has no annotations to write{reasons}")

@@ -82,7 +82,7 @@ def clean_id(text: str) -> str:
     return SEPARATOR.join(name for part in plain.split(SEPARATOR) if (name := part.strip()))
 
 
-class Shape(_Value):
+class DrawnShape(_Value):
     """Vertices in the plane of the mosaic, or in a picture as taken.
 
     Pixels count from the outer corner of the first, x to the right and y down.
@@ -109,7 +109,7 @@ class Shape(_Value):
         )
 
     @model_validator(mode="after")
-    def _is_whole(self) -> "Shape":
+    def _is_whole(self) -> "DrawnShape":
         count, least, most = len(self.points), _LEAST[self.kind], _MOST[self.kind]
         if not least <= count <= most:
             wanted = f"{least}" if least == most else f"{least} or more, at most {most},"
@@ -157,14 +157,14 @@ class Shape(_Value):
             return math.pi * self.radius**2
         return float(self.geometry.area) if self.is_area else 0.0
 
-    def moved(self, to: "Affine") -> "Shape":
+    def moved(self, to: "Affine") -> "DrawnShape":
         """The same shape in other coordinates."""
         return self.with_rings(
             [to.apply(np.array(ring, dtype=np.float64)) for ring in (self.points, *self.holes)],
             None if self.radius is None else self.radius * to.scale,
         )
 
-    def with_rings(self, rings: Sequence[Array], radius: float | None = None) -> "Shape":
+    def with_rings(self, rings: Sequence[Array], radius: float | None = None) -> "DrawnShape":
         """The same kind of shape through other points.
 
         Args:
@@ -172,7 +172,7 @@ class Shape(_Value):
             radius: of a circle.
         """
         outer, *holes = ([(float(x), float(y)) for x, y in ring] for ring in rings)
-        return Shape(
+        return DrawnShape(
             kind=self.kind, points=tuple(outer), holes=tuple(tuple(h) for h in holes), radius=radius
         )
 
@@ -223,7 +223,7 @@ class Annotation(_Value):
     id: str = Field(default_factory=lambda: secrets.token_hex(6), pattern=r"^[0-9a-zA-Z_-]{1,64}$")
     label: Name
     """The id of its label."""
-    shape: Shape
+    shape: DrawnShape
     image: str | None = None
     """Name of the picture, as in the manifest; None in the plane of the mosaic."""
     author: str = Field("", max_length=200)
@@ -256,7 +256,7 @@ class _Known:
         return True
 
 
-def _is_same(a: Shape, b: Shape, step: float) -> bool:
+def _is_same(a: DrawnShape, b: DrawnShape, step: float) -> bool:
     """Whether vertices and radius of two shapes differ by less than a step, and holes by none."""
     far = np.abs(np.array(a.points) - np.array(b.points)).max()
     around = abs((a.radius or 0.0) - (b.radius or 0.0))

@@ -15,9 +15,9 @@ from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 from alice_survey.report.colours import MOSAIC_FILE
 from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from reconstruct.annotations.backdrops import backdrops_of
 from reconstruct.annotations.formats.registry import FORMATS
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, InPicture, OnPlane, Projector
-from reconstruct.annotations.sheets import sheets_of
 from reconstruct.annotations.store import (
     OtherVersionError,
     change_annotations,
@@ -25,7 +25,14 @@ from reconstruct.annotations.store import (
     token_of,
 )
 from reconstruct.annotations.table import HEADER as COLUMNS
-from reconstruct.annotations.table import Ground, Measured, cells, ground_of, measured, quadrats
+from reconstruct.annotations.table import (
+    KnownGround,
+    Measured,
+    cells,
+    ground_of,
+    measured,
+    quadrats,
+)
 from reconstruct.annotations.transfer import GEOJSON, exported, frame_of, import_data
 from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, Label, with_labels
 from reconstruct.pictures.undistorted import Pictures
@@ -41,7 +48,7 @@ _KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8",
           ".zip": "application/zip"}  # fmt: skip
 
 
-class _Change(BaseModel):
+class _Edit(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     token: str
@@ -64,7 +71,7 @@ class _Annotate:
         with self._lock:
             return self._projector(self._studio.workspace.state(()))
 
-    def ground(self) -> Ground:
+    def ground(self) -> KnownGround:
         """The known ground of the mosaic as it is now."""
         if not self._studio.workspace.has(MOSAIC_FILE):
             raise AliceError("there is no mosaic yet: run 'alice-survey reconstruct' first")
@@ -88,7 +95,7 @@ class _Annotate:
 
     def change(self, call: Call) -> dict[str, Any]:
         """Put and delete some, if nobody else did meanwhile."""
-        wanted = call.read(_Change)
+        wanted = call.read(_Edit)
 
         def made(values: AnnotationSet) -> AnnotationSet:
             gone = {*wanted.delete, *(one.id for one in wanted.put)}
@@ -110,9 +117,9 @@ class _Annotate:
     def take(self, call: Call) -> dict[str, Any]:
         """Add the annotations of a tool's file."""
         format_name, token = call.query.get("format", ""), call.query.get("token", "")
-        sheets = sheets_of(self._folder)
+        backdrops = backdrops_of(self._folder)
         return self._changed(
-            lambda: import_data(self._folder, call.body, format_name, sheets, token)
+            lambda: import_data(self._folder, call.body, format_name, backdrops, token)
         )
 
     def _changed(self, work: Any) -> dict[str, Any]:
@@ -126,7 +133,7 @@ class _Annotate:
     def give(self, call: Call) -> Content:
         """The annotations as a file of a tool; several files as a ZIP."""
         name = call.path["format"]
-        files = exported(self._folder, name, sheets_of(self._folder))
+        files = exported(self._folder, name, backdrops_of(self._folder))
         suffix = ".json" if name == GEOJSON else FORMATS[name].suffix
         texts = {f"{name}{end}{suffix}": text.encode() for end, text in files.texts.items()}
         if not files.written:

@@ -1,7 +1,7 @@
 /* The Compare tab: another survey next to this one or swiped over it, and what has changed. */
 
 import {attempt, button, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
-import {comparedMaps} from "./compare_maps.js";
+import {boundsOf, comparedMaps} from "./compare_maps.js";
 
 const GAINED = "#0072b2";
 const LOST = "#d55e00";
@@ -25,6 +25,8 @@ export function tab(studio) {
     say(other.name + " is open to look at; nothing of it is changed");
     kinds();
     render();
+    const about = other.layers.find((layer) => layer.name === kind.value);
+    if (about) studio.map.leaflet.fitBounds(boundsOf(about), {animate: false, padding: [24, 24]});
     show();
   }), {class: "primary"});
 

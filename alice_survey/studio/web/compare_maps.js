@@ -4,6 +4,11 @@ import {el} from "./core.js";
 
 const PANE = "compare";
 
+/* What a raster covers. */
+export const boundsOf = (about) => leaflet.latLngBounds(
+  [about.north - about.height * about.pixel, about.west], [about.north, about.west + about.width * about.pixel],
+);
+
 export function comparedMaps(studio, swiped) {
   const map = studio.map.leaflet;
   const view = map.getContainer().parentElement;
@@ -68,6 +73,7 @@ export function comparedMaps(studio, swiped) {
 
   function beside(about, name) {
     resize("50%");
+    if (!map.getBounds().intersects(boundsOf(about))) map.fitBounds(boundsOf(about), {animate: false});
     box = el("div", {tabindex: "0", role: "application", "aria-label": "Map of " + name + ": it moves with the other",
       style: {position: "absolute", top: "0", bottom: "0", left: "50%", right: "0", background: "var(--wash)", borderLeft: "2px solid var(--soft)"}});
     document.querySelector(".map-side").append(box);

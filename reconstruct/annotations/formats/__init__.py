@@ -1,1 +1,1 @@
-"""Files of annotation tools: one module each, read and written."""
+"""ToolFiles of annotation tools: one module each, read and written."""

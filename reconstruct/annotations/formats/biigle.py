@@ -14,10 +14,11 @@ import numpy as np
 
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import WorkspaceError, warn
+from reconstruct.annotations.backdrops import Backdrops
 from reconstruct.annotations.formats.common import (
-    Files,
     Format,
-    Found,
+    Reading,
+    ToolFiles,
     check_size,
     one_ring,
     pairs,
@@ -25,8 +26,7 @@ from reconstruct.annotations.formats.common import (
     polygon_of,
     shape_of,
 )
-from reconstruct.annotations.sheets import Sheets
-from reconstruct.annotations.values import SEPARATOR, AnnotationSet, Label, Place, Shape
+from reconstruct.annotations.values import SEPARATOR, AnnotationSet, DrawnShape, Label, Place
 
 _COLUMNS = (
     "annotation_label_id", "label_id", "label_name", "label_hierarchy", "user_id", "firstname",
@@ -40,7 +40,7 @@ _NAMES = {"point": "Point", "polyline": "LineString", "polygon": "Polygon", "cir
 _ELLIPSE_SIDES = 64
 
 
-def read_biigle(data: bytes, sheets: Sheets) -> AnnotationSet:
+def read_biigle(data: bytes, backdrops: Backdrops) -> AnnotationSet:
     """Annotations of a report, or labels of a label tree.
 
     Raises:
@@ -58,7 +58,7 @@ def read_biigle(data: bytes, sheets: Sheets) -> AnnotationSet:
         missing = next((n for n in ("filename", "label_name") if n not in names), None)
         if missing is not None:
             raise WorkspaceError(f"column {missing} is missing")
-        return _report(rows, sheets)
+        return _report(rows, backdrops)
     if "name" in names:
         return _tree(rows)
     raise WorkspaceError(
@@ -67,20 +67,20 @@ def read_biigle(data: bytes, sheets: Sheets) -> AnnotationSet:
     )
 
 
-def _report(rows: list[tuple[int, dict[str, str]]], sheets: Sheets) -> AnnotationSet:
-    found, frames = Found(), 0
+def _report(rows: list[tuple[int, dict[str, str]]], backdrops: Backdrops) -> AnnotationSet:
+    found, frames = Reading(), 0
     for line, row in rows:
         where, kind = f"line {line}", row["shape_name"].strip()
         if kind == "WholeFrame":
             frames += 1
             continue
-        sheet = sheets.named(row["filename"].strip())
+        backdrop = backdrops.named(row["filename"].strip())
         attributes = _object(row.get("attributes"))
-        check_size(where, sheet, attributes.get("width"), attributes.get("height"))
+        check_size(where, backdrop, attributes.get("width"), attributes.get("height"))
         hierarchy = row.get("label_hierarchy") or row["label_name"]
         name = " ".join(p for p in (row.get("firstname"), row.get("lastname")) if p)
         found.add(
-            where, sheet, _shape(where, kind, row["points"]),
+            where, backdrop, _shape(where, kind, row["points"]),
             label=found.label(hierarchy), author=name, time_utc=_time(row.get("created_at") or ""),
         )  # fmt: skip
     if frames:
@@ -88,7 +88,7 @@ def _report(rows: list[tuple[int, dict[str, str]]], sheets: Sheets) -> Annotatio
     return found.values
 
 
-def _shape(where: str, kind: str, text: str) -> Shape:
+def _shape(where: str, kind: str, text: str) -> DrawnShape:
     try:
         flat = json.loads(text)
     except ValueError:
@@ -150,7 +150,7 @@ def _time_back(text: str) -> str:
 def _tree(rows: list[tuple[int, dict[str, str]]]) -> AnnotationSet:
     """Labels of a tree, or of any list with a column `name`."""
     of_id = {row.get("id", "").strip(): row for _, row in rows if row.get("id", "").strip()}
-    found = Found()
+    found = Reading()
     for line, row in rows:
         names, at, seen = [row["name"].strip()], row, {row.get("id", "").strip()}
         while (parent := (at.get("parent_id") or "").strip()) and parent != "NULL":
@@ -171,20 +171,20 @@ def _tree(rows: list[tuple[int, dict[str, str]]]) -> AnnotationSet:
     return found.values
 
 
-def write_biigle(values: AnnotationSet, sheets: Sheets) -> Files:
+def write_biigle(values: AnnotationSet, backdrops: Backdrops) -> ToolFiles:
     """A report of annotations, and the label tree ("_labels")."""
-    drawn, left_out = placed(values, sheets, {}, has_holes=False)
+    drawn, left_out = placed(values, backdrops, {}, has_holes=False)
     tree = _numbered(values.labels)
     users = {name: n for n, name in enumerate(dict.fromkeys(a.author for a, _, _ in drawn), 1)}
     images = {name: n for n, name in enumerate(dict.fromkeys(s.name for _, s, _ in drawn), 1)}
     rows = []
-    for n, (one, sheet, shape) in enumerate(drawn, 1):
+    for n, (one, backdrop, shape) in enumerate(drawn, 1):
         first, _, last = one.author.partition(" ")
         name = _NAMES[shape.kind]
-        size = {"width": sheet.width_px, "height": sheet.height_px}
+        size = {"width": backdrop.width_px, "height": backdrop.height_px}
         rows.append((
             n, tree[one.label], one.label.rpartition(SEPARATOR)[2], one.label, users[one.author],
-            first, last, images[sheet.name], sheet.name, "", "", _SHAPES[name], name,
+            first, last, images[backdrop.name], backdrop.name, "", "", _SHAPES[name], name,
             json.dumps(_flat(shape)), json.dumps(size), n, _time_back(one.time_utc),
         ))  # fmt: skip
     labels = []
@@ -198,7 +198,7 @@ def write_biigle(values: AnnotationSet, sheets: Sheets) -> Files:
             "" if label is None or label.aphia_id is None else label.aphia_id,
         ))  # fmt: skip
     texts = {"": _csv(_COLUMNS, rows), "_labels": _csv(_TREE, labels)}
-    return Files(texts=texts, written=len(drawn), left_out=left_out)
+    return ToolFiles(texts=texts, written=len(drawn), left_out=left_out)
 
 
 def _numbered(labels: tuple[Label, ...]) -> dict[str, int]:
@@ -211,7 +211,7 @@ def _numbered(labels: tuple[Label, ...]) -> dict[str, int]:
     return found
 
 
-def _flat(shape: Shape) -> list[float]:
+def _flat(shape: DrawnShape) -> list[float]:
     if shape.kind == "circle" and shape.radius is not None:
         return [*shape.points[0], shape.radius]
     ring = shape.points

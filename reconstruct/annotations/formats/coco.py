@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from alice_survey.base.errors import WorkspaceError
+from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.formats.common import (
     OURS,
-    Files,
     Format,
-    Found,
+    Reading,
+    ToolFiles,
     check_size,
     hint_of,
     one_ring,
@@ -26,13 +27,12 @@ from reconstruct.annotations.formats.common import (
     with_hint,
 )
 from reconstruct.annotations.formats.rle import decoded, outlines, unpacked
-from reconstruct.annotations.sheets import Sheet, Sheets
-from reconstruct.annotations.values import SEPARATOR, AnnotationSet, Label, Shape
+from reconstruct.annotations.values import SEPARATOR, AnnotationSet, DrawnShape, Label
 
 _NO_PARENT = ("", "none", None)
 
 
-def read_coco(data: bytes, sheets: Sheets) -> AnnotationSet:
+def read_coco(data: bytes, backdrops: Backdrops) -> AnnotationSet:
     """Annotations of a COCO file.
 
     Raises:
@@ -44,10 +44,10 @@ def read_coco(data: bytes, sheets: Sheets) -> AnnotationSet:
             isinstance(one, dict) and isinstance(one.get("id", 0), int | str) for one in whole[key]
         ):
             raise WorkspaceError(f"no COCO file: {key!r} is no list of objects with an id")
-    found = Found()
+    found = Reading()
     labels = {one.get("id"): _label(found, one) for one in whole["categories"]}
     images = {one.get("id"): one for one in whole["images"]}
-    known: dict[Any, Sheet] = {}
+    known: dict[Any, Backdrop] = {}
     for n, one in enumerate(whole["annotations"]):
         where = f"annotation {one.get('id', n)}"
         number, category = one.get("image_id"), one.get("category_id")
@@ -56,23 +56,23 @@ def read_coco(data: bytes, sheets: Sheets) -> AnnotationSet:
         if not isinstance(category, int | str) or category not in labels:
             raise WorkspaceError(f"{where}: category_id {category!r} is no category of the file")
         if number not in known:
-            known[number] = _sheet(images[number], sheets)
+            known[number] = _backdrop(images[number], backdrops)
         shapes = _shapes(where, one, known[number])
         for values, shape in zip(_values(one, len(shapes)), shapes, strict=True):
             found.add(where, known[number], shape, label=labels[category], **values)
     return found.values
 
 
-def _sheet(image: Mapping[str, Any], sheets: Sheets) -> Sheet:
+def _backdrop(image: Mapping[str, Any], backdrops: Backdrops) -> Backdrop:
     name = image.get("file_name")
     if not isinstance(name, str):
         raise WorkspaceError(f"image {image.get('id')}: it has no file_name")
-    sheet = sheets.named(name)
-    check_size(f"image {name}", sheet, image.get("width"), image.get("height"))
-    return sheet
+    backdrop = backdrops.named(name)
+    check_size(f"image {name}", backdrop, image.get("width"), image.get("height"))
+    return backdrop
 
 
-def _label(found: Found, category: Mapping[str, Any]) -> str:
+def _label(found: Reading, category: Mapping[str, Any]) -> str:
     name, parent = category.get("name"), category.get("supercategory")
     if not isinstance(name, str) or not name:
         raise WorkspaceError(f"category {category.get('id')}: it has no name")
@@ -119,10 +119,10 @@ def _values(one: Mapping[str, Any], parts: int) -> list[dict[str, Any]]:
     return [{**texts, "attributes": attributes} for _ in range(parts)]
 
 
-def _shapes(where: str, one: Mapping[str, Any], sheet: Sheet) -> list[Shape]:
+def _shapes(where: str, one: Mapping[str, Any], backdrop: Backdrop) -> list[DrawnShape]:
     segmentation, hint = one.get("segmentation"), (one.get(OURS) or {})
     if isinstance(segmentation, dict):
-        return _masked(where, segmentation, sheet)
+        return _masked(where, segmentation, backdrop)
     if segmentation:
         if not isinstance(segmentation, list):
             raise WorkspaceError(f"{where}: its segmentation is neither polygons nor a mask")
@@ -139,16 +139,16 @@ def _shapes(where: str, one: Mapping[str, Any], sheet: Sheet) -> list[Shape]:
     return [shape_of(where, "rectangle", [[(x, y), (x + w, y), (x + w, y + h), (x, y + h)]])]
 
 
-def _masked(where: str, segmentation: Mapping[str, Any], sheet: Sheet) -> list[Shape]:
+def _masked(where: str, segmentation: Mapping[str, Any], backdrop: Backdrop) -> list[DrawnShape]:
     size, counts = segmentation.get("size"), segmentation.get("counts")
-    if size != [sheet.height_px, sheet.width_px]:
+    if size != [backdrop.height_px, backdrop.width_px]:
         raise WorkspaceError(
-            f"{where}: a mask of {size}, but {sheet.name} has {sheet.height_px} rows and "
-            f"{sheet.width_px} columns"
+            f"{where}: a mask of {size}, but {backdrop.name} has {backdrop.height_px} rows and "
+            f"{backdrop.width_px} columns"
         )
     try:
         runs = unpacked(counts) if isinstance(counts, str) else [int(n) for n in counts or ()]
-        mask = decoded(runs, sheet.height_px, sheet.width_px)
+        mask = decoded(runs, backdrop.height_px, backdrop.width_px)
     except (TypeError, ValueError, OverflowError):
         raise WorkspaceError(f"{where}: counts of a mask are a list of numbers or text") from None
     except WorkspaceError as error:
@@ -158,21 +158,21 @@ def _masked(where: str, segmentation: Mapping[str, Any], sheet: Sheet) -> list[S
     return [shape_of(where, "polygon", [outer, *holes]) for outer, holes in outlines(mask)]
 
 
-def write_coco(values: AnnotationSet, sheets: Sheets) -> Files:
+def write_coco(values: AnnotationSet, backdrops: Backdrops) -> ToolFiles:
     """A COCO file of annotations; lines are left out."""
-    drawn, left_out = placed(values, sheets, {"polyline": "COCO has no lines"}, has_holes=False)
-    names = list(dict.fromkeys(sheet.name for _, sheet, _ in drawn))
+    drawn, left_out = placed(values, backdrops, {"polyline": "COCO has no lines"}, has_holes=False)
+    names = list(dict.fromkeys(backdrop.name for _, backdrop, _ in drawn))
     numbers = {name: n for n, name in enumerate(names, 1)}
-    sizes = {sheet.name: sheet for _, sheet, _ in drawn}
+    sizes = {backdrop.name: backdrop for _, backdrop, _ in drawn}
     with_points = {one.label for one, _, shape in drawn if shape.kind == "point"}
     categories = [
         _category(n, label, label.id in with_points) for n, label in enumerate(values.labels, 1)
     ]
     of_label = {label.id: n for n, label in enumerate(values.labels, 1)}
     annotations = []
-    for n, (one, sheet, shape) in enumerate(drawn, 1):
+    for n, (one, backdrop, shape) in enumerate(drawn, 1):
         annotations.append({
-            "id": n, "image_id": numbers[sheet.name], "category_id": of_label[one.label],
+            "id": n, "image_id": numbers[backdrop.name], "category_id": of_label[one.label],
             **_segmented(shape), "iscrowd": 0, "attributes": dict(one.attributes),
             OURS: {
                 "id": one.id, "author": one.author, "time_utc": one.time_utc, "note": one.note,
@@ -191,7 +191,7 @@ def write_coco(values: AnnotationSet, sheets: Sheets) -> Files:
         "categories": categories,
     }  # fmt: skip
     text = json.dumps(whole, allow_nan=False, indent=1) + "\n"
-    return Files(texts={"": text}, written=len(drawn), left_out=left_out)
+    return ToolFiles(texts={"": text}, written=len(drawn), left_out=left_out)
 
 
 def _category(number: int, label: Label, has_points: bool) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def _category(number: int, label: Label, has_points: bool) -> dict[str, Any]:
             **points, OURS: ours}  # fmt: skip
 
 
-def _segmented(shape: Shape) -> dict[str, Any]:
+def _segmented(shape: DrawnShape) -> dict[str, Any]:
     if shape.kind == "point":
         x, y = shape.points[0]
         return {"segmentation": [], "bbox": [x, y, 0.0, 0.0], "area": 0.0,

@@ -10,14 +10,14 @@ from pydantic import ValidationError
 
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import WorkspaceError
+from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.keyhole import joined, parted
-from reconstruct.annotations.sheets import Sheet, Sheets
 from reconstruct.annotations.values import (
     Annotation,
     AnnotationSet,
+    DrawnShape,
     Label,
     Place,
-    Shape,
     clean_id,
     new_label,
     with_labels,
@@ -31,7 +31,7 @@ _SAME_PX = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Files:
+class ToolFiles:
     """What a format writes."""
 
     texts: Mapping[str, str]
@@ -49,12 +49,12 @@ class Format:
     name: str
     title: str
     suffix: str
-    read: Callable[[bytes, Sheets], AnnotationSet]
-    write: Callable[[AnnotationSet, Sheets], Files]
+    read: Callable[[bytes, Backdrops], AnnotationSet]
+    write: Callable[[AnnotationSet, Backdrops], ToolFiles]
 
 
 @dataclass
-class Found:
+class Reading:
     """Labels and annotations as they are read."""
 
     labels: dict[str, Label] = field(default_factory=dict)
@@ -67,15 +67,15 @@ class Found:
             self.labels[name] = new_label(name, len(self.labels), aphia_id, colour)
         return name
 
-    def add(self, where: str, sheet: Sheet, shape: Shape, **values: Any) -> None:
-        """Note an annotation, its shape in pixels of a sheet.
+    def add(self, where: str, backdrop: Backdrop, shape: DrawnShape, **values: Any) -> None:
+        """Note an annotation, its shape in pixels of a backdrop.
 
         Raises:
             WorkspaceError: a value is wrong; the line begins with `where`.
         """
         try:
             self.annotations.append(
-                Annotation(shape=sheet.from_pixels(shape), image=sheet.image, **values)
+                Annotation(shape=backdrop.from_pixels(shape), image=backdrop.image, **values)
             )
         except ValidationError as error:
             raise WorkspaceError(f"{where}: {_first(error)}") from None
@@ -110,7 +110,7 @@ def read_object(data: bytes, what: str) -> dict[str, Any]:
 
 def shape_of(
     where: str, kind: str, rings: Sequence[Sequence[Place]], radius: float | None = None
-) -> Shape:
+) -> DrawnShape:
     """A shape of points as they stand in a file; a repeated last vertex is dropped.
 
     Raises:
@@ -118,7 +118,7 @@ def shape_of(
     """
     outer, *holes = (_open(ring) if kind in ("polygon", "rectangle") else ring for ring in rings)
     try:
-        return Shape.model_validate(
+        return DrawnShape.model_validate(
             {"kind": kind, "points": outer, "holes": holes, "radius": radius}
         )
     except ValidationError as error:
@@ -140,22 +140,22 @@ def pairs(where: str, flat: Any) -> list[Place]:
     return [(float(x), float(y)) for x, y in array.reshape(-1, 2)]
 
 
-def hint_of(shape: Shape) -> dict[str, Any]:
+def hint_of(shape: DrawnShape) -> dict[str, Any]:
     """What a polygon alone does not say of a rectangle or a circle."""
     if shape.kind == "circle":
         return {"kind": "circle", "middle": list(shape.points[0]), "radius": shape.radius}
     return {"kind": shape.kind} if shape.kind == "rectangle" else {}
 
 
-def with_hint(polygon: Shape, hint: Any) -> Shape:
+def with_hint(polygon: DrawnShape, hint: Any) -> DrawnShape:
     """The shape that a polygon was written for, where it is still the polygon written for it."""
     if not isinstance(hint, Mapping):
         return polygon
     try:
         if hint.get("kind") == "rectangle":
-            return Shape(kind="rectangle", points=polygon.points)
+            return DrawnShape(kind="rectangle", points=polygon.points)
         if hint.get("kind") == "circle":
-            shape = Shape.model_validate(
+            shape = DrawnShape.model_validate(
                 {"kind": "circle", "points": [hint["middle"]], "radius": hint["radius"]}
             )
             (outline,) = shape.rings
@@ -168,19 +168,19 @@ def with_hint(polygon: Shape, hint: Any) -> Shape:
     return polygon
 
 
-def one_ring(shape: Shape) -> tuple[Place, ...] | None:
+def one_ring(shape: DrawnShape) -> tuple[Place, ...] | None:
     """An area as one ring, its holes by slits; None where no slit reaches a hole."""
     outer, *holes = shape.rings
     return joined(outer, tuple(holes)) if holes else outer
 
 
-def polygon_of(where: str, ring: Sequence[Place]) -> Shape:
+def polygon_of(where: str, ring: Sequence[Place]) -> DrawnShape:
     """The way back."""
     outer, holes = parted(tuple(_open(ring)))
     return shape_of(where, "polygon", [outer, *holes])
 
 
-def check_size(where: str, sheet: Sheet, width: Any, height: Any) -> None:
+def check_size(where: str, backdrop: Backdrop, width: Any, height: Any) -> None:
     """Check that a tool had a picture of this size.
 
     Raises:
@@ -188,21 +188,22 @@ def check_size(where: str, sheet: Sheet, width: Any, height: Any) -> None:
     """
     if not isinstance(width, (int, float)) or not isinstance(height, (int, float)):
         return
-    if (width, height) != (sheet.width_px, sheet.height_px) and width > 0 and height > 0:
+    if (width, height) != (backdrop.width_px, backdrop.height_px) and width > 0 and height > 0:
         raise WorkspaceError(
-            f"{where}: {width:g} x {height:g} pixels, but {sheet.name} has {sheet.width_px} x "
-            f"{sheet.height_px}: annotate the picture itself, not a smaller copy"
+            f"{where}: {width:g} x {height:g} pixels, but {backdrop.name} has "
+            f"{backdrop.width_px} x {backdrop.height_px}: annotate the picture itself, not a "
+            "smaller copy"
         )
 
 
 def placed(
-    values: AnnotationSet, sheets: Sheets, lacks: Mapping[str, str], *, has_holes: bool
-) -> tuple[list[tuple[Annotation, Sheet, Shape]], tuple[str, ...]]:
-    """Annotations with the sheets they are drawn on and their shapes there, and what is left out.
+    values: AnnotationSet, backdrops: Backdrops, lacks: Mapping[str, str], *, has_holes: bool
+) -> tuple[list[tuple[Annotation, Backdrop, DrawnShape]], tuple[str, ...]]:
+    """Annotations with the backdrops they are drawn on and their shapes there; what is left out.
 
     Args:
         values: annotations.
-        sheets: pictures.
+        backdrops: pictures.
         lacks: why a kind of shape is not written, by kind.
         has_holes: whether the format has them.
     """
@@ -210,18 +211,18 @@ def placed(
     found, why = [], dict.fromkeys([unseen, cut_off, *lacks.values()], 0)
     over = 0
     for one in values.annotations:
-        sheet = sheets.of(one)
+        backdrop = backdrops.of(one)
         if one.shape.kind in lacks:
             why[lacks[one.shape.kind]] += 1
-        elif sheet is None:
+        elif backdrop is None:
             why[unseen] += 1
         elif not has_holes and one.shape.holes and one_ring(one.shape) is None:
             why[cut_off] += 1
         else:
-            shape = sheet.to_pixels(one.shape)
+            shape = backdrop.to_pixels(one.shape)
             low, high = np.min(shape.points, axis=0), np.max(shape.points, axis=0)
-            over += bool((low < 0).any() or (high > [sheet.width_px, sheet.height_px]).any())
-            found.append((one, sheet, shape))
+            over += bool((low < 0).any() or (high > [backdrop.width_px, backdrop.height_px]).any())
+            found.append((one, backdrop, shape))
     lines = [f"{count} left out: {reason}" for reason, count in why.items() if count]
     if over:
         lines.append(f"{over} reach over the edge of their picture: cut tiles with more overlap")

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.errors import WorkspaceError
+from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.formats.common import (
     OURS,
-    Files,
     Format,
-    Found,
+    Reading,
+    ToolFiles,
     check_size,
     hint_of,
     pairs,
@@ -26,8 +27,7 @@ from reconstruct.annotations.formats.common import (
     shape_of,
     with_hint,
 )
-from reconstruct.annotations.sheets import Sheet, Sheets
-from reconstruct.annotations.values import AnnotationSet, Label, Place, Shape
+from reconstruct.annotations.values import AnnotationSet, DrawnShape, Label, Place
 
 _MIDDLE = 0.5
 """Of the first pixel, from its outer corner."""
@@ -37,7 +37,7 @@ _EMPTY = "Empty"
 """Class of regions without a label."""
 
 
-def read_taglab(data: bytes, sheets: Sheets) -> AnnotationSet:
+def read_taglab(data: bytes, backdrops: Backdrops) -> AnnotationSet:
     """Annotations of a TagLab project.
 
     Raises:
@@ -47,27 +47,27 @@ def read_taglab(data: bytes, sheets: Sheets) -> AnnotationSet:
     images = whole.get("images")
     if not isinstance(images, list) or not all(isinstance(one, dict) for one in images):
         raise WorkspaceError("no TagLab project: 'images' is no list of objects")
-    found = Found()
+    found = Reading()
     for entry in _labels(whole.get("labels")):
         found.label(*entry)
     for n, image in enumerate(images):
         regions, points = _marks(image, n)
         if not regions and not points:
             continue
-        sheet = _sheet(image, n, sheets)
+        backdrop = _backdrop(image, n, backdrops)
         for m, region in enumerate(regions):
-            where = f"{sheet.name}, region {region.get('id', m)}"
+            where = f"{backdrop.name}, region {region.get('id', m)}"
             shape, values = _region(where, region)
             values["label"] = found.label(_class(region, "class name"))
-            found.add(where, sheet, shape, **values)
+            found.add(where, backdrop, shape, **values)
         for m, point in enumerate(points):
             of = {str(key).lower(): value for key, value in point.items()}
-            where = f"{sheet.name}, point {of.get('id', m)}"
+            where = f"{backdrop.name}, point {of.get('id', m)}"
             spot = pairs(where, [of.get("x", of.get("coordx")), of.get("y", of.get("coordy"))])
             shape = shape_of(where, "point", [spot])
             label = found.label(_class(of, "class", "class name", "class_name"))
             _, values = _said(of.get("note"), of.get("data"))
-            found.add(where, sheet, shape, label=label, **values)
+            found.add(where, backdrop, shape, label=label, **values)
     return found.values
 
 
@@ -110,7 +110,7 @@ def _marks(image: Mapping[str, Any], n: int) -> tuple[list[Any], list[Any]]:
     return list(regions or ()), list(points or ())
 
 
-def _sheet(image: Mapping[str, Any], n: int, sheets: Sheets) -> Sheet:
+def _backdrop(image: Mapping[str, Any], n: int, backdrops: Backdrops) -> Backdrop:
     channels = image.get("channels")
     listed = channels if isinstance(channels, list) else []
     files = [one.get("filename") for one in listed if isinstance(one, dict)]
@@ -120,16 +120,16 @@ def _sheet(image: Mapping[str, Any], n: int, sheets: Sheets) -> Sheet:
     fault: WorkspaceError | None = None
     for name in names:
         try:
-            sheet = sheets.named(name)
+            backdrop = backdrops.named(name)
         except WorkspaceError as error:
             fault = fault or error
             continue
-        check_size(f"image {name}", sheet, image.get("width"), image.get("height"))
-        return sheet
+        check_size(f"image {name}", backdrop, image.get("width"), image.get("height"))
+        return backdrop
     raise fault or WorkspaceError(f"image {n}: no picture")
 
 
-def _region(where: str, region: Mapping[str, Any]) -> tuple[Shape, dict[str, Any]]:
+def _region(where: str, region: Mapping[str, Any]) -> tuple[DrawnShape, dict[str, Any]]:
     holes = region.get("inner contours") or []
     if not isinstance(holes, list):
         raise WorkspaceError(f"{where}: its inner contours are no list")
@@ -161,12 +161,12 @@ def _class(of: Mapping[str, Any], *keys: str) -> str:
     return _EMPTY
 
 
-def write_taglab(values: AnnotationSet, sheets: Sheets) -> Files:
+def write_taglab(values: AnnotationSet, backdrops: Backdrops) -> ToolFiles:
     """A TagLab project of annotations; lines are left out."""
-    drawn, left_out = placed(values, sheets, {"polyline": "TagLab has no lines"}, has_holes=True)
+    drawn, left_out = placed(values, backdrops, {"polyline": "TagLab has no lines"}, has_holes=True)
     images: dict[str, dict[str, Any]] = {}
-    for n, (one, sheet, shape) in enumerate(drawn):
-        image = images.setdefault(sheet.name, _image(sheet))
+    for n, (one, backdrop, shape) in enumerate(drawn):
+        image = images.setdefault(backdrop.name, _image(backdrop))
         ours = {"id": one.id, "author": one.author, "time_utc": one.time_utc, **hint_of(shape)}
         data = {**one.attributes, OURS: json.dumps(ours)}
         if shape.kind == "point":
@@ -188,22 +188,22 @@ def write_taglab(values: AnnotationSet, sheets: Sheets) -> Files:
         "image_metadata_template": {},
     }
     text = json.dumps(whole, allow_nan=False, indent=1) + "\n"
-    return Files(texts={"": text}, written=len(drawn), left_out=left_out)
+    return ToolFiles(texts={"": text}, written=len(drawn), left_out=left_out)
 
 
-def _image(sheet: Sheet) -> dict[str, Any]:
-    factor = 1.0 if sheet.plane is None else 1e3 * sheet.plane.scale
+def _image(backdrop: Backdrop) -> dict[str, Any]:
+    factor = 1.0 if backdrop.plane is None else 1e3 * backdrop.plane.scale
     return {
         "rect": [0.0, 0.0, 0.0, 0.0], "map_px_to_mm_factor": f"{factor:.9g}",
-        "width": sheet.width_px, "height": sheet.height_px,
+        "width": backdrop.width_px, "height": backdrop.height_px,
         "annotations": {"regions": [], "points": []}, "layers": [],
-        "channels": [{"filename": sheet.name, "type": "RGB"}],
-        "id": sheet.name, "name": sheet.name, "workspace": [], "export_dataset_area": [],
+        "channels": [{"filename": backdrop.name, "type": "RGB"}],
+        "id": backdrop.name, "name": backdrop.name, "workspace": [], "export_dataset_area": [],
         "georef_filename": "", "metadata": {},
     }  # fmt: skip
 
 
-def _outlined(shape: Shape) -> dict[str, Any]:
+def _outlined(shape: DrawnShape) -> dict[str, Any]:
     outer, *holes = ([(x - _MIDDLE, y - _MIDDLE) for x, y in ring] for ring in shape.rings)
     left, top, right, bottom = shape.geometry.bounds
     middle = shape.geometry.centroid

@@ -1,4 +1,4 @@
-"""Annotations for tests, and the sheets they lie on."""
+"""Annotations for tests, and the backdrops they lie on."""
 
 import math
 
@@ -6,13 +6,13 @@ import numpy as np
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from reconstruct.annotations.sheets import Sheet, Sheets
+from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.values import (
     Affine,
     Annotation,
     AnnotationSet,
+    DrawnShape,
     Label,
-    Shape,
     with_labels,
 )
 
@@ -29,19 +29,23 @@ LABELS = with_labels((), [
 ])  # fmt: skip
 
 
-def sheet(
+def backdrop(
     name: str = "mosaic.tif", column: int = 0, row: int = 0, side: int | None = None
-) -> Sheet:
+) -> Backdrop:
     place = (WEST + column * PIXEL, NORTH - row * PIXEL)
-    return Sheet(
+    return Backdrop(
         name=name, width_px=side or WIDE, height_px=side or HIGH,
         plane=Affine(scale=PIXEL, flipped=True, shift=place),
     )  # fmt: skip
 
 
-SHEETS = Sheets([sheet()], {"left/000.png": TAKEN, "right/000.png": TAKEN})
-TILES = Sheets(
-    [sheet(f"tile_{r:03d}_{c:03d}.png", 384 * c, 384 * r, 512) for r in range(3) for c in range(3)],
+BACKDROPS = Backdrops([backdrop()], {"left/000.png": TAKEN, "right/000.png": TAKEN})
+TILES = Backdrops(
+    [
+        backdrop(f"tile_{r:03d}_{c:03d}.png", 384 * c, 384 * r, 512)
+        for r in range(3)
+        for c in range(3)
+    ],
     {"left/000.png": TAKEN},
 )
 
@@ -53,23 +57,23 @@ def number(low: float, high: float) -> st.SearchStrategy[float]:
 @st.composite
 def pixel_shapes(
     draw: st.DrawFn, wide: float, high: float, kinds: tuple[str, ...] = KINDS, least_holes: int = 0
-) -> Shape:
+) -> DrawnShape:
     """Any shape within a picture: its vertices by angle and distance from a middle."""
     kind = draw(st.sampled_from(kinds))
     radius = draw(number(4.0, min(wide, high) / 2.5))
     x, y = draw(number(radius, wide - radius)), draw(number(radius, high - radius))
     if kind == "point":
-        return Shape(kind="point", points=((x, y),))
+        return DrawnShape(kind="point", points=((x, y),))
     if kind == "circle":
-        return Shape(kind="circle", points=((x, y),), radius=radius)
+        return DrawnShape(kind="circle", points=((x, y),), radius=radius)
     if kind == "rectangle":
         turn = draw(number(0.0, math.tau))
-        return Shape(kind="rectangle", points=_star(x, y, [radius] * 4, turn))
+        return DrawnShape(kind="rectangle", points=_star(x, y, [radius] * 4, turn))
     count = draw(st.integers(3, 12))
     away = [radius * draw(number(0.6, 1.0)) for _ in range(count)]
     turn = draw(number(0.0, math.tau))
     if kind == "polyline":
-        return Shape(kind="polyline", points=_star(x, y, away, turn))
+        return DrawnShape(kind="polyline", points=_star(x, y, away, turn))
     outer = _star(x, y, away, turn)
     within = Polygon(outer).buffer(-0.05 * radius)
     holes = []
@@ -81,7 +85,7 @@ def pixel_shapes(
         hole = _star(*spot, hole_away, draw(number(0.0, math.tau)))
         if within.covers(Polygon(hole)):
             holes.append(hole)
-    return Shape(kind="polygon", points=outer, holes=tuple(holes))
+    return DrawnShape(kind="polygon", points=outer, holes=tuple(holes))
 
 
 def _star(x: float, y: float, away: list[float], turn: float) -> tuple[tuple[float, float], ...]:
@@ -102,7 +106,7 @@ def marks(draw: st.DrawFn) -> Annotation:
     shape = draw(pixel_shapes(wide, high))
     return Annotation(
         label=draw(st.sampled_from(LABELS)).id,
-        shape=shape if image else sheet().from_pixels(shape),
+        shape=shape if image else backdrop().from_pixels(shape),
         image=image,
         author=draw(st.sampled_from(["", "Ada", "Ada Love Lace"])),
         time_utc=draw(st.sampled_from(["", "2026-11-27T05:01:16Z", "last summer"])),
@@ -118,7 +122,7 @@ sets = st.lists(marks(), min_size=1, max_size=4).map(
 
 def places_px(one: Annotation) -> list[np.ndarray]:
     """Its rings in pixels of the picture or the mosaic."""
-    shape = one.shape if one.image is not None else sheet().to_pixels(one.shape)
+    shape = one.shape if one.image is not None else backdrop().to_pixels(one.shape)
     return [np.array(ring) for ring in (shape.points, *shape.holes)]
 
 

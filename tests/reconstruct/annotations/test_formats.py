@@ -13,15 +13,15 @@ from rasterio.transform import Affine as GridAffine
 from shapely.geometry import Polygon
 
 from alice_survey.base.errors import AliceError
+from reconstruct.annotations.backdrops import Backdrops
 from reconstruct.annotations.formats.registry import FORMATS
 from reconstruct.annotations.formats.rle import decoded, encoded, outlines, packed, unpacked
 from reconstruct.annotations.keyhole import joined, parted
-from reconstruct.annotations.sheets import Sheets
-from reconstruct.annotations.values import AnnotationSet, Shape, signed_area
+from reconstruct.annotations.values import AnnotationSet, DrawnShape, signed_area
 from tests.reconstruct.annotations.marks import (
+    BACKDROPS,
     LABELS,
     PIXEL,
-    SHEETS,
     TILES,
     WEST,
     miss_px,
@@ -32,16 +32,18 @@ from tests.reconstruct.annotations.marks import (
 LACKS = {"taglab": {"polyline"}, "coco": {"polyline"}, "biigle": set()}
 
 
-@pytest.mark.parametrize("sheets", [SHEETS, TILES], ids=["whole", "tiles"])
+@pytest.mark.parametrize("backdrops", [BACKDROPS, TILES], ids=["whole", "tiles"])
 @pytest.mark.parametrize("name", FORMATS)
 @given(some=sets)
 @settings(max_examples=15)
-def test_what_is_written_is_read_as_it_was(name: str, sheets: Sheets, some: AnnotationSet) -> None:
-    files = FORMATS[name].write(some, sheets)
+def test_what_is_written_is_read_as_it_was(
+    name: str, backdrops: Backdrops, some: AnnotationSet
+) -> None:
+    files = FORMATS[name].write(some, backdrops)
     kept = [one for one in some.annotations if one.shape.kind not in LACKS[name]]
     assert files.written == len(kept)
     assert bool(files.left_out) >= (len(kept) < len(some.annotations))
-    back = FORMATS[name].read(files.texts[""].encode(), sheets)
+    back = FORMATS[name].read(files.texts[""].encode(), backdrops)
     if name == "taglab":  # pictures one after the other, in each regions and then points
         assert len(back.annotations) == len(kept)
         pool = list(back.annotations)
@@ -62,7 +64,7 @@ def test_what_is_written_is_read_as_it_was(name: str, sheets: Sheets, some: Anno
         assert [label.aphia_id for label in back.labels] == [one.aphia_id for one in LABELS]
         assert [label.colour for label in back.labels] == [one.colour for one in LABELS]
     else:
-        tree = FORMATS[name].read(files.texts["_labels"].encode(), sheets)
+        tree = FORMATS[name].read(files.texts["_labels"].encode(), backdrops)
         assert {label.id for label in LABELS} <= {label.id for label in tree.labels}
         assert tree.by_label["Porites"].aphia_id == 206987
     again, known = some.with_more(back, PIXEL)
@@ -70,7 +72,7 @@ def test_what_is_written_is_read_as_it_was(name: str, sheets: Sheets, some: Anno
 
 
 @given(shape=pixel_shapes(500.0, 400.0, ("polygon",), 1))
-def test_slits_keep_the_area_and_are_found_again(shape: Shape) -> None:
+def test_slits_keep_the_area_and_are_found_again(shape: DrawnShape) -> None:
     assume(shape.holes)
     ring = joined(shape.points, shape.holes)
     assert ring is not None
@@ -134,7 +136,7 @@ COCO_BY_HAND = {
 
 
 def test_a_coco_file_by_hand() -> None:
-    found = FORMATS["coco"].read(json.dumps(COCO_BY_HAND).encode(), SHEETS)
+    found = FORMATS["coco"].read(json.dumps(COCO_BY_HAND).encode(), BACKDROPS)
     triangle, column, box, spot, first, second = found.annotations
     assert [label.id for label in found.labels] == ["animal > urchin", "weed"]
     assert all(one.image == "left/000.png" for one in found.annotations)
@@ -189,7 +191,7 @@ def test_a_taglab_project_by_hand(old: bool) -> None:
     if old:  # labels by their ids, regions alone
         whole["labels"] = {one["id"]: one for one in whole["labels"]}
         whole["images"][0]["annotations"] = whole["images"][0]["annotations"]["regions"]
-    found = FORMATS["taglab"].read(json.dumps(whole).encode(), SHEETS)
+    found = FORMATS["taglab"].read(json.dumps(whole).encode(), BACKDROPS)
     assert len(found.annotations) == (2 if old else 3)
     colony, nameless = found.annotations[:2]
     assert found.by_label["Pocillopora"].aphia_id == 206938
@@ -234,11 +236,11 @@ def test_a_biigle_report_of_tiles_by_hand() -> None:
 def test_a_label_tree_and_a_list_of_species() -> None:
     tree = "id,name,parent_id,color,label_source_id,source_id\n1,Animalia,,00ff00,,2\n" \
         "2,Porifera,1,0000FF,1,558\n"  # fmt: skip
-    found = FORMATS["biigle"].read(tree.encode(), SHEETS)
+    found = FORMATS["biigle"].read(tree.encode(), BACKDROPS)
     assert [(one.id, one.aphia_id, one.colour) for one in found.labels] == [
         ("Animalia", 2, "#00ff00"), ("Animalia > Porifera", 558, "#0000ff"),
     ]  # fmt: skip
-    plain = FORMATS["biigle"].read(b"name,aphia_id\nSabella,129964\nSepia,\n", SHEETS)
+    plain = FORMATS["biigle"].read(b"name,aphia_id\nSabella,129964\nSepia,\n", BACKDROPS)
     assert [(one.id, one.aphia_id) for one in plain.labels] == [
         ("Sabella", 129964),
         ("Sepia", None),
@@ -251,7 +253,7 @@ def test_a_label_tree_and_a_list_of_species() -> None:
 @settings(max_examples=30)
 def test_anything_else_is_one_line(name: str, noise: bytes) -> None:
     try:
-        FORMATS[name].read(noise, SHEETS)
+        FORMATS[name].read(noise, BACKDROPS)
     except AliceError as error:
         assert len(str(error).splitlines()) == 1
 
@@ -272,7 +274,7 @@ def test_a_file_with_one_wrong_value_is_read_or_one_line(
     at, key = data.draw(st.sampled_from(list(_places(whole))))
     at[key] = value
     try:
-        found = FORMATS[name].read(json.dumps(whole).encode(), SHEETS)
+        found = FORMATS[name].read(json.dumps(whole).encode(), BACKDROPS)
     except AliceError as error:
         assert len(str(error).splitlines()) == 1 and len(str(error)) < 600
     else:
@@ -313,7 +315,7 @@ def test_a_smaller_copy_and_an_ambiguous_name_are_refused() -> None:
     whole["annotations"] = whole["annotations"][:1]
     whole["images"][0] |= {"width": 282, "height": 226}
     with pytest.raises(AliceError, match="282"):
-        FORMATS["coco"].read(json.dumps(whole).encode(), SHEETS)
+        FORMATS["coco"].read(json.dumps(whole).encode(), BACKDROPS)
     whole["images"][0] |= {"width": 564, "height": 451, "file_name": "000.png"}
     with pytest.raises(AliceError, match=r"left/000\.png"):
-        FORMATS["coco"].read(json.dumps(whole).encode(), SHEETS)
+        FORMATS["coco"].read(json.dumps(whole).encode(), BACKDROPS)

@@ -13,7 +13,7 @@ from alice_survey.seafloor.terrain import Terrain, read_terrain
 from camera_calib.rig import read_rig
 from reconstruct.annotations.projection import OnPlane, Projector
 from reconstruct.annotations.table import sigma_of_area
-from reconstruct.annotations.values import Annotation, Shape
+from reconstruct.annotations.values import Annotation, DrawnShape
 from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.placing.alignment import align_rigid
 
@@ -158,7 +158,7 @@ def test_an_outline_is_shown_in_the_pictures_above_it(truth: Truth) -> None:
 
 def test_a_vertex_beyond_the_surface_is_one_line(truth: Truth) -> None:
     image = truth.projector.images[0]
-    shape = Shape(kind="polygon", points=((100.0, 100.0), (200.0, 100.0), (-4e3, 1e4)))
+    shape = DrawnShape(kind="polygon", points=((100.0, 100.0), (200.0, 100.0), (-4e3, 1e4)))
     with pytest.raises(ReconstructionError, match="1 of 3 vertices") as caught:
         truth.projector.on_plane(Annotation(label="x", shape=shape, image=image))
     assert len(str(caught.value).splitlines()) == 1
@@ -171,7 +171,7 @@ def test_the_sigma_of_an_area_is_what_picks_do() -> None:
     rng = np.random.default_rng(5)
     ring = np.array([[0.0, 0], [1.0, 0.1], [1.2, 0.9], [0.4, 1.1], [-0.1, 0.6]])
     hole = np.array([[0.4, 0.4], [0.4, 0.6], [0.6, 0.6], [0.6, 0.4]])
-    shape = Shape(kind="polygon", points=as_places(ring), holes=(as_places(hole),))
+    shape = DrawnShape(kind="polygon", points=as_places(ring), holes=(as_places(hole),))
     sigma = 0.01
     spots = [spots_of(np.array(one), sigma) for one in shape.rings]
     predicted = sigma_of_area(shape, spots)

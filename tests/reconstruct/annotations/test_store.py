@@ -17,8 +17,8 @@ from reconstruct.annotations.store import (
     read_annotations,
     token_of,
 )
-from reconstruct.annotations.table import Ground, Measured, quadrats
-from reconstruct.annotations.values import Annotation, AnnotationSet, Label, Shape, with_labels
+from reconstruct.annotations.table import KnownGround, Measured, quadrats
+from reconstruct.annotations.values import Annotation, AnnotationSet, DrawnShape, Label, with_labels
 from reconstruct.views.model import WorldFrame
 
 DATUM = Datum(32.8, 34.9)
@@ -29,7 +29,7 @@ LABELS = with_labels((), [Label(id="coral"), Label(id="sand", colour="#e69f00")]
 def square(west: float, south: float, side: float, label: str = "coral") -> Annotation:
     corners = ((west, south), (west + side, south), (west + side, south + side),
                (west, south + side))  # fmt: skip
-    return Annotation(label=label, shape=Shape(kind="rectangle", points=corners))
+    return Annotation(label=label, shape=DrawnShape(kind="rectangle", points=corners))
 
 
 def some(*annotations: Annotation) -> AnnotationSet:
@@ -92,7 +92,7 @@ def measured(one: Annotation, sigma: float = 0.01) -> Measured:
 
 KNOWN = np.ones((40, 60), bool)
 KNOWN[:, 40:] = False
-GROUND = Ground(known=KNOWN, transform=GridAffine(0.1, 0, 0, 0, -0.1, 4), pixel=0.1)
+GROUND = KnownGround(known=KNOWN, transform=GridAffine(0.1, 0, 0, 0, -0.1, 4), pixel=0.1)
 """4 m by 6 m, of which the western 4 m are known."""
 
 

@@ -14,14 +14,14 @@ from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.records import CamerasRecord
-from reconstruct.annotations.values import Affine, Annotation, Shape
+from reconstruct.annotations.values import Affine, Annotation, DrawnShape
 from reconstruct.raster import opened_raster
 
 MOSAIC = "mosaic.tif"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sheet:
+class Backdrop:
     """One picture, and where it lies."""
 
     name: str
@@ -30,11 +30,11 @@ class Sheet:
     plane: Affine | None
     """From its pixels to the plane of the mosaic; None for a picture as taken."""
 
-    def to_pixels(self, shape: Shape) -> Shape:
-        """A shape of the workspace in this sheet's pixels."""
+    def to_pixels(self, shape: DrawnShape) -> DrawnShape:
+        """A shape of the workspace in this backdrop's pixels."""
         return shape if self.plane is None else shape.moved(self.plane.inverse)
 
-    def from_pixels(self, shape: Shape) -> Shape:
+    def from_pixels(self, shape: DrawnShape) -> DrawnShape:
         """The way back."""
         return shape if self.plane is None else shape.moved(self.plane)
 
@@ -44,10 +44,10 @@ class Sheet:
         return self.name if self.plane is None else None
 
 
-class Sheets:
-    """All sheets of a workspace, by the names that tools know them by."""
+class Backdrops:
+    """All backdrops of a workspace, by the names that tools know them by."""
 
-    def __init__(self, mosaic: Sequence[Sheet], images: Mapping[str, tuple[int, int]]) -> None:
+    def __init__(self, mosaic: Sequence[Backdrop], images: Mapping[str, tuple[int, int]]) -> None:
         """Take them.
 
         Args:
@@ -57,32 +57,32 @@ class Sheets:
         self.mosaic, self._images = tuple(mosaic), dict(images)
 
     @cached_property
-    def _by_name(self) -> dict[str, Sheet]:
+    def _by_name(self) -> dict[str, Backdrop]:
         pictures = (
-            Sheet(name=name, width_px=size[0], height_px=size[1], plane=None)
+            Backdrop(name=name, width_px=size[0], height_px=size[1], plane=None)
             for name, size in self._images.items()
         )
-        return {sheet.name: sheet for sheet in (*self.mosaic, *pictures)}
+        return {backdrop.name: backdrop for backdrop in (*self.mosaic, *pictures)}
 
     @cached_property
-    def _by_last_name(self) -> dict[str, list[Sheet]]:
-        found: dict[str, list[Sheet]] = {}
-        for name, sheet in self._by_name.items():
+    def _by_last_name(self) -> dict[str, list[Backdrop]]:
+        found: dict[str, list[Backdrop]] = {}
+        for name, backdrop in self._by_name.items():
             for key in {PurePath(name).name, PurePath(name).stem}:
-                found.setdefault(key, []).append(sheet)
+                found.setdefault(key, []).append(backdrop)
         return found
 
-    def named(self, name: str) -> Sheet:
-        """The sheet that a tool calls so: its name, or the end of its path, or its stem.
+    def named(self, name: str) -> Backdrop:
+        """The backdrop that a tool calls so: its name, or the end of its path, or its stem.
 
         Raises:
             WorkspaceError: there is none, or there are several.
         """
         path = PurePath(name.replace("\\", "/"))
         for count in range(len(path.parts)):
-            sheet = self._by_name.get("/".join(path.parts[count:]))
-            if sheet is not None:
-                return sheet
+            backdrop = self._by_name.get("/".join(path.parts[count:]))
+            if backdrop is not None:
+                return backdrop
         matches = self._by_last_name.get(path.name) or self._by_last_name.get(path.stem) or []
         if len(matches) == 1:
             return matches[0]
@@ -96,10 +96,10 @@ class Sheets:
             f"as {known}): give the folder of tiles with --tiles, or the workspace of that survey"
         )
 
-    def of(self, annotation: Annotation) -> Sheet | None:
-        """The sheet on which an annotation is drawn best: the tile that holds most of it.
+    def of(self, annotation: Annotation) -> Backdrop | None:
+        """The backdrop on which an annotation is drawn best: the tile that holds most of it.
 
-        None where no sheet shows it.
+        None where no backdrop shows it.
         """
         if annotation.image is not None:
             return self._by_name.get(annotation.image)
@@ -108,20 +108,20 @@ class Sheets:
         if not self.mosaic:
             return None
         box = shapely.box(*annotation.shape.geometry.bounds)
-        shares = [_share(box, sheet) for sheet in self.mosaic]
+        shares = [_share(box, backdrop) for backdrop in self.mosaic]
         best = int(np.argmax(shares))
         return self.mosaic[best] if shares[best] > 0 else None
 
-    def __iter__(self) -> Iterator[Sheet]:
-        """All sheets."""
+    def __iter__(self) -> Iterator[Backdrop]:
+        """All backdrops."""
         return iter(self._by_name.values())
 
 
-def _share(box: shapely.Polygon, sheet: Sheet) -> float:
-    """Share of a box's extent that a sheet shows, between 0 and 1."""
-    if sheet.plane is None:
+def _share(box: shapely.Polygon, backdrop: Backdrop) -> float:
+    """Share of a box's extent that a backdrop shows, between 0 and 1."""
+    if backdrop.plane is None:
         return 0.0
-    corners = sheet.plane.apply(np.array([[0.0, 0.0], [sheet.width_px, sheet.height_px]]))
+    corners = backdrop.plane.apply(np.array([[0.0, 0.0], [backdrop.width_px, backdrop.height_px]]))
     (west, north), (east, south) = corners
     left, bottom, right, top = box.bounds
     shares = [
@@ -132,8 +132,8 @@ def _share(box: shapely.Polygon, sheet: Sheet) -> float:
     return shares[0] * shares[1]
 
 
-def sheets_of(workspace: Path, tiles: Path | None = None) -> Sheets:
-    """The sheets of a workspace.
+def backdrops_of(workspace: Path, tiles: Path | None = None) -> Backdrops:
+    """The backdrops of a workspace.
 
     Args:
         workspace: folder of the survey.
@@ -156,7 +156,7 @@ def sheets_of(workspace: Path, tiles: Path | None = None) -> Sheets:
             if record.camera not in sizes:
                 sizes[record.camera] = _size(manifest.parent / record.image)
             images[record.image] = sizes[record.camera]
-    return Sheets(_tiles(tiles) if tiles is not None else _whole(workspace), images)
+    return Backdrops(_tiles(tiles) if tiles is not None else _whole(workspace), images)
 
 
 def _size(path: Path) -> tuple[int, int]:
@@ -167,22 +167,22 @@ def _size(path: Path) -> tuple[int, int]:
         raise WorkspaceError(f"{path}: missing, or no picture that can be decoded") from None
 
 
-def _whole(workspace: Path) -> list[Sheet]:
+def _whole(workspace: Path) -> list[Backdrop]:
     path = workspace / "mosaic" / MOSAIC
     if not path.is_file():
         return []
     with opened_raster(path) as raster:
-        return [_sheet(MOSAIC, raster.width, raster.height, raster.transform)]
+        return [_backdrop(MOSAIC, raster.width, raster.height, raster.transform)]
 
 
-def _sheet(name: str, width: int, height: int, t: rasterio.Affine) -> Sheet:
-    return Sheet(
+def _backdrop(name: str, width: int, height: int, t: rasterio.Affine) -> Backdrop:
+    return Backdrop(
         name=name, width_px=width, height_px=height,
         plane=Affine(scale=float(t.a), flipped=True, shift=(float(t.c), float(t.f))),
     )  # fmt: skip
 
 
-def _tiles(folder: Path) -> list[Sheet]:
+def _tiles(folder: Path) -> list[Backdrop]:
     wanted = ("tile", "width_px", "height_px", "pixel", "west", "north")
     path = folder / "tiles.csv"
     _, rows = read_csv(path, wanted, fault=WorkspaceError)
@@ -194,6 +194,6 @@ def _tiles(folder: Path) -> list[Sheet]:
         except ValueError as error:
             raise WorkspaceError(f"{path} line {line}: {error}") from None
         found.append(
-            _sheet(row["tile"], width, height, rasterio.Affine(pixel, 0, west, 0, -pixel, north))
+            _backdrop(row["tile"], width, height, rasterio.Affine(pixel, 0, west, 0, -pixel, north))
         )
     return found
