@@ -287,7 +287,9 @@ def _pair(pictures: RegisteredPictures, first: str, second: str) -> RigidTransfo
     """Pose of a camera relative to the first one by a station that both took; None without one."""
     order = list(pictures.warps)
     rows = [np.flatnonzero(pictures.camera == order.index(name)) for name in (first, second)]
-    _, a, b = np.intersect1d(*(pictures.station[r] for r in rows), return_indices=True)
+    _, a, b = np.intersect1d(
+        pictures.station[rows[0]], pictures.station[rows[1]], return_indices=True
+    )
     if not len(a):
         return None
     one, two = (_pose(pictures, int(r[k[0]])) for r, k in zip(rows, (a, b), strict=True))

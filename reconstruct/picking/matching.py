@@ -8,6 +8,7 @@ what remains determines how well (White 1980; Newey & West 1987, for noise that 
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,8 +160,9 @@ class _Part:
         self._size = np.array(grey.shape[::-1])
         pixels = grey.astype(np.float64)
         self._plain = pixels
+        find: Any = ndimage
         self._spline = (
-            ndimage.spline_filter(pixels, order=_SPLINE, mode="mirror") if pixels.size else pixels
+            find.spline_filter(pixels, order=_SPLINE, mode="mirror") if pixels.size else pixels
         )
 
     @classmethod
@@ -179,8 +181,10 @@ class _Part:
         source = self._plain if order == 1 else self._spline
         at = place[inside, ::-1].T - 0.5
 
+        find: Any = ndimage
+
         def read(where: Array) -> Array:
-            values: Array = ndimage.map_coordinates(
+            values: Array = find.map_coordinates(
                 source, where, order=order, mode="mirror", prefilter=False
             )
             return values
@@ -251,8 +255,8 @@ def _sigma(columns: Array, weight: Array, rest: Array, inverse: Array) -> float:
     terms = ((weight * rest)[:, None] * columns[:, :]).T.reshape(-1, side, side)
     fall = 1.0 - np.abs(np.arange(-_LAG_PX, _LAG_PX + 1)) / (_LAG_PX + 1)
     near = ndimage.convolve1d(terms, fall, axis=1, mode="constant")
-    near = ndimage.convolve1d(near, fall, axis=2, mode="constant").reshape(len(terms), -1)
-    middle = terms.reshape(len(terms), -1) @ near.T
+    flat = ndimage.convolve1d(near, fall, axis=2, mode="constant").reshape(len(terms), -1)
+    middle = terms.reshape(len(terms), -1) @ flat.T
     count = weight.sum() ** 2 / (weight**2).sum()
     covariance = inverse @ (0.5 * (middle + middle.T)) @ inverse * count / (count - len(terms))
     return float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2, 0.0)))

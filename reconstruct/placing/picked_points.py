@@ -200,8 +200,7 @@ def own_sigmas(picks: Sequence[Pick]) -> Array:
 def gain_of(jacobian: Array, sigma: Array) -> Array:
     """(3, 2 N) how the point moves with pixels of these sigmas (2 N,) and slopes (2 N, 3)."""
     weighted = jacobian / (sigma**2)[:, None]
-    gain: Array = np.linalg.solve(jacobian.T @ weighted, weighted.T)
-    return gain
+    return np.asarray(np.linalg.solve(jacobian.T @ weighted, weighted.T), np.float64)
 
 
 def covariance_of_picks(picks: Sequence[Pick], jacobian: Array, factor: float = 1.0) -> Array:
@@ -216,7 +215,7 @@ def covariance_of_picks(picks: Sequence[Pick], jacobian: Array, factor: float = 
         factor: by which the variances of own noise are larger than stated.
     """
     own, slopes = own_sigmas(picks), jacobian.reshape(-1, 2, 3)
-    found = np.diag(np.repeat(factor * own**2, 2))
+    found: Array = np.diag(np.repeat(factor * own**2, 2)).astype(np.float64)
     along = np.linalg.svd(jacobian)[2][:2].T
     in_plane = slopes @ along
     row = {pick.image: n for n, pick in enumerate(picks)}
@@ -289,8 +288,12 @@ def _fit(
         seen = np.stack([cameras[p.image].project(point) for p in picks])
         return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
 
+    def weighted(x: Array) -> Array:
+        found: Array = weight * misses(x)
+        return found
+
     found = least_squares(
-        lambda x: weight * misses(x), np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
+        weighted, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
         ftol=1e-12, gtol=1e-12, jac="3-point",
     )  # fmt: skip
     jacobian = np.empty((2 * len(picks), 3))
