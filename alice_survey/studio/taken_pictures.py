@@ -122,7 +122,7 @@ class TakenPictures:
         good, data = cv2.imencode(".webp", part, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
         if not good:
             raise ImageError(f"{name}: its tile cannot be written")
-        return data.tobytes()
+        return bytes(data)
 
 
 def levels_of(width: int, height: int) -> int:

@@ -154,9 +154,7 @@ class Block:
             camera=np.array([names.index(own[pictures.camera[row]]) for row in rows], np.int64),
             taken=np.array([[p.x_px, p.y_px] for p in kept]), point=np.zeros(len(kept), np.int64),
         )  # fmt: skip
-        linear = exact_observations(
-            replace(self.state, points=spot.model[None]), seen, self.fields
-        )
+        linear = exact_observations(replace(self.state, points=spot.model[None]), seen, self.fields)
         jacobian = linear.by_point.reshape(-1, 3)
         sigma = np.repeat(own_sigmas(kept), 2)
         gain = gain_of(jacobian, sigma)
@@ -214,7 +212,9 @@ class Lengths:
             raise ReconstructionError("the two spots are one and the same")
         way /= value
         block = self._block([*first, *second])
-        at = [block.errors(s, p, self._pictures) for s, p in zip(spots, (first, second), strict=True)]
+        at = [
+            block.errors(s, p, self._pictures) for s, p in zip(spots, (first, second), strict=True)
+        ]
         picks = float(way @ (at[0].picks + at[1].picks) @ way)
         poses, rig = block.variances(
             np.einsum("i,ifk->fk", way, at[1].by_poses - at[0].by_poses)[None],
@@ -233,7 +233,9 @@ class Lengths:
         Raises:
             ReconstructionError: they show none.
         """
-        cameras = {p.image: self._pictures.picture(p.image) for p in picks if p.image in self._pictures}
+        cameras = {
+            p.image: self._pictures.picture(p.image) for p in picks if p.image in self._pictures
+        }
         alone = [replace(pick, point="spot") for pick in picks]
         found, lost = find_spots(alone, cameras)
         if "spot" not in found:
@@ -285,7 +287,9 @@ def _pair(pictures: RegisteredPictures, first: str, second: str) -> RigidTransfo
     """Pose of a camera relative to the first one by a station that both took; None without one."""
     order = list(pictures.warps)
     rows = [np.flatnonzero(pictures.camera == order.index(name)) for name in (first, second)]
-    _, a, b = np.intersect1d(*(pictures.station[r] for r in rows), return_indices=True)
+    _, a, b = np.intersect1d(
+        pictures.station[rows[0]], pictures.station[rows[1]], return_indices=True
+    )
     if not len(a):
         return None
     one, two = (_pose(pictures, int(r[k[0]])) for r, k in zip(rows, (a, b), strict=True))

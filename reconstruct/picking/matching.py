@@ -7,15 +7,14 @@ are fitted to the other picture (Gruen 1985, "Adaptive least squares correlation
 what remains determines how well (White 1980; Newey & West 1987, for noise that neighbours share).
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from alice_survey.base.frames import Array
-from reconstruct.picking.registered import tangents
 from reconstruct.picking.surface import SurfacePlace
 from reconstruct.placing.picked_points import RegisteredPicture
 
@@ -88,13 +87,11 @@ class Matcher:
         grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
         self._weight = np.exp(-0.5 * (grid**2).sum(axis=1) / _WEIGHT_PX**2)
         self._grid = grid
-        rays = [picture.ray(one) for one in pixel + grid]
-        starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
+        starts, ways = picture.ray(pixel + grid)
         away = ((place.point - starts) @ place.normal) / (ways @ place.normal)
         self._points = starts + away[:, None] * ways
         self._own = _Part.around(grey, pixel, HALF_PX + 1)
         self._shown = self._own.at(pixel + grid)[0]
-        self._finest = float(np.std(self._shown[np.isfinite(self._shown)]))
 
     def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Match | NoMatch:
         """Find the pick in another picture.
@@ -106,7 +103,7 @@ class Matcher:
         """
         if not np.isfinite(self._shown).all():
             return NoMatch(image=image, why="the pick is too close to the edge of its picture")
-        expected = np.stack([picture.project(point) for point in self._points])
+        expected = picture.project(self._points)
         middle = picture.project(self._place.point)
         if not np.isfinite(expected).all():
             return NoMatch(image=image, why="the picture does not see the spot")
@@ -155,16 +152,6 @@ class Matcher:
         return shifts[best], float(likeness[best]), float(others.max(initial=-1.0))
 
 
-def find_in_others(
-    matcher: Matcher,
-    images: Sequence[str],
-    picture: Callable[[str], RegisteredPicture],
-    grey: Callable[[str], Grey],
-) -> list[Match | NoMatch]:
-    """Find a pick in pictures, one after the other."""
-    return [matcher.find(image, grey(image), picture(image)) for image in images]
-
-
 class _Part:
     """A part of a picture as a quintic spline, with its slopes."""
 
@@ -173,8 +160,9 @@ class _Part:
         self._size = np.array(grey.shape[::-1])
         pixels = grey.astype(np.float64)
         self._plain = pixels
+        find: Any = ndimage
         self._spline = (
-            ndimage.spline_filter(pixels, order=_SPLINE, mode="mirror") if pixels.size else pixels
+            find.spline_filter(pixels, order=_SPLINE, mode="mirror") if pixels.size else pixels
         )
 
     @classmethod
@@ -193,8 +181,10 @@ class _Part:
         source = self._plain if order == 1 else self._spline
         at = place[inside, ::-1].T - 0.5
 
+        find: Any = ndimage
+
         def read(where: Array) -> Array:
-            values: Array = ndimage.map_coordinates(
+            values: Array = find.map_coordinates(
                 source, where, order=order, mode="mirror", prefilter=False
             )
             return values
@@ -251,8 +241,10 @@ def _fit(
         if np.abs(change[2:]).max() > _MOST_STRETCH or np.linalg.norm(change[:2]) > 2 * HALF_PX:
             return None
         if np.linalg.norm(step[:2]) < _SETTLED_PX:
-            return change[:2], _sigma(columns, weight, rest, inverse), float(
-                _correlations(shown, seen[:1], weight)[0]
+            return (
+                change[:2],
+                _sigma(columns, weight, rest, inverse),
+                float(_correlations(shown, seen[:1], weight)[0]),
             )
     return None
 
@@ -263,28 +255,8 @@ def _sigma(columns: Array, weight: Array, rest: Array, inverse: Array) -> float:
     terms = ((weight * rest)[:, None] * columns[:, :]).T.reshape(-1, side, side)
     fall = 1.0 - np.abs(np.arange(-_LAG_PX, _LAG_PX + 1)) / (_LAG_PX + 1)
     near = ndimage.convolve1d(terms, fall, axis=1, mode="constant")
-    near = ndimage.convolve1d(near, fall, axis=2, mode="constant").reshape(len(terms), -1)
-    middle = terms.reshape(len(terms), -1) @ near.T
+    flat = ndimage.convolve1d(near, fall, axis=2, mode="constant").reshape(len(terms), -1)
+    middle = terms.reshape(len(terms), -1) @ flat.T
     count = weight.sum() ** 2 / (weight**2).sum()
     covariance = inverse @ (0.5 * (middle + middle.T)) @ inverse * count / (count - len(terms))
     return float(np.sqrt(max(np.trace(covariance[:2, :2]) / 2, 0.0)))
-
-
-def affine_between(
-    first: RegisteredPicture, second: RegisteredPicture, point: Array, normal: Array
-) -> Array:
-    """(2, 2) change of the second picture's pixel with the first's, along a surface at a point."""
-    along = tangents(normal)
-    step = 1e-4 * float(np.linalg.norm(point - first.model_from_pinhole.translation))
-    slopes = [
-        np.stack(
-            [
-                (one.project(point + step * way) - one.project(point - step * way)) / (2 * step)
-                for way in along.T
-            ],
-            axis=1,
-        )
-        for one in (first, second)
-    ]
-    found: Array = slopes[1] @ np.linalg.inv(slopes[0])
-    return found

@@ -107,9 +107,7 @@ def _pick_of(match: Match, pick: Pick) -> Pick:
     )
 
 
-def _factor(
-    spot: Spot, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
-) -> float:
+def _factor(spot: Spot, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> float:
     """By which matches are worse than they state, at least 1."""
     off = residuals(spot.model, picks, cameras) / own_sigmas(picks)[:, None]
     spare = 2 * len(picks) - 3

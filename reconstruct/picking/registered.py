@@ -109,7 +109,8 @@ class RegisteredPictures:
 
     def warp(self, image: str) -> PinholeWarp:
         """The camera that took a picture."""
-        return list(self.warps.values())[self.camera[self.row(image)]]
+        warps: list[PinholeWarp] = list(self.warps.values())
+        return warps[int(self.camera[self.row(image)])]
 
     def picture(self, image: str) -> RegisteredPicture:
         """A picture by its name; see `row`."""

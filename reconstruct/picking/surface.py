@@ -145,8 +145,7 @@ class Surface:
         over = place.point + (share[:, None] * steps)[..., None] * ways[:, None]
         floor = dem.at(dem.height, over.reshape(-1, 3)[:, [1, 0]]).reshape(over.shape[:2])
         with np.errstate(invalid="ignore"):
-            found: NDArray[np.bool_] = (floor + over[..., 2] > clear).any(axis=1)
-        return found
+            return np.asarray((floor + over[..., 2] > clear).any(axis=1))
 
     @cached_property
     def _heights(self) -> tuple[float, float]:
@@ -166,9 +165,9 @@ class Surface:
     def _by_points(self, at: Array) -> SurfacePlace:
         if self._points is None or self._tree is None or len(self._points) < _NEIGHBOURS:
             raise ReconstructionError("the model has too few points to make a surface")
-        away, rows = self._tree.query(at, _NEIGHBOURS)
+        away, rows = (np.asarray(one) for one in self._tree.query(at, _NEIGHBOURS))
         near = self._points[rows]
-        usual = float(np.median(self._tree.query(near[:, :2], _NEIGHBOURS)[0][:, -1]))
+        usual = float(np.median(np.asarray(self._tree.query(near[:, :2], _NEIGHBOURS)[0])[:, -1]))
         if away[0] > _FARTHEST * usual:
             raise ReconstructionError(
                 f"no point of the model is near {at[0]:.3f} north, {at[1]:.3f} east"

@@ -127,7 +127,9 @@ def _save(
     more = [name for name in header if name not in names and (not names or name in wanted)]
     more += sorted(wanted - {*names, *more})
     first = records[0].text.rstrip("\r\n") if records else ""
-    lines = [mark + (",".join(([first] if first else []) + more) + end if more else records[0].text)]
+    lines = [
+        mark + (",".join(([first] if first else []) + more) + end if more else records[0].text)
+    ]
     left = dict(rows)
     names = [*names, *more]
     for record in records[1:]:

@@ -8,6 +8,7 @@ both (see `covariance_of_picks`).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -38,18 +39,25 @@ class RegisteredPicture:
     model_from_pinhole: RigidTransform
 
     def project(self, point: Array) -> Array:
-        """(2,) pixel of the picture as taken at which a point (3,) of the model is seen."""
-        seen = self.model_from_cam.inv().apply(point[None])
-        return np.asarray(self.warp.camera.project(seen)[0])
+        """Pixels (..., 2) of the picture as taken that show points (..., 3) of the model."""
+        turn, place = self._stands
+        return self.warp.camera.project((point - place) @ turn)
 
     def ray(self, pixel: Array) -> tuple[Array, Array]:
-        """Start and unit direction, (3,) each, in the model, of a pixel of the picture as taken."""
+        """Starts and unit directions, (..., 3), in the model, of pixels (..., 2) as taken."""
         start, way = self.warp.camera.unproject(pixel)
-        there = self.model_from_cam
-        return there.apply(start), there.rotation.apply(way)
+        turn, place = self._stands
+        return start @ turn.T + place, way @ turn.T
+
+    @cached_property
+    def _stands(self) -> tuple[Array, Array]:
+        """Rotation (3, 3) `model_from_cam`, and where the entrance pupil is, (3,)."""
+        pose = self.model_from_cam
+        return pose.rotation.as_matrix(), np.asarray(pose.translation)
 
     @property
     def model_from_cam(self) -> RigidTransform:
+        """The camera's own frame, whose origin is the entrance pupil, in the model."""
         return self.model_from_pinhole * self.warp.pinhole_from_cam
 
 
@@ -192,8 +200,7 @@ def own_sigmas(picks: Sequence[Pick]) -> Array:
 def gain_of(jacobian: Array, sigma: Array) -> Array:
     """(3, 2 N) how the point moves with pixels of these sigmas (2 N,) and slopes (2 N, 3)."""
     weighted = jacobian / (sigma**2)[:, None]
-    gain: Array = np.linalg.solve(jacobian.T @ weighted, weighted.T)
-    return gain
+    return np.asarray(np.linalg.solve(jacobian.T @ weighted, weighted.T), np.float64)
 
 
 def covariance_of_picks(picks: Sequence[Pick], jacobian: Array, factor: float = 1.0) -> Array:
@@ -208,7 +215,7 @@ def covariance_of_picks(picks: Sequence[Pick], jacobian: Array, factor: float = 
         factor: by which the variances of own noise are larger than stated.
     """
     own, slopes = own_sigmas(picks), jacobian.reshape(-1, 2, 3)
-    found = np.diag(np.repeat(factor * own**2, 2))
+    found: Array = np.diag(np.repeat(factor * own**2, 2)).astype(np.float64)
     along = np.linalg.svd(jacobian)[2][:2].T
     in_plane = slopes @ along
     row = {pick.image: n for n, pick in enumerate(picks)}
@@ -229,7 +236,9 @@ def covariance_of_picks(picks: Sequence[Pick], jacobian: Array, factor: float = 
     return found
 
 
-def residuals(point: Array, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> Array:
+def residuals(
+    point: Array, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
+) -> Array:
     """(N, 2) pixels at which pictures see a point minus where it was picked."""
     return np.stack([cameras[p.image].project(point) - [p.x_px, p.y_px] for p in picks])
 
@@ -279,9 +288,13 @@ def _fit(
         seen = np.stack([cameras[p.image].project(point) for p in picks])
         return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
 
+    def weighted(x: Array) -> Array:
+        found: Array = weight * misses(x)
+        return found
+
     found = least_squares(
-        lambda x: weight * misses(x), np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12, ftol=1e-12, gtol=1e-12,
-        jac="3-point",
+        weighted, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
+        ftol=1e-12, gtol=1e-12, jac="3-point",
     )  # fmt: skip
     jacobian = np.empty((2 * len(picks), 3))
     for axis in range(3):

@@ -82,7 +82,9 @@ class _SavePicks(_Asked):
 
 class _SaveControl(_Asked):
     token: str
-    rows: Annotated[list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)]
+    rows: Annotated[
+        list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)
+    ]
     names: Annotated[list[tuple[Name, Name]], Field(max_length=5000)] = []
 
 
@@ -198,9 +200,7 @@ class _Tab:
     def _place(self, model: _Model, call: Call) -> SurfacePlace:
         if "image" not in call.query:
             return model.surface.below(call.number("n"), call.number("e"))
-        return self._met(
-            model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5
-        )
+        return self._met(model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5)
 
     @staticmethod
     def _met(model: _Model, image: str, x_px: float, y_px: float) -> SurfacePlace:
@@ -224,7 +224,7 @@ class _Tab:
         place = self._met(model, pick.image, pick.x_px, pick.y_px)
         images = asked.images
         if images is None:
-            images = [s.image for s in _unhidden(model, place)[0]][:_MOST_SEEING // 3]
+            images = [s.image for s in _unhidden(model, place)[0]][: _MOST_SEEING // 3]
         for image in images:
             model.pictures.row(image)
         found = refine(pick, images, place, model.pictures.picture, self._taken.grey)
@@ -260,7 +260,9 @@ class _Tab:
             about = points.setdefault(
                 pick.point,
                 {
-                    "name": pick.point, "picks": [], "why": lost.get(pick.point, ""),
+                    "name": pick.point,
+                    "picks": [],
+                    "why": lost.get(pick.point, ""),
                     "coded": number >= len(own or []),
                     "spot": None if spot is None else _spot_json(spot),
                 },
@@ -268,7 +270,8 @@ class _Tab:
             left_out = spot is not None and pick.image in spot.left_out
             about["picks"].append(
                 {
-                    **_pick_json(pick), "left_out": left_out,
+                    **_pick_json(pick),
+                    "left_out": left_out,
                     "residual": None if miss is None else miss.tolist(),
                 }
             )
@@ -290,7 +293,7 @@ class _Tab:
         records = self._taken.records()
         strange = [p.image for p in asked.picks if p.image not in records]
         if strange:
-            raise WorkspaceError(f"{strange[0]!r} is no picture of this survey")
+            raise AliceError(f"{strange[0]!r} is no picture of this survey")
         picks = [one.pick for one in asked.picks]
         return self._written(
             PICKS_FILE, lambda path: save_picks(path, asked.token, picks, set(asked.points))
@@ -355,7 +358,9 @@ class _Tab:
         asked, model = call.read(_Scale), self._read_model()
         ends = [[p.pick for p in one] for one in (asked.first, asked.second)]
         places = [model.lengths.spot(picks).model for picks in ends]
-        names = ["+".join(f"{p.image}:{p.x},{p.y}" for p in one) for one in (asked.first, asked.second)]
+        names = [
+            "+".join(f"{p.image}:{p.x},{p.y}" for p in one) for one in (asked.first, asked.second)
+        ]
         with self._writing, self._studio.only_writer():
             line = note_scale(
                 self._studio.workspace.folder, (names[0], names[1]), places[0], places[1],
@@ -369,12 +374,14 @@ class _Tab:
     def _written(self, name: str, write: Callable[[Any], str]) -> dict[str, Any]:
         path = self._studio.workspace.folder / name
         if path.is_symlink():
-            raise WorkspaceError(f"{name} is a link: the studio changes files of the survey alone")
+            raise AliceError(f"{name} is a link: the studio changes files of the survey alone")
         with self._writing, self._studio.only_writer():
             try:
                 token = write(path)
             except ChangedTableError as error:
                 raise StaleError(str(error)) from None
+            except WorkspaceError as error:  # a row of the page, or of the file by its line
+                raise AliceError(str(error)) from None
         self._studio.publish("picks", {"file": name, "token": token})
         return {"token": token}
 

@@ -28,8 +28,8 @@ export function controlRows(rows, preview, remove) {
     ? ["north_m", "east_m", "depth_m", "latitude_deg", "longitude_deg", "easting_m", "northing_m", "height_m"]
       .filter((key) => row[key]).map((key) => row[key]).join(", ")
     : row.kind === "bar" ? row.from + " to " + row.to + ": " + row.length_m + " m" : row.length_m + " m");
-  return table("What is known; residuals in mm (points: north, east, down)", ["Name", "Use", "Known", "Residual", "Change"],
-    rows.map((row) => [row.name, row.kind + ", " + row.use, what(row), fitOf(row, preview),
+  return table("What is known; residuals in mm (points: north, east, down)", ["Name", "Known", "Residual", "Change"],
+    rows.map((row) => [row.name, row.kind + ", " + row.use + ": " + what(row), fitOf(row, preview),
       button("Delete", () => remove(row), {"aria-label": "Delete " + row.kind + " " + row.name})]));
 }
 

@@ -38,7 +38,7 @@ export class PictureView {
     }});
     this.choice = el("label", {class: "use", hidden: true}, this.check, "Use this pick");
     this.card = el("section", {class: "picture-card", "aria-label": seen.name},
-      this.box, el("h4", {}, seen.name), this.about, this.text,
+      this.box, el("h2", {}, seen.name), this.about, this.text,
       this.choice);
   }
 
@@ -89,6 +89,7 @@ export class PictureView {
   draw() {
     if (!this.map) return;
     this.crosses = this.crosses.filter(([drawn]) => !drawn.classList.contains("picked") || drawn.remove());
+    this.crosses.forEach(([drawn]) => drawn.toggleAttribute("hidden", Boolean(this.pick)));
     if (this.pick) this.crosses.push([cross("picked"), place(this.pick.x, this.pick.y)]);
     this.settle();
     if (!this.pick) return;
@@ -159,6 +160,7 @@ export class Wall {
     this.clear();
     this.title.textContent = title;
     this.root.hidden = false;
+    this.root.scrollIntoView({block: "nearest"});
     this.waiting = pictures.slice();
     this.showMore(first);
   }
