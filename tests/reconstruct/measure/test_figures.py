@@ -13,6 +13,7 @@ from scipy.special import ellipe
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
@@ -117,7 +118,7 @@ def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:
     cells, rng = grid(1.0, 0.01), np.random.default_rng(5)
     for sigma in (0.001, 0.002):
         drawn = Drawn(tmp_path, cells, lambda x, y: 0.0 * x, Sigmas(own=sigma))
-        noise = 2 * sigma**2 * (1 - np.exp(-1.0)) / 0.01**2
+        noise = 2 * sigma**2 * float(1 - own_correlation(np.array(1.0))) / 0.01**2
         rough, line = [], []
         for _ in range(4):
             surface, _ = drawn.draw(rng)
