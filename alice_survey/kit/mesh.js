@@ -6,9 +6,9 @@ const FILLED = 0.9;
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
 /* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where it
-   is seen from, `lost` is called when the browser takes its graphics memory back. Returns what moves
-   it, `pick`: the point under a pixel of the canvas or null, and `mark`: show some points and the
-   lines between. */
+   is seen from, `lost` is called when the browser takes its graphics memory back. Returns `pick`,
+   which gives the point under a pixel of the canvas or null, and `mark`, which shows some points and
+   the lines between. */
 async function startMesh(root, canvas, bytes, {told, lost}) {
   const view = canvas.parentElement;
   const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
@@ -169,7 +169,7 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     reset();
   }).observe(view);
   canvas.addEventListener("webglcontextlost", lost);
-  return {pick, mark, reset, draw, vector: (x, y, z) => new three.Vector3(x, y, z)};
+  return {pick, mark};
 }
 
 /* What the page holds, or its server gives. */

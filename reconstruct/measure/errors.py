@@ -3,10 +3,12 @@
 `sigma.tif` holds both together, a cell at a time, so that a sum over cells needs more: how errors
 go together. Poses and calibration move all of a surface, smoothly, by the motions that
 `sparse/covariance.npz` states; a figure that hardly changes when all of its points move together
-is hardly touched by them. What the dense stage adds is a cell's own, and fades within about a
-cell: windows that are compared have a Gaussian weight of 1.25 px (`dense.refine_depth`), so that
-errors of pixels at a distance d correlate by exp(-d² / (2 * 1.25 px)²), and a cell is about 2.5 px
-wide (`dense.scales.CELL_PIXELS`).
+is hardly touched by them. What the dense stage adds is a cell's own, and fades within about two
+cells. It is white noise of pixels under two kernels: the Gaussian window of 1.25 px in which
+pictures are compared (`dense.refine_depth`), half a cell where a cell is 2.5 px wide
+(`dense.scales.CELL_PIXELS`), and the bilinear shares by which points count for the cells around
+them (`dense.dem.cells_over`), whose variance is a sixth of a cell. Noise under a kernel of variance
+s² correlates by exp(-d² / 4s²), here 4s² = 4 (1/4 + 1/6) cells².
 """
 
 from collections.abc import Callable
@@ -31,14 +33,16 @@ _PATCHES = 3
 """The same where only the size of the poses' part is known: it is shared within patches."""
 _COMPANY = 8
 """Points around a node of which the mean counts."""
-REACH_CELLS = 2
-"""Cells from which on own errors do not go together: exp(-9)."""
+REACH_CELLS = 3
+"""Cells up to which own errors go together: by 0.005 there."""
+_OWN_KERNEL = 1 / 4 + 1 / 6
+"""Variance of the kernels under which own errors are white noise, in cells."""
 
 
 def own_correlation(cells: Array) -> Array:
     """Correlation of own errors at a distance in cells."""
-    fading: Array = np.where(cells < REACH_CELLS + 0.9, np.exp(-(cells**2)), 0.0)
-    return fading
+    fading: Array = np.exp(-(cells**2) / (4 * _OWN_KERNEL))
+    return np.where(cells < REACH_CELLS + 0.5, fading, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -198,7 +202,7 @@ def shared_errors(
         frame: of its model.
         bounds: west, south, east and north of its rasters.
     """
-    notes = ["counted: own errors of cells, which go together within about a cell"]
+    notes = ["counted: own errors of cells, which go together within about two cells"]
     path = workspace / "sparse" / "covariance.npz"
     shared = read_uncertainty(path).shared if path.is_file() else None
     if shared is not None:

@@ -40,7 +40,7 @@ Base = float | Literal["rim"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Block:
+class _GridPart:
     """A part of the grid, with cells around it."""
 
     height: Array
@@ -63,7 +63,7 @@ class Quadrat:
     figures: tuple[Measured, ...]
 
 
-class _Region:
+class _PolygonOnGrid:
     """A polygon on a surface."""
 
     def __init__(self, surface: MeasuredSurface, polygon: Any) -> None:
@@ -89,7 +89,7 @@ class _Region:
     def _cut(first: float, last: float, count: int) -> tuple[int, int]:
         return max(0, math.floor(first) - 1), min(count, math.ceil(last) + 2)
 
-    def blocks(self) -> Iterator[_Block]:
+    def blocks(self) -> Iterator[_GridPart]:
         """Parts of the grid that cover it, each cell in the core of one."""
         for top in range(*self._rows, _BLOCK_CELLS):
             for left in range(*self._columns, _BLOCK_CELLS):
@@ -97,7 +97,7 @@ class _Region:
                 columns = min(_BLOCK_CELLS, self._columns[1] - left)
                 yield self._block(top, left, rows, columns)
 
-    def _block(self, top: int, left: int, rows: int, columns: int) -> _Block:
+    def _block(self, top: int, left: int, rows: int, columns: int) -> _GridPart:
         grid = self.surface.grid
         row, column = top - _RIM, left - _RIM
         shape = (rows + 2 * _RIM, columns + 2 * _RIM)
@@ -109,7 +109,7 @@ class _Region:
         inner[core] = weight[core]
         y, x = np.mgrid[: shape[0], : shape[1]]
         east, north = grid.east_of(x + column + 0.5), grid.north_of(y + row + 0.5)
-        return _Block(
+        return _GridPart(
             height=height, own=own, weight=inner, all_weight=weight,
             x=east - self.middle[0], y=north - self.middle[1], core=core,
         )  # fmt: skip
@@ -130,7 +130,7 @@ class _Region:
         found: Array = share
         return found
 
-    def add(self, slopes: FigureSlopes, block: _Block, by_motion: Array) -> None:
+    def add(self, slopes: FigureSlopes, block: _GridPart, by_motion: Array) -> None:
         """Add a block's derivatives (rows, columns, 3)."""
         own = own_variance(by_motion[..., 2], block.own, block.core)
         east, north = (
@@ -140,7 +140,7 @@ class _Region:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Moments:
+class _PolygonMoments:
     """Sums over the known squares of a polygon, about its middle."""
 
     share: float
@@ -159,12 +159,12 @@ class _Moments:
         return np.asarray(np.linalg.solve(self.second, self.heights), dtype=np.float64)
 
 
-def _upright(block: _Block) -> Array:
+def _upright(block: _GridPart) -> Array:
     """(rows, columns, 3) 1, x and y of cells."""
     return np.stack([np.ones_like(block.x), block.x, block.y], axis=-1)
 
 
-def _moments(region: _Region) -> _Moments:
+def _moments(region: _PolygonOnGrid) -> _PolygonMoments:
     cell = region.surface.grid.cell
     first, second, heights = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
     for block in region.blocks():
@@ -175,7 +175,7 @@ def _moments(region: _Region) -> _Moments:
         used = weight > 0
         second += (weight[used, None] * upright[used]).T @ upright[used]
         heights += (weight[used] * block.height[used]) @ upright[used]
-    return _Moments(
+    return _PolygonMoments(
         share=first[0] / region.polygon.area, area=first[0], first=first, second=second,
         heights=heights,
     )  # fmt: skip
@@ -198,7 +198,7 @@ def measure_polygon(
         ReconstructionError: it crosses itself, is too large, or no surface is known in it.
     """
     places = as_places(vertices)
-    region = _Region(surface, polygon_of(places))
+    region = _PolygonOnGrid(surface, polygon_of(places))
     moments = _moments(region)
     if not moments.area > 0:
         raise ReconstructionError("no surface is known within the polygon: draw it on the surface")
@@ -209,8 +209,8 @@ def measure_polygon(
             "rugosity are of that part"
         )
     ring = _ring(surface, places)
-    rim = None if base is None else _Rim.of(surface, region, base)
-    sums = _Sums(region, moments, rim)
+    rim = None if base is None else _VolumePlane.of(surface, region, base)
+    sums = _PolygonSums(region, moments, rim)
     figures = [
         of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
         figure(surface, "surface_area", "Area of the surface", sums.surface, sums.by_surface, 2),
@@ -256,7 +256,7 @@ def polygon_of(places: Array) -> Any:
     return polygon
 
 
-class _Rim:
+class _VolumePlane:
     """The plane of a volume."""
 
     def __init__(self, plane: Array, samples: Samples | None, by_height: Array) -> None:
@@ -265,7 +265,7 @@ class _Rim:
         self._samples, self._by_height = samples, by_height
 
     @classmethod
-    def of(cls, surface: MeasuredSurface, region: _Region, base: Base) -> "_Rim":
+    def of(cls, surface: MeasuredSurface, region: _PolygonOnGrid, base: Base) -> "_VolumePlane":
         """At a height, or fitted to the rim."""
         if base != "rim":
             return cls(np.array([float(base), 0.0, 0.0]), None, np.zeros((3, 0)))
@@ -295,10 +295,12 @@ class _Rim:
         slopes.add(self._samples.places, motion, self._samples.own_variance(motion))
 
 
-class _Sums:
+class _PolygonSums:
     """All sums over a polygon, in one pass."""
 
-    def __init__(self, region: _Region, moments: _Moments, rim: _Rim | None) -> None:
+    def __init__(
+        self, region: _PolygonOnGrid, moments: _PolygonMoments, rim: _VolumePlane | None
+    ) -> None:
         surface = self._surface = region.surface
         errors, cell = surface.errors, surface.grid.cell
         self._moments, self._rim = moments, rim

@@ -26,6 +26,7 @@ RASTERS = (
 )  # fmt: skip
 """Rasters that a place has values in."""
 _PICKING = "not counted: how well a place was picked on the map"
+_RESOLVED = "not counted: relief finer than about two cells, which the surface smooths"
 _WINDOW_CELLS = 1024
 """Cells along the side of what is read at once."""
 
@@ -74,7 +75,7 @@ class Samples:
         cells, cell_of = np.unique(self.cells[used].reshape(-1, 2), axis=0, return_inverse=True)
         kick = (slopes[used, None] * self.weights[used] * self.own[used]).ravel()
         kicks = np.bincount(cell_of.ravel(), kick, minlength=len(cells))
-        i, j = KDTree(cells).query_pairs(REACH_CELLS + 0.9, output_type="ndarray").T
+        i, j = KDTree(cells).query_pairs(REACH_CELLS + 0.5, output_type="ndarray").T
         fading = own_correlation(np.linalg.norm(cells[i] - cells[j], axis=1))
         return float(kicks @ kicks + 2.0 * (kicks[i] * kicks[j] * fading).sum())
 
@@ -112,7 +113,7 @@ class MeasuredSurface:
             grid=grid,
             frame=frame,
             plane=plane,
-            errors=replace(errors, notes=(*errors.notes, _PICKING)),
+            errors=replace(errors, notes=(*errors.notes, _PICKING, _RESOLVED)),
         )
 
     @property
