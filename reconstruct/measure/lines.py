@@ -103,7 +103,8 @@ def measure_points(
     given = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(given) < 2:
         raise ReconstructionError("a line needs two points")
-    there = surface.at(given[:, :2])
+    # the mesh is painted by other pictures than the mosaic, from about as far aside
+    there = surface.picked(given[:, :2])
     apart = np.abs(there.height - given[:, 2]) > surface.grid.cell + 3.0 * there.sigma
     unlike = int((apart | ~np.isfinite(there.height)).sum())
     notes = () if not unlike else (
