@@ -14,13 +14,13 @@ from starlette.responses import RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError, WorkspaceError, known_fault
 from alice_survey.studio.chart import CHART, server_of
 from alice_survey.studio.endpoints.base import (
     Call,
     Content,
     Endpoint,
-    StaleError,
     Studio,
     json_text,
 )

@@ -1,6 +1,5 @@
 """`annotations.json` of a workspace: read, changed by one writer at a time, seen by a GIS."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from filelock import FileLock, Timeout
 from pydantic import Field
 
 from alice_survey.base.artefacts import JsonRecord, json_values
+from alice_survey.base.edited_files import check_token, content_of, content_token
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PlaceRecord
@@ -20,10 +20,6 @@ from reconstruct.views.model import WorldFrame, datum_of
 FILE = "annotations.json"
 _WAIT_S = 10.0
 _SAME_DEG = 1e-9
-
-
-class OtherVersionError(WorkspaceError):
-    """The file was changed by another writer since it was read."""
 
 
 class AnnotationsRecord(JsonRecord):
@@ -46,11 +42,7 @@ class AnnotationsRecord(JsonRecord):
 
 def token_of(workspace: Path) -> str:
     """A token of what the file holds; empty where there is none."""
-    try:
-        content = (workspace / FILE).read_bytes()
-    except FileNotFoundError:
-        return ""
-    return hashlib.blake2b(content, digest_size=12).hexdigest()
+    return content_token(content_of(workspace / FILE))
 
 
 def read_annotations(workspace: Path, frame: WorldFrame | None = None) -> AnnotationSet:
@@ -92,15 +84,12 @@ def change_annotations(
         The token of what was written.
 
     Raises:
-        OtherVersionError: another writer came first.
+        StaleError: another writer came first.
         WorkspaceError: the file is damaged, cannot be written, or is being written too long.
     """
     try:
         with FileLock(workspace / f".{FILE}.lock", timeout=_WAIT_S):
-            if token is not None and token != token_of(workspace):
-                raise OtherVersionError(
-                    f"{FILE} was changed by another writer meanwhile: load the page again"
-                )
+            check_token(FILE, content_of(workspace / FILE), token)
             values = change(read_annotations(workspace, frame))
             AnnotationsRecord(
                 frame="ned" if frame is None else frame.name,

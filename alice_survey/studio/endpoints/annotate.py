@@ -9,17 +9,17 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from alice_survey.base.config import Config
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 from alice_survey.report.colours import MOSAIC_FILE
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from reconstruct.annotations.backdrops import backdrops_of
 from reconstruct.annotations.formats.registry import FORMATS
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, InPicture, OnPlane, Projector
 from reconstruct.annotations.store import (
-    OtherVersionError,
     change_annotations,
     read_annotations,
     token_of,
@@ -27,7 +27,7 @@ from reconstruct.annotations.store import (
 from reconstruct.annotations.table import HEADER as COLUMNS
 from reconstruct.annotations.table import (
     KnownGround,
-    Measured,
+    MeasuredMark,
     cells,
     ground_of,
     measured,
@@ -48,9 +48,7 @@ _KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8",
           ".zip": "application/zip"}  # fmt: skip
 
 
-class _Edit(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Edit(Config):
     token: str
     put: list[Annotation] = Field(default_factory=list)
     """Annotations that are new, or take the place of others of their ids."""
@@ -111,7 +109,7 @@ class _Annotate:
                 raise AliceError(f"the change: {_reason(error)}") from None
 
         return self._changed(
-            lambda: (change_annotations(self._folder, frame_of(self._folder), made, wanted.token),)
+            change_annotations(self._folder, frame_of(self._folder), made, wanted.token)
         )
 
     def take(self, call: Call) -> dict[str, Any]:
@@ -119,16 +117,12 @@ class _Annotate:
         format_name, token = call.query.get("format", ""), call.query.get("token", "")
         backdrops = backdrops_of(self._folder)
         return self._changed(
-            lambda: import_data(self._folder, call.body, format_name, backdrops, token)
+            *import_data(self._folder, call.body, format_name, backdrops, token)[:2]
         )
 
-    def _changed(self, work: Any) -> dict[str, Any]:
-        try:
-            token, *more = work()
-        except OtherVersionError as error:
-            raise StaleError(str(error)) from None
+    def _changed(self, token: str, text: str = "") -> dict[str, Any]:
         self._studio.publish("annotations", {"token": token})
-        return {"token": token, "text": more[0] if more else ""}
+        return {"token": token, "text": text}
 
     def give(self, call: Call) -> Content:
         """The annotations as a file of a tool; several files as a ZIP."""
@@ -208,7 +202,7 @@ class _Annotate:
         return Content(data=data, kind="image/webp", tag=f"{token}-{left}-{top}-{width}-{height}")
 
 
-def _mark(mark: Measured) -> dict[str, Any]:
+def _mark(mark: MeasuredMark) -> dict[str, Any]:
     middle = mark.geometry.centroid
     shape = mark.shape.model_dump(mode="json") if mark.annotation.image is not None else None
     return {

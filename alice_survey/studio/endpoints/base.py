@@ -25,10 +25,6 @@ _MOST_WAITING = 1000
 """Events that a page may be behind; a slower one misses the oldest."""
 
 
-class StaleError(AliceError):
-    """What a page wants to change is no longer what it has seen."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Content:
     """An answer that is not JSON."""

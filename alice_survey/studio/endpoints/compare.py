@@ -17,17 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 import alice_survey
+from alice_survey.base.config import Config
 from alice_survey.base.contents import shown
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Datum
 from alice_survey.base.run.interrupts import for_other_programs
 from alice_survey.kit.document import PictureLayer
 from alice_survey.report.colours import change_rasters
 from alice_survey.report.held import Held
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.studio.layers import ChangedError, Layers
 from alice_survey.studio.paths import Workspace
 from reconstruct.evaluate.elevation import enu_from_enu
@@ -41,9 +43,7 @@ _ROOT = Path(alice_survey.__file__).parents[1]
 _CHANGED = "the survey was worked on meanwhile: choose it again"
 
 
-class _Named(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Named(Config):
     path: str = Field(min_length=1, max_length=4000)
 
 

@@ -12,10 +12,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from alice_survey.base.config import Config
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError, NavigationError
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from missions.exports.options import options_of
 from missions.exports.registry import format_names
 from missions.exports.write import write_exports
@@ -41,23 +43,17 @@ for _bits in range(1, 8):
     )  # fmt: skip
 
 
-class _Ask(BaseModel):
-    """A request of the page; an unknown field is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class _Open(_Ask):
+class _Open(Config):
     log: str
     replay: float | None = Field(None, gt=0, le=1000)
     dive: int | None = Field(None, ge=1)
 
 
-class _Minutes(_Ask):
+class _Minutes(Config):
     minutes: float | None = Field(None, gt=0, le=6000)
 
 
-class _Number(_Ask):
+class _Number(Config):
     number: int
 
 

@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 import rasterio
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from alice_survey.base.config import Config
 from alice_survey.base.errors import AliceError
 from alice_survey.base.records import MeshRecord
 from alice_survey.report.colours import number_rasters
@@ -40,17 +41,13 @@ _OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", 
 Place = tuple[float, float]
 
 
-class _Asked(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class AskedProfile(_Asked):
+class AskedProfile(Config):
     """A line on the surface."""
 
     places: list[Place] = Field(min_length=2, max_length=_MOST_PLACES)
 
 
-class AskedMeasure(_Asked):
+class AskedMeasure(Config):
     """A line, points in space, or a polygon."""
 
     kind: Literal["line", "points", "polygon"]
@@ -61,7 +58,7 @@ class AskedMeasure(_Asked):
     """Side of quadrats within a polygon."""
 
 
-class ExportedFigure(_Asked):
+class ExportedFigure(Config):
     """A figure as it was measured."""
 
     name: str
@@ -73,7 +70,7 @@ class ExportedFigure(_Asked):
     unit: str
 
 
-class ExportedMeasure(_Asked):
+class ExportedMeasure(Config):
     """A measurement as the page keeps it."""
 
     name: str = Field(max_length=200)
@@ -83,14 +80,14 @@ class ExportedMeasure(_Asked):
     notes: list[str] = Field(default=[], max_length=20)
 
 
-class AskedExport(_Asked):
+class AskedExport(Config):
     """Measurements to write."""
 
     form: Literal["csv", "geojson"]
     measures: list[ExportedMeasure] = Field(min_length=1, max_length=_MOST_MEASURES)
 
 
-class _Model:
+class _ModelTab:
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
         self._cached = lru_cache(maxsize=1)(self._opened)
@@ -265,7 +262,7 @@ class _Model:
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """Of the model."""
-    model = _Model(studio)
+    model = _ModelTab(studio)
     return (
         Endpoint(path="/api/model/about", answer=model.about),
         Endpoint(path="/api/model/value", answer=model.value),

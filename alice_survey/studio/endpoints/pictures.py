@@ -5,14 +5,15 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from alice_survey.base.artefacts import read_csv
+from alice_survey.base.config import Config
 from alice_survey.base.errors import AliceError, ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import ControlRecord, MappingRecord
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.studio.taken_pictures import TILE_PX, TakenPictures, levels_of
 from reconstruct.picking.lengths import Lengths, spot_residuals
 from reconstruct.picking.preview import preview_control
@@ -29,7 +30,6 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.control_tables import (
-    ChangedTableError,
     save_control,
     save_picks,
     table_token,
@@ -46,11 +46,7 @@ Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 
-class _Asked(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class _Pick(_Asked):
+class _AskedPick(Config):
     """Pixels count from 0 at the middle of the first, as in `picks.csv`."""
 
     image: Name
@@ -68,42 +64,42 @@ class _Pick(_Asked):
         )  # fmt: skip
 
 
-class _Refine(_Asked):
-    pick: _Pick
+class _Refine(Config):
+    pick: _AskedPick
     images: Annotated[list[Name], Field(max_length=_MOST_SEEING)] | None = None
     """The best of those that see the spot where they are not named."""
 
 
-class _SavePicks(_Asked):
+class _SavePicks(Config):
     token: str
     points: Annotated[list[Name], Field(max_length=1000)]
-    picks: Annotated[list[_Pick], Field(max_length=20_000)]
+    picks: Annotated[list[_AskedPick], Field(max_length=20_000)]
 
 
-class _SaveControl(_Asked):
+class _SaveControl(Config):
     token: str
     rows: Annotated[
         list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)
     ]
-    names: Annotated[list[tuple[Name, Name]], Field(max_length=5000)] = []
+    names: Annotated[tuple[tuple[Name, Name], ...], Field(max_length=5000)] = ()
 
 
-class _Spot(_Asked):
-    picks: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
+class _AskedSpot(Config):
+    picks: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
 
 
-class _Ends(_Asked):
+class _AskedEnds(Config):
     """Two spots, each by the picks of it."""
 
-    first: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
-    second: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
+    first: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
+    second: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
 
 
-class _Scale(_Ends):
+class _AskedScale(_AskedEnds):
     length_m: Annotated[float, Field(gt=0)]
 
 
-class _Model:
+class _OpenModel:
     """A registered model, as long as its files are what they were."""
 
     def __init__(self, studio: Studio) -> None:
@@ -119,7 +115,7 @@ class _Tab:
         self._studio = studio
         self._taken = TakenPictures(studio.workspace)
         self._lock, self._writing = threading.Lock(), threading.Lock()
-        self._model: tuple[tuple[str, ...], _Model] | None = None
+        self._model: tuple[tuple[str, ...], _OpenModel] | None = None
 
     # ---- Pictures ----
 
@@ -138,7 +134,7 @@ class _Tab:
             ],
         }
 
-    def _about(self, record: ImageRecord, model: _Model | None) -> dict[str, Any]:
+    def _about(self, record: ImageRecord, model: _OpenModel | None) -> dict[str, Any]:
         place = None
         if model is not None and record.image in model.pictures:
             place = model.pictures.centres[model.pictures.row(record.image)].tolist()
@@ -197,13 +193,13 @@ class _Tab:
             ],
         }  # fmt: skip
 
-    def _place(self, model: _Model, call: Call) -> SurfacePlace:
+    def _place(self, model: _OpenModel, call: Call) -> SurfacePlace:
         if "image" not in call.query:
             return model.surface.below(call.number("n"), call.number("e"))
         return self._met(model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5)
 
     @staticmethod
-    def _met(model: _Model, image: str, x_px: float, y_px: float) -> SurfacePlace:
+    def _met(model: _OpenModel, image: str, x_px: float, y_px: float) -> SurfacePlace:
         size = model.pictures.warp(image).size_px
         if not (0 <= x_px <= size[0] and 0 <= y_px <= size[1]):
             raise ReconstructionError(
@@ -325,7 +321,7 @@ class _Tab:
 
     def spot(self, call: Call) -> dict[str, Any]:
         """The spot that picks show and how far each misses it; nothing is written."""
-        asked, model = call.read(_Spot), self._read_model()
+        asked, model = call.read(_AskedSpot), self._read_model()
         picks = [p.pick for p in asked.picks]
         found = model.lengths.spot(picks)
         off = spot_residuals({p.point: found for p in picks}, picks, model.pictures)
@@ -342,7 +338,7 @@ class _Tab:
 
     def length(self, call: Call) -> dict[str, Any]:
         """The distance between two spots and its sigma; nothing is written."""
-        asked, model = call.read(_Ends), self._read_model()
+        asked, model = call.read(_AskedEnds), self._read_model()
         with model.lock:
             found = model.lengths.between(
                 [p.pick for p in asked.first], [p.pick for p in asked.second]
@@ -355,7 +351,7 @@ class _Tab:
 
     def scale(self, call: Call) -> dict[str, Any]:
         """Note a known length in `scale.json`."""
-        asked, model = call.read(_Scale), self._read_model()
+        asked, model = call.read(_AskedScale), self._read_model()
         ends = [[p.pick for p in one] for one in (asked.first, asked.second)]
         places = [model.lengths.spot(picks).model for picks in ends]
         names = [
@@ -378,8 +374,6 @@ class _Tab:
         with self._writing, self._studio.only_writer():
             try:
                 token = write(path)
-            except ChangedTableError as error:
-                raise StaleError(str(error)) from None
             except WorkspaceError as error:  # a row of the page, or of the file by its line
                 raise AliceError(str(error)) from None
         self._studio.publish("picks", {"file": name, "token": token})
@@ -394,7 +388,7 @@ class _Tab:
     def _has_model(self) -> bool:
         return all(self._studio.workspace.has(path) for path in _MODEL)
 
-    def _read_model(self) -> _Model:
+    def _read_model(self) -> _OpenModel:
         workspace = self._studio.workspace
         if not self._has_model():
             raise AliceError("no model yet: run 'alice-survey reconstruct' first")
@@ -402,11 +396,11 @@ class _Tab:
             dense = [p for p in ("dense/dem.tif",) if workspace.has(p)]
             tokens = tuple(workspace.token(path) for path in (*_MODEL, *dense))
             if self._model is None or self._model[0] != tokens:
-                self._model = tokens, _Model(self._studio)
+                self._model = tokens, _OpenModel(self._studio)
             return self._model[1]
 
 
-def _unhidden(model: _Model, place: SurfacePlace) -> tuple[list[Sight], int]:
+def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]:
     """Pictures that see a place with nothing between, and how many it is hidden from."""
     found = model.pictures.seeing(place.point, place.normal)[: 4 * _MOST_SEEING]
     centres = np.array([model.pictures.centres[model.pictures.row(s.image)] for s in found])

@@ -1,7 +1,6 @@
 """The tab Plan: settings and shapes as they are, planned again while they change, and saved."""
 
 import base64
-import hashlib
 import io
 import math
 import tempfile
@@ -20,13 +19,14 @@ from pydantic_core import to_json
 
 from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
+from alice_survey.base.edited_files import check_token, content_of, content_token
 from alice_survey.base.errors import AliceError, ConfigError, PlanError, collected_by, heard
 from alice_survey.base.executor import local_executor
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
 from alice_survey.base.trajectory import read_columns, read_track
 from alice_survey.kit.document import PictureLayer
 from alice_survey.stages import spec
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.studio.newest import Newest, SupersededError
 from alice_survey.studio.paths import RefusedError
 from alice_survey.studio.setting_limits import setting_limits
@@ -54,10 +54,6 @@ _MOST_MOMENTS = 4000
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 _JSON = "application/json"
-_CHANGED = (
-    "survey.toml was changed meanwhile, by another page or by hand: load it again; what you "
-    "changed here is kept in the page"
-)
 
 
 class PlanRequest(Config):
@@ -112,7 +108,7 @@ class _PlanTab:
             text = data.decode("utf-8")
         except UnicodeDecodeError:
             raise ConfigError(f"{self.path}: is not text") from None
-        return _Settings(text, hashlib.sha256(data).hexdigest()[:32])
+        return _Settings(text, content_token(data))
 
     def draft(self, request: PlanRequest) -> Draft:
         """The settings with a page's changes."""
@@ -259,8 +255,7 @@ class _PlanTab:
         folder = self.studio.workspace.folder
         with self.saving, _quiet():
             with self.studio.only_writer():
-                if request.token != self.settings().token:
-                    raise StaleError(_CHANGED)
+                check_token(SETTINGS, content_of(self.path), request.token or "")
                 draft = self.draft(request)
                 if not request.token:
                     init_survey(folder)
