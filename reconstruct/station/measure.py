@@ -23,9 +23,10 @@ from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.rig import Rig, read_rig
 from camera_calib.triangulate import nearest_to_rays
-from reconstruct.evaluate.elevation import Elevation, read_elevation
+from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.measure.errors import SharedErrors, shared_errors
 from reconstruct.measure.figures import polygon_area, polyline, slopes_of
+from reconstruct.picking.surface import shown_places
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.placing.picked_points import RegisteredPicture
 from reconstruct.planes import LEVEL_PLANE
@@ -292,7 +293,7 @@ def _in_workspace(
         if len(rays) == 2:
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
-            surface = surface or read_elevation(workspace)[0]
+            surface = surface or StoredElevation.of(need_stage(workspace, "dense", "reconstruct"))
             point, covariance = _on_surface(surface, errors, *rays[0], pick_sigma_px)
         points.append(point)
         own.append(covariance)
@@ -344,28 +345,20 @@ def _crossed(rays: list[tuple[View, PinholeWarp, Array]], sigma_px: float) -> tu
 
 
 def _on_surface(
-    surface: Elevation,
+    surface: StoredElevation,
     errors: SharedErrors,
     view: View,
     warp: PinholeWarp,
     taken: Array,
     sigma_px: float,
 ) -> tuple[Array, Array]:
-    start, direction = _ray(view, warp, taken)
-    point = surface.hit(start, direction)
-    if point is None:
+    picture = RegisteredPicture(warp=warp, model_from_pinhole=view.world_from_cam)
+    shown = shown_places(surface, picture, taken[None])
+    if not np.isfinite(shown.points).all():
         raise ReconstructionError(
             f"{view.image}:{taken[0] - 0.5:g},{taken[1] - 0.5:g}: its ray meets no known "
             "surface; pick another pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
         )
-    place = point[None, [1, 0]]
-    stated, shared = surface.at(surface.sigma, place), errors.variance_of_heights(place)
-    sigma = float(np.sqrt(np.maximum(stated**2 - shared, 0.0))[0])
-    raised = surface.hit(start, direction, lift=sigma)
-    moves = [raised - point if raised is not None else sigma * direction]
-    for axis in range(2):
-        aside_point = surface.hit(*_ray(view, warp, taken + np.eye(2)[axis]))
-        if aside_point is not None:
-            moves.append((aside_point - point) * sigma_px)
-    covariance = sum((np.outer(m, m) for m in moves), np.zeros((3, 3)))
-    return point, covariance
+    sigma = errors.own_sigma(shown.points[:, [1, 0]], shown.sigma)
+    moves = np.column_stack([sigma * shown.by_height[0], sigma_px * shown.by_pixel[0]])
+    return shown.points[0], moves @ moves.T

@@ -19,7 +19,7 @@ from reconstruct.picking.lengths import Lengths, spot_residuals
 from reconstruct.picking.preview import preview_control
 from reconstruct.picking.refine import refine
 from reconstruct.picking.registered import RegisteredPictures, Sight
-from reconstruct.picking.surface import Surface, SurfacePlace
+from reconstruct.picking.surface import ModelSurface, SurfacePlace
 from reconstruct.placing.control_file import (
     CONTROL_FILE,
     MARKERS_FILE,
@@ -105,7 +105,7 @@ class _OpenModel:
     def __init__(self, studio: Studio) -> None:
         folder = studio.workspace.folder
         self.pictures = RegisteredPictures.read(folder)
-        self.surface = Surface(folder)
+        self.surface = ModelSurface(folder)
         self.lengths = Lengths(folder, self.pictures)
         self.lock = threading.Lock()
 
