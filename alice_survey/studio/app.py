@@ -28,7 +28,7 @@ from alice_survey.studio.endpoints.shell import all_endpoints
 from alice_survey.studio.files import PAGE, POLICY, REVALIDATE, content_type, opened
 from alice_survey.studio.guard import API, Guard, line
 from alice_survey.studio.jobs import BusyError
-from alice_survey.studio.layers import FILES, ChangedError
+from alice_survey.studio.layers import FILES
 from alice_survey.studio.page import MeshCopies, listing
 from alice_survey.studio.paths import RefusedError, names_of
 
@@ -36,7 +36,6 @@ _TILE = re.compile(
     rf"/tiles/({'|'.join((*FILES, CHART))})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
 )
 _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
-_CHANGED = "the survey was worked on meanwhile: load the page again"
 _KEEP = "private, max-age=86400, immutable"
 """Cache policy of requests that state a version."""
 _BODY_S = 30.0
@@ -99,8 +98,6 @@ def _answered(endpoint: Endpoint, call: Call, request: Request) -> Response:
         found = endpoint.answer(call)
     except RefusedError as fault:
         return _fault(400, str(fault))
-    except ChangedError:
-        return _fault(409, _CHANGED)
     except (StaleError, BusyError) as fault:
         return _fault(409, str(fault))
     except FileNotFoundError:
@@ -168,8 +165,8 @@ class _Answers:
             return self._answer(request)
         except RefusedError as fault:
             return line(400, str(fault))
-        except ChangedError:
-            return line(409, _CHANGED)
+        except StaleError as fault:
+            return line(409, str(fault))
         except FileNotFoundError:
             return line(404, "nothing is here")
         except (

@@ -11,8 +11,7 @@ from alice_survey.kit.page import page_policy, render_html
 from alice_survey.kit.words import count
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_copy
-from alice_survey.studio.layers import ChangedError
-from alice_survey.studio.paths import Entry, Workspace
+from alice_survey.studio.paths import Entry, Workspace, worked_on
 
 _MESH = "mesh/mesh.glb"
 
@@ -33,12 +32,12 @@ class MeshCopies:
 
         Raises:
             FileNotFoundError: there is no mesh.
-            ChangedError: there is another mesh by now.
+            StaleError: there is another mesh by now.
             WorkspaceError: it is damaged.
         """
         now = self._workspace.token(_MESH)
         if token not in (None, now):
-            raise ChangedError
+            raise worked_on()
         return self._copy(now), now
 
     def _made(self, _token: str) -> bytes:

@@ -13,8 +13,8 @@ from alice_survey.base.errors import AliceError, ReconstructionError, WorkspaceE
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import ControlRecord, MappingRecord
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
-from alice_survey.studio.taken_pictures import TILE_PX, TakenPictures, levels_of
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
+from alice_survey.studio.taken_pictures import TILE_PX, levels_of
 from reconstruct.picking.lengths import Lengths, spot_residuals
 from reconstruct.picking.preview import preview_control
 from reconstruct.picking.refine import refine
@@ -113,9 +113,8 @@ class _OpenModel:
 class _Tab:
     def __init__(self, studio: Studio) -> None:
         self._studio = studio
-        self._taken = TakenPictures(studio.workspace)
-        self._lock, self._writing = threading.Lock(), threading.Lock()
-        self._model: tuple[tuple[str, ...], _OpenModel] | None = None
+        self._taken, self._writing = studio.taken, threading.Lock()
+        self._model = KeptValue(lambda: _OpenModel(studio))
 
     # ---- Pictures ----
 
@@ -154,15 +153,12 @@ class _Tab:
 
     def tile(self, call: Call) -> Content:
         """A tile of a picture as taken, WebP; level 0 is the coarsest."""
-        try:
-            level, x, y = (int(call.path[key]) for key in ("level", "x", "y"))
-        except ValueError:
-            raise FileNotFoundError from None
+        level, x, y = (call.whole(key) for key in ("level", "x", "y"))
         name = call.path["name"]
         token = self._taken.token(name)
         wide, high = self._taken.size(name)
         halvings = levels_of(wide, high) - 1 - level
-        if min(halvings, x, y) < 0:
+        if halvings < 0:
             raise FileNotFoundError(name)
         data = self._taken.tile(name, halvings, x, y)
         return Content(data=data, kind="image/webp", tag=f"{token}-{level}-{x}-{y}")
@@ -392,12 +388,7 @@ class _Tab:
         workspace = self._studio.workspace
         if not self._has_model():
             raise AliceError("no model yet: run 'alice-survey reconstruct' first")
-        with self._lock:
-            dense = [p for p in ("dense/dem.tif",) if workspace.has(p)]
-            tokens = tuple(workspace.token(path) for path in (*_MODEL, *dense))
-            if self._model is None or self._model[0] != tokens:
-                self._model = tokens, _OpenModel(self._studio)
-            return self._model[1]
+        return self._model.of(workspace.state((*_MODEL, "dense/dem.tif")))
 
 
 def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]:

@@ -1,11 +1,9 @@
 """The tab Plan: settings and shapes as they are, planned again while they change, and saved."""
 
 import base64
-import io
 import math
 import tempfile
 import threading
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,7 +24,14 @@ from alice_survey.base.frames import Array, Datum, attitude_from_rotation
 from alice_survey.base.trajectory import read_columns, read_track
 from alice_survey.kit.document import PictureLayer
 from alice_survey.stages import spec
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
+from alice_survey.studio.endpoints.base import (
+    Call,
+    Content,
+    Endpoint,
+    Studio,
+    scale_json,
+    zipped,
+)
 from alice_survey.studio.newest import Newest, SupersededError
 from alice_survey.studio.paths import RefusedError
 from alice_survey.studio.setting_limits import setting_limits
@@ -289,11 +294,8 @@ class _PlanTab:
             return Content(
                 data=paths[0].read_bytes(), kind="application/octet-stream", name=names[0]
             )
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in paths:
-                archive.write(path, path.relative_to(folder / "exports"))
-        return Content(data=packed.getvalue(), kind="application/zip", name=f"{name}.zip")
+        exports = folder / "exports"
+        return zipped(f"{name}.zip", {str(one.relative_to(exports)): one for one in paths})
 
 
 def _json(found: Mapping[str, Any]) -> Content:
@@ -358,18 +360,14 @@ def _datum(datum: Datum) -> dict[str, float]:
 def _layer(layer: PictureLayer) -> dict[str, Any]:
     """A picture for the map, and what its colours mean."""
     [png] = layer.tiles.values()
-    scale = layer.scale
     return {
         "png": f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}",
         "north": layer.north_m,
         "west": layer.west_m,
         "pixel": layer.pixel_m,
         "title": layer.title,
-        "scale": None if scale is None else {
-            "label": scale.label, "low": scale.low, "high": scale.high,
-            "colours": list(scale.colours),
-        },
-    }  # fmt: skip
+        "scale": scale_json(layer),
+    }
 
 
 def _flown(folder: Path, config: SurveyConfig) -> dict[str, Any]:

@@ -1,23 +1,20 @@
 """Annotations in pictures against the true sea floor that was rendered, and their sigmas."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.seafloor.terrain import Terrain, read_terrain
 from camera_calib.rig import read_rig
-from reconstruct.adjustment.uncertainty import read_uncertainty
 from reconstruct.annotations.projection import OnPlane, Projector
 from reconstruct.annotations.table import sigma_of_area
 from reconstruct.annotations.values import Annotation, DrawnShape
-from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.evaluate.truth import read_true_poses
-from reconstruct.picking.surface import shown_places
 from reconstruct.placing.alignment import align_rigid
 
 PICK_PX = 0.5
@@ -80,7 +77,7 @@ def over_sigma(miss: np.ndarray, sigma: np.ndarray) -> float:
 
 def test_picked_vertices_lie_within_their_sigma_on_the_true_sea_floor(truth: Truth) -> None:
     rng = np.random.default_rng(1)
-    misses, sigmas, exact = [], [], []
+    misses, sigmas, exact, exact_sigmas = [], [], [], []
     for image in truth.projector.pictures.names[::3]:
         pixels = scatter(rng, 100)
         true = truth.hits(image, pixels)
@@ -88,11 +85,14 @@ def test_picked_vertices_lie_within_their_sigma_on_the_true_sea_floor(truth: Tru
         misses.append((noisy.points - true)[:, [1, 0]])
         sigmas.append(noisy.sigma)
         sure = truth.projector.to_plane(image, pixels, 0.0)
-        exact.append(np.linalg.norm((sure.points - true)[:, :2], axis=1))
+        exact.append((sure.points - true)[:, [1, 0]])
+        exact_sigmas.append(sure.sigma)
         assert np.nanmedian(sure.sigma) < 0.5 * np.nanmedian(noisy.sigma)
     ratio = over_sigma(np.concatenate(misses), np.concatenate(sigmas))
     assert 0.7 < ratio < 1.4
-    assert np.nanmedian(np.concatenate(exact)) < 3e-4  # without noise of picks: 0.3 mm of 2.7 a px
+    # without noise of picks: what poses and the surface do, here 0.3 mm where a pixel is 2.7
+    assert 0.7 < over_sigma(np.concatenate(exact), np.concatenate(exact_sigmas)) < 1.4
+    assert np.nanmedian(np.linalg.norm(np.concatenate(exact), axis=1)) < 3e-4
 
 
 def test_what_one_picture_shows_is_found_in_others(truth: Truth) -> None:
@@ -113,33 +113,6 @@ def test_what_one_picture_shows_is_found_in_others(truth: Truth) -> None:
             sigmas.append(other.sigma[other.seen])
     assert shown > 20
     assert 0.7 < over_sigma(np.concatenate(misses), np.concatenate(sigmas)) < 1.4
-
-
-def test_what_poses_do_to_places_is_what_moved_poses_do(truth: Truth) -> None:
-    """Monte Carlo: the picture's pose is drawn from its covariance, all else is exact.
-
-    The model's points move with all pictures that see them, less than one of these alone.
-    """
-    projector, rng = truth.projector, np.random.default_rng(3)
-    workspace, ratios = truth.folder.parents[1], []
-    known = read_uncertainty(workspace / "sparse" / "covariance.npz")
-    dem = StoredElevation.of(workspace / "dense")
-    for row in (2, 7, 11):
-        image, pixels = known.images[row], scatter(rng, 15)
-        picture = projector.pictures.picture(image)
-        still = projector.to_plane(image, pixels, 0.0)
-        origin, found = picture.model_from_pinhole.translation, []
-        for kick in rng.multivariate_normal(np.zeros(6), known.frame_cov[row], 100):
-            turn = Rotation.from_rotvec(kick[:3])
-            move = RigidTransform.from_components(origin + kick[3:] - turn.apply(origin), turn)
-            moved = replace(picture, model_from_pinhole=move * picture.model_from_pinhole)
-            found.append(shown_places(dem, moved, pixels).points[:, [1, 0]] - still.places)
-        expected = np.sqrt((still.shared[:, :, :-1] ** 2).sum(axis=(1, 2)))
-        spread = np.sqrt((np.array(found) ** 2).sum(axis=2).mean(axis=0))
-        ratios.append(np.nanmedian(spread / expected))
-        assert np.isfinite(spread).sum() > 10
-    print(ratios)
-    assert 0.5 < min(ratios) and max(ratios) < 2.0
 
 
 def test_there_and_back_again_is_the_same_pixel(truth: Truth) -> None:
