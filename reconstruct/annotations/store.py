@@ -1,15 +1,15 @@
 """`annotations.json` of a workspace: read, changed by one writer at a time, seen by a GIS."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from filelock import FileLock, Timeout
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from alice_survey.base.artefacts import JsonRecord, json_values
+from alice_survey.base.contents import first_fault
 from alice_survey.base.edited_files import check_token, content_of, content_token
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum
@@ -62,8 +62,8 @@ def read_annotations(workspace: Path, frame: WorldFrame | None = None) -> Annota
         _check_frame(workspace / FILE, record, frame)
     try:
         return record.values
-    except ValueError as error:
-        raise WorkspaceError(f"{workspace / FILE}: {_first_line(error)}") from None
+    except ValidationError as error:
+        raise WorkspaceError(f"{workspace / FILE}: {first_fault(error)}") from None
 
 
 def change_annotations(
@@ -172,14 +172,3 @@ def _check_frame(path: Path, record: AnnotationsRecord, frame: WorldFrame) -> No
             f"{path}: its places are of the frame {record.frame!r} with another datum than the "
             f"model now has ({frame.name!r}): move the file away, or give the survey the datum back"
         )
-
-
-def _first_line(error: ValueError) -> str:
-    lines = [line.strip() for line in str(error).splitlines()]
-    line = next((line for line in lines if line.startswith("Value error")), lines[0])
-    return line.removeprefix("Value error, ").partition(" [type")[0]
-
-
-def dumped(values: AnnotationSet) -> str:
-    """As JSON text, for a page."""
-    return json.dumps(values.model_dump(mode="json"), allow_nan=False)

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from alice_survey.base.config import Config
+from alice_survey.base.contents import first_fault
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 from alice_survey.report.colours import MOSAIC_FILE
@@ -95,8 +96,8 @@ class _Annotate:
                 raise AliceError("the change: a label stands twice in the list")
             try:
                 return AnnotationSet(labels=labels, annotations=(*kept, *new))
-            except ValueError as error:
-                raise AliceError(f"the change: {_reason(error)}") from None
+            except ValidationError as error:
+                raise AliceError(f"the change: {first_fault(error)}") from None
 
         return self._changed(
             change_annotations(self._folder, frame_of(self._folder), made, wanted.token)
@@ -213,12 +214,6 @@ def _check(spots: OnPlane, one: Annotation) -> None:
             f"none of the {lost} vertices of {one.label!r} meets a known surface: no picture can "
             "be shown"
         )
-
-
-def _reason(error: ValueError) -> str:
-    lines = str(error).splitlines()
-    text = next((line for line in lines if "Value error" in line), lines[0]).strip()
-    return text.removeprefix("Value error, ").partition(" [type")[0]
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

@@ -16,7 +16,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from alice_survey.base.contents import shown
+from alice_survey.base.contents import first_fault
 from alice_survey.base.errors import AliceError
 from alice_survey.kit.document import PictureLayer
 from alice_survey.studio.jobs import Jobs
@@ -92,9 +92,7 @@ class Call:
         try:
             return kind.model_validate_json(self.body)
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
-            raise AliceError(f"the request: {place or 'its body'}: {shown(first['msg'])}") from None
+            raise AliceError(f"the request: {first_fault(error, 'its body')}") from None
 
     def number(self, name: str) -> float:
         """A finite number of the query.
