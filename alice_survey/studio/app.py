@@ -21,6 +21,7 @@ from alice_survey.studio.endpoints.base import (
     Call,
     Content,
     Endpoint,
+    KeptValue,
     Studio,
     json_text,
 )
@@ -29,8 +30,8 @@ from alice_survey.studio.files import PAGE, POLICY, REVALIDATE, content_type, op
 from alice_survey.studio.guard import API, Guard, line
 from alice_survey.studio.jobs import BusyError
 from alice_survey.studio.layers import FILES
-from alice_survey.studio.page import MeshCopies, listing
-from alice_survey.studio.paths import RefusedError, names_of
+from alice_survey.studio.page import MESH, light_mesh, listing
+from alice_survey.studio.paths import RefusedError, names_of, worked_on
 
 _TILE = re.compile(
     rf"/tiles/({'|'.join((*FILES, CHART))})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
@@ -155,7 +156,7 @@ class _Answers:
 
     def __init__(self, studio: Studio) -> None:
         self._workspace, self._layers = studio.workspace, studio.layers
-        self._meshes = MeshCopies(studio.workspace)
+        self._mesh = KeptValue(lambda: light_mesh(studio.workspace.folder))
         web_map = "" if studio.background is None else f" {server_of(studio.background)}"
         self._policy = _STUDIO_POLICY.format(web_map)
 
@@ -193,8 +194,10 @@ class _Answers:
             tag = f"{found}-{level}-{x}-{y}"
             return _versioned(request, content, tag, "image/webp", token)
         if path == "/mesh.glb":
-            content, found = self._meshes.read(token)
-            return _versioned(request, content, found, "model/gltf-binary", token)
+            now = self._workspace.token(MESH)
+            if token not in (None, now):
+                raise worked_on()
+            return _versioned(request, self._mesh.of(now), now, "model/gltf-binary", token)
         if path == "/files":
             return RedirectResponse("/files/", 301)
         if path.startswith("/files/"):
