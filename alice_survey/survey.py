@@ -242,11 +242,16 @@ def init_survey(folder: Path, template: str = "survey.toml", area: Path | None =
         raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        text = (resources.files("alice_survey") / template).read_text(encoding="utf-8")
+        text = template_text(template)
         path.write_text(text if area is None else _with_area(text, area, folder), encoding="utf-8")
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
     return path
+
+
+def template_text(template: str = "survey.toml") -> str:
+    """The commented settings that a new survey starts from."""
+    return (resources.files("alice_survey") / template).read_text(encoding="utf-8")
 
 
 def _with_area(text: str, area: Path, folder: Path) -> str:

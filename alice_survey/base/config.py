@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_origin
 
@@ -483,15 +483,45 @@ def load_config(path: str | Path) -> SurveyConfig:
         raise ConfigError(f"{path}: no such file; 'alice-survey init DIR' writes one") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
+    return parse_settings(text, path)
+
+
+def parse_settings(text: str, path: Path) -> SurveyConfig:
+    """Check the text of a settings file.
+
+    Args:
+        text: TOML.
+        path: of the file, from whose folder relative names of files count.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    return checked_settings(settings_in(text, str(path)), path)
+
+
+def settings_in(text: str, origin: str) -> dict[str, Any]:
+    """The settings that a text holds, as they are written.
+
+    Args:
+        text: TOML.
+        origin: what messages call it.
+
+    Raises:
+        ConfigError: it is not TOML.
+    """
     if len(text) > _LONGEST:
         raise ConfigError(
-            f"{path}: {len(text) / 1e6:.1f} million characters: no settings file is that long"
+            f"{origin}: {len(text) / 1e6:.1f} million characters: no settings file is that long"
         )
     try:
-        settings = tomllib.loads(text)
+        return tomllib.loads(text)
     # A number of thousands of digits is a ValueError.
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {one_line(error)}") from None
+        raise ConfigError(f"{origin}: not valid TOML: {one_line(error)}") from None
+
+
+def checked_settings(settings: dict[str, Any], path: Path) -> SurveyConfig:
+    """Check settings as a file holds them; arguments and errors as of `parse_settings`."""
     return parse_config(_with_resolved_files(settings, path.parent), str(path))
 
 
@@ -504,17 +534,21 @@ _FILES = (
 def _with_resolved_files(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Settings whose relative file names are resolved from the folder of the settings file."""
     result = dict(settings)
-    for section, key in _FILES:
-        values = settings.get(section)
-        if isinstance(values, dict) and isinstance(values.get(key), str):
-            file = folder / values[key]
-            if file.exists() and not (file.is_file() or file.is_dir()):
-                raise ConfigError(f"{section}.{key}: {file} is neither a file nor a folder")
-            result[section] = {**result[section], key: str(file)}
-    own = settings.get("vehicle")
-    if isinstance(own, dict) and str(own.get("name")).lower().endswith(VEHICLE_FILES):
-        result["vehicle"] = {**result.get("vehicle", own), "name": str(folder / str(own["name"]))}
+    for section, key, name in settings_files(settings):
+        file = folder / name
+        if key != "name" and file.exists() and not (file.is_file() or file.is_dir()):
+            raise ConfigError(f"{section}.{key}: {file} is neither a file nor a folder")
+        result[section] = {**result[section], key: str(file)}
     return result
+
+
+def settings_files(settings: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Section, key and name of each file that settings, as written, name."""
+    for section, key in (*_FILES, ("vehicle", "name")):
+        values = settings.get(section)
+        name = values.get(key) if isinstance(values, Mapping) else None
+        if isinstance(name, str) and (key != "name" or name.lower().endswith(VEHICLE_FILES)):
+            yield section, key, name
 
 
 def parse_config(settings: dict[str, Any], origin: str) -> SurveyConfig:

@@ -49,7 +49,7 @@ _STUDIO_POLICY = (
 _TOKEN = "X-Studio-Token"  # noqa: S105 (the name of a header)
 _JSON = "application/json"
 _APP = re.compile(r"/app/([a-z_]+\.(?:js|css))")
-_KIT = ("map.js", "map_tiles.js", "mesh.js", "page.css")
+_KIT = ("map.js", "map_stations.js", "map_tiles.js", "mesh.js", "page.css")
 _VENDORED = ("vendor_map.js", "vendor_map.css", "vendor_mesh.js")
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import secrets
 import socket
 import threading
@@ -143,11 +144,18 @@ class Server:
             target=self._uvicorn.run, kwargs={"sockets": [self.socket]}, daemon=True
         )
         answering.start()
+        log = logging.getLogger("uvicorn.error")
+        log.addFilter(self._is_shown)
         try:
             answering.join()
         finally:
             self.shutdown()
             answering.join(2 * _ENDING_S)
+            log.removeFilter(self._is_shown)
+
+    def _is_shown(self, _: logging.LogRecord) -> bool:
+        """Whether uvicorn may speak: of what is dropped at the end nobody needs to hear."""
+        return not self.studio.ending.is_set()
 
     def shutdown(self) -> None:
         """End `serve_forever`."""

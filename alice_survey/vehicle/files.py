@@ -13,7 +13,7 @@ paper's tables, and `computed` from the shape.
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -119,6 +119,11 @@ def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
     raise VehicleError(f"vehicle {name_or_file!r} is not known; known: {known}, or a TOML file")
 
 
+def known_vehicles() -> list[str]:
+    """Names of the vehicles that are known."""
+    return list(_DESCRIBED)
+
+
 def vehicles_of_a_geometry() -> list[str]:
     """Names of the known vehicles whose shape is known: they carry the same payload."""
     return [name for name in _DESCRIBED if name in GEOMETRIES]
@@ -135,8 +140,13 @@ def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
         VehicleError: the file cannot be read, or lacks a field, has one that is not known or makes
             no sense, or has no such set.
     """
-    table = read_table(path)
-    found = validated(path, _VehicleFile, _with_shape(table))
+    return _vehicle_of(path, _text_of(path), coefficients)
+
+
+@lru_cache(maxsize=32)
+def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
+    """The vehicle of a file's text; kept, as the water inside of a hull takes a while to find."""
+    found = validated(path, _VehicleFile, _with_shape(_table_of(path, text)))
     for what, parts in (("thrusters", found.thrusters), ("fins", found.fins)):
         names = [part.name for part in parts]
         if len(set(names)) < len(names):
@@ -277,11 +287,21 @@ def read_table(path: Path) -> dict[str, Any]:
     Raises:
         VehicleError: the file cannot be read or holds no table.
     """
+    return _table_of(path, _text_of(path))
+
+
+def _text_of(path: Path) -> str:
     try:
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise VehicleError(f"{path}: cannot be read: {why(error)}") from None
+    except ValueError as error:
+        raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
+
+
+def _table_of(path: Path, text: str) -> dict[str, Any]:
+    try:
+        table = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
     if not isinstance(table, dict):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -32,6 +32,32 @@ _POLAR_DEG = 66.6
 _LOCAL_SETTINGS = ("no_go_ne_m", "allowed_ne_m")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GivenShapes:
+    """The shapes of an area as settings and files have them, and the frame they are planned in."""
+
+    survey: RawShapes
+    no_go: tuple[RawShapes, ...]
+    """By source."""
+    allowed: RawShapes | None
+    frame: LocalFrame
+
+
+def given_shapes(settings: AreaConfig) -> GivenShapes:
+    """Read the shapes of an area.
+
+    Raises:
+        PlanError: a file or text cannot be read.
+    """
+    survey = _with_closed_lines(_survey_shapes(settings), settings)
+    return GivenShapes(
+        survey=survey,
+        no_go=(*_no_go_shapes(settings), *([] if survey.no_go is None else [survey.no_go])),
+        allowed=_allowed_shapes(settings),
+        frame=_local_frame(settings, survey),
+    )
+
+
 def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float = 0.0) -> Area:
     """What to survey and where the vehicle may be.
 
@@ -47,14 +73,12 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     Raises:
         PlanError: a shape cannot be used; the message names the source and the place.
     """
-    raw = _with_closed_lines(_survey_shapes(settings), settings)
-    no_go_raw = [*_no_go_shapes(settings), *([raw.no_go] if raw.no_go is not None else [])]
-    allowed_raw = _allowed_shapes(settings)
-    frame = _local_frame(settings, raw)
+    given = given_shapes(settings)
+    raw, allowed_raw, frame = given.survey, given.allowed, given.frame
     shape = _polygons(raw, frame, settings.corridor_width_m)
     clearance_m = settings.no_go_clearance_m
     zones = [(raw.origin, widened(shape.holes, clearance_m))]
-    zones += [(zone.origin, _zone(zone, frame, clearance_m)) for zone in no_go_raw]
+    zones += [(zone.origin, _zone(zone, frame, clearance_m)) for zone in given.no_go]
     no_go = _union([zone for _, zone in zones])
     wanted = widened(shape.solid, margin_m)
     survey = _less(wanted, no_go)
@@ -133,7 +157,7 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
         return shape
     widths_m = [line.width_m or corridor_width_m for line in local.lines]
     strips = [
-        _corridor(line.points, width_m, local.origin, local.line_name(i))
+        corridor_strip(line.points, width_m, local.origin, local.line_name(i))
         for i, (line, width_m) in enumerate(zip(local.lines, widths_m, strict=True))
     ]
     if raw.polygons:
@@ -252,7 +276,7 @@ def _widest_gap_m(parts: Sequence[BaseGeometry]) -> float:
     return widest
 
 
-def _corridor(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
+def corridor_strip(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
     """The strip along a line.
 
     Raises:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
@@ -17,7 +18,7 @@ from missions.coverage.raster import (
     Grid,
     border_rays_body,
     count_pictures,
-    footprints_ne,
+    footprint_offsets,
     grid_over,
     inside,
 )
@@ -34,6 +35,10 @@ _SIZES = 0.005 * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6])
 """Changes of a cell's size that are tried."""
 _PLACES = 300
 """Cells in a row that are looked at for that."""
+_COARSE = 0.8
+"""Share of the cells of a quick look above which its grid is taken as coarser than usual."""
+_FEW_POINTS = 4
+"""Points on each side of a border for such a grid."""
 _TILE, _TILE_MIB = 2048, 90
 """Cells a side that are worked on at once, and the memory that they take for two cameras."""
 _CHUNK = 8192
@@ -71,6 +76,8 @@ class Certificate:
     """By camera: share of the area, (N,), that 0, 1, 2, ... of its pictures see."""
     line_histograms: dict[str, Array]
     """By camera: share of the area, (N,), that is seen on 0, 1, 2, ... lines."""
+    estimated: bool = False
+    """Whether it is a quick look: cells are larger than usual, and borders have fewer points."""
 
     @property
     def taken(self) -> int:
@@ -184,6 +191,7 @@ def certificate(
     pattern: Pattern,
     *,
     cell_m: float | None = None,
+    most_cells: int | None = None,
     executor: Executor = SERIAL,
 ) -> Certificate:
     """Certify what pictures see of an area.
@@ -195,12 +203,14 @@ def certificate(
         pattern: the overlap requested.
         cell_m: of the grid; left out, about a twentieth of a footprint, less for a small area, and
             more where that would be over 16 million cells.
+        most_cells: of the grid where `cell_m` is left out, for a quick look. Where that makes the
+            cells larger, borders are traced at fewer points: to 0.2 % of a footprint's width.
         executor: where the parts of a large area are worked on.
 
     Raises:
         PlanError: `cell_m` is not positive, or would make too large a grid.
     """
-    grid = grid_over(area, _cell_m(area, rig, stations, pattern, cell_m))
+    grid = grid_over(area, _cell_m(area, rig, stations, pattern, cell_m, most_cells))
     mask = inside(area, grid)
     if not mask.any():  # the area is a sliver between middles of cells
         raise PlanError(
@@ -208,10 +218,13 @@ def certificate(
         )
     order = np.argsort(stations.line, kind="stable")
     stations = stations.some(order)
-    rays = border_rays_body(rig)
+    coarse = most_cells is not None and grid.rows * grid.columns > _COARSE * most_cells
+    rays = border_rays_body(rig, _FEW_POINTS) if coarse else border_rays_body(rig)
     reach_m = _reaches_m(rays, stations)
     blind = int(np.count_nonzero(np.isnan(reach_m)))
     names = tuple(rig.cameras)
+    # Beyond its reach a place may be by rounding.
+    glass, reach = grid.cells_of(stations.glass_ne), (reach_m + 1e-6) / grid.cell_m
     result = {
         name: np.zeros(grid.shape, np.uint16)
         for name in ("pictures", "least_pictures", "least_lines", "pairs")
@@ -222,7 +235,7 @@ def certificate(
         part = grid.part(row, column, _TILE, _TILE)
         here = (slice(row, row + part.rows), slice(column, column + part.columns))
         if mask[here].any():
-            near = stations.some(_near(part, stations, reach_m))
+            near = stations.some(_near(glass, reach, row, column, part.rows, part.columns))
             places.append(here)
             tasks.append(_GridTask(grid=part, rays=rays, stations=near, inside=mask[here]))
     tiles = []
@@ -239,6 +252,7 @@ def certificate(
         cameras=names,
         stations=len(stations),
         blind=blind,
+        estimated=coarse,
         grid=grid,
         inside=mask,
         histograms={n: _histogram([t.pictures[i] for t in tiles]) for i, n in enumerate(names)},
@@ -248,7 +262,12 @@ def certificate(
 
 
 def _cell_m(
-    area: Area, rig: Rig, stations: Stations, pattern: Pattern, asked_m: float | None
+    area: Area,
+    rig: Rig,
+    stations: Stations,
+    pattern: Pattern,
+    asked_m: float | None,
+    most_cells: int | None,
 ) -> float:
     """The side of a cell.
 
@@ -275,6 +294,8 @@ def _cell_m(
             f"{_MOST_CELLS / 1e6:.0f} million of them: holes under {1.4 * least_m:.2g} m may be "
             "missed; certify parts of the area, or choose cell_m"
         )
+    if most_cells is not None:
+        least_m = max(least_m, math.sqrt(boxed_m2 / most_cells))
     return _out_of_step(fine_m, (pattern.step_m, pattern.spacing_m), least_m)
 
 
@@ -303,29 +324,47 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
-def _borders(rays: tuple[Array, Array], stations: Stations, rows: slice) -> Array:
-    borders: Array = footprints_ne(
-        *rays, stations.glass_ne[rows], stations.altitude_m[rows], stations.attitude_rad[rows]
-    )
-    return borders
-
-
 def _reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
     """How far from the glass, (S,), a station sees; NaN where it looks past the sea floor."""
     reaches = [np.empty(0)]
     for rows in _chunks(len(stations)):
-        offsets = _borders(rays, stations, rows) - stations.glass_ne[rows, None, None]
-        reaches.append(np.sqrt((offsets**2).sum(axis=-1).max(axis=(1, 2))))
+        offsets, which = _offsets(rays, stations, rows)
+        reaches.append(np.sqrt((offsets**2).sum(axis=-1).max(axis=(1, 2)))[which])
     return np.concatenate(reaches)
 
 
-def _near(grid: Grid, stations: Stations, reach_m: Array) -> NDArray[np.bool_]:
-    """Stations, (S,), that may see some of a grid."""
-    half = np.array(grid.shape) / 2
-    off = np.abs(grid.cells_of(stations.glass_ne) - half) - half
-    beyond_m = np.linalg.norm(np.maximum(off, 0.0), axis=1) * grid.cell_m
-    near: NDArray[np.bool_] = beyond_m <= reach_m + 1e-6
-    return near
+def _offsets(
+    rays: tuple[Array, Array], stations: Stations, rows: slice
+) -> tuple[Array, NDArray[np.intp]]:
+    offsets: tuple[Array, NDArray[np.intp]] = footprint_offsets(
+        *rays, stations.altitude_m[rows], stations.attitude_rad[rows]
+    )
+    return offsets
+
+
+@compiled
+def _near(
+    glass: Array, reach: Array, row: int, column: int, rows: int, columns: int
+) -> NDArray[np.intp]:
+    """Which stations, (N,), may see some of a part of a grid.
+
+    Args:
+        glass: (S, 2) their places, in rows and columns of the grid.
+        reach: (S,) how far they see, in cells; NaN of those that see nothing.
+        row: at which the part begins.
+        column: the same.
+        rows: of the part.
+        columns: of the part.
+    """
+    near = np.empty(len(glass), np.intp)
+    count = 0
+    for s in range(len(glass)):
+        up = max(row - glass[s, 0], glass[s, 0] - (row + rows), 0.0)
+        aside = max(column - glass[s, 1], glass[s, 1] - (column + columns), 0.0)
+        if up * up + aside * aside <= reach[s] * reach[s]:
+            near[count] = s
+            count += 1
+    return near[:count].copy()
 
 
 def count_tile(task: _GridTask) -> _TileCounts:
@@ -352,8 +391,12 @@ def _counts(
     last, stamp = np.full(shape, -1, np.int32), np.full(grid.shape, -1, np.int32)
     pairs = np.zeros(grid.shape, np.uint16)
     for rows in _chunks(len(stations)):
-        cells = grid.cells_of(_borders(rays, stations, rows))
-        count_pictures(cells, stations.line[rows], rows.start, pictures, lines, last, stamp, pairs)
+        offsets, which = _offsets(rays, stations, rows)
+        count_pictures(
+            grid.cells_of(offsets + np.array(grid.origin_ne)), which,
+            np.ascontiguousarray(grid.cells_of(stations.glass_ne[rows])), stations.line[rows],
+            rows.start, pictures, lines, last, stamp, pairs,
+        )  # fmt: skip
     return pictures, lines, pairs
 
 

@@ -117,8 +117,12 @@ def inside(area: Area, grid: Grid) -> NDArray[np.bool_]:
     return mask
 
 
-def border_rays_body(rig: Rig) -> tuple[Array, Array]:
+def border_rays_body(rig: Rig, points_per_side: int = _POINTS_PER_SIDE) -> tuple[Array, Array]:
     """Where the rays of each picture's border leave the glass, and their ways in water.
+
+    Args:
+        rig: its cameras.
+        points_per_side: of the border.
 
     Returns:
         Points about the left port's outer glass, (cameras, points, 3) metres, and unit rays of the
@@ -128,7 +132,7 @@ def border_rays_body(rig: Rig) -> tuple[Array, Array]:
     points, rays = [], []
     for name, camera in rig.cameras.items():
         body_from_cam = rig.body_from_cam(name)
-        points_cam, rays_cam = camera.unproject(camera.border(_POINTS_PER_SIDE))
+        points_cam, rays_cam = camera.unproject(camera.border(points_per_side))
         points.append(body_from_cam.apply(points_cam) - glass)
         rays.append(body_from_cam.rotation.apply(rays_cam))
     return np.stack(points), np.stack(rays)
@@ -176,8 +180,39 @@ def footprints_ne(
 
 
 @compiled(nogil=True)
+def footprint_offsets(
+    points_body: Array, rays_body: Array, altitude_m: Array, attitude_rad: Array
+) -> tuple[Array, NDArray[np.intp]]:
+    """Borders about the glass, each traced once for stations in a row that are alike but in place.
+
+    Args:
+        points_body: (C, P, 3) from `border_rays_body`.
+        rays_body: (C, P, 3) the same way.
+        altitude_m: (S,) of the glass.
+        attitude_rad: (S, 3) roll, pitch, heading.
+
+    Returns:
+        (K, C, P, 2) north and east, as of `footprints_ne`; and (S,) which of them each station has.
+    """
+    which = np.zeros(len(altitude_m), np.intp)
+    for s in range(1, len(altitude_m)):
+        alike = altitude_m[s] == altitude_m[s - 1]
+        for axis in range(3):
+            alike = alike and attitude_rad[s, axis] == attitude_rad[s - 1, axis]
+        which[s] = which[s - 1] if alike else which[s - 1] + 1
+    first = np.flatnonzero(np.diff(which)) + 1
+    first = np.concatenate((np.zeros(min(len(which), 1), np.intp), first))
+    offsets = footprints_ne(
+        points_body, rays_body, np.zeros((len(first), 2)), altitude_m[first], attitude_rad[first]
+    )
+    return offsets, which
+
+
+@compiled(nogil=True)
 def count_pictures(
-    borders: Array,
+    offsets: Array,
+    which: NDArray[np.intp],
+    glass: Array,
     line: NDArray[np.intp],
     first: int,
     pictures: NDArray[np.uint16],
@@ -192,7 +227,9 @@ def count_pictures(
     line before those of the next.
 
     Args:
-        borders: (S, C, P, 2) of pictures, as rows and columns of the grid.
+        offsets: (K, C, P, 2) borders of pictures about the glass, in rows and columns of the grid.
+        which: (S,) which of them each station has.
+        glass: (S, 2) places of the glass, the same way.
         line: (S,) of each station, -1 of none: that counts as a picture, not as a line.
         first: how many stations were added before.
         pictures: (C, rows, columns) how many of each camera; added to.
@@ -201,13 +238,16 @@ def count_pictures(
         stamp: (rows, columns) picture that saw it last, -1 at first; kept the same way.
         pairs: (rows, columns) how many stations see it with all cameras at once; added to.
     """
-    stations, cameras, points = borders.shape[:3]
+    cameras, points = offsets.shape[1:3]
     rows, columns = stamp.shape
+    border = np.empty((points, 2))
     crossing = np.empty((rows, points), np.int32)
     found = np.zeros(rows, np.int32)
-    for s in range(stations):
+    for s in range(len(which)):
         for c in range(cameras):
-            border = borders[s, c]
+            for p in range(points):
+                border[p, 0] = glass[s, 0] + offsets[which[s], c, p, 0]
+                border[p, 1] = glass[s, 1] + offsets[which[s], c, p, 1]
             low, high = math.inf, -math.inf
             left, right = math.inf, -math.inf
             whole = True

@@ -10,7 +10,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from alice_survey.base.frames import Array, Datum
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_ne, level_pose
-from missions.values.legs import Leg, Route
+from missions.values.legs import Leg, Route, places_on
 from missions.values.line import Line
 from missions.values.plan_file import Plan
 
@@ -59,13 +59,14 @@ def grown(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
 
 def route_ne(route: Route, chord_m: float = CHORD_M) -> Array:
     """Corners of a route, (N, 2); arcs as chords that lie within a distance of them."""
-    rows = [np.array([route.legs[0].start_ne_m])]
-    rows += [
-        leg.places(np.linspace(0.0, leg.length_m, chords(leg, chord_m) + 1)[1:])
-        for leg in route.legs
-        if leg.length_m > 0
-    ]
-    return np.vstack(rows)
+    legs = [leg for leg in route.legs if leg.length_m > 0]
+    counts = np.array([chords(leg, chord_m) for leg in legs], dtype=np.intp)
+    lengths_m = np.array([leg.length_m for leg in legs])
+    of = np.repeat(np.arange(len(legs)), counts)
+    number = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    along_m = np.where(number == counts[of], lengths_m[of], number * (lengths_m / counts)[of])
+    places = places_on(legs, of, along_m)
+    return np.vstack([np.array([route.legs[0].start_ne_m]), places])
 
 
 def chords(leg: Leg, chord_m: float = CHORD_M) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
@@ -26,7 +27,8 @@ from missions.exposure.settings_table import Setting
 from missions.plan.page_map import plan_map, station_data
 from missions.values.plan_file import Plan
 
-_SCRIPT = Path(__file__).with_name("page_map.js")
+SCRIPTS = (files("alice_survey.kit") / "map_stations.js", Path(__file__).with_name("page_map.js"))
+"""What the page's map adds to the kit's; the studio draws stations by the first."""
 
 
 def write_page(
@@ -59,7 +61,8 @@ def write_page(
     chart = replace(
         plan_map(plan, rig, certificate, bathymetry, sea, layers),
         script=MapScript(
-            text=_SCRIPT.read_text(encoding="utf-8"), data=station_data(plan, rig, certificate)
+            text="".join(script.read_text(encoding="utf-8") for script in SCRIPTS),
+            data=station_data(plan, rig, certificate),
         ),
     )
     report = Report(

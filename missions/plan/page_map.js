@@ -1,160 +1,24 @@
-/* What the map of a plan adds to the kit's: stations and footprints in view, the station under the
-   pointer, and counts of pictures. Places are metres north and east of the datum; Leaflet has them
-   as latitude and longitude. */
-
-const MOST_SHOWN = 3000;  /* stations and footprints in view that are drawn one by one */
-const NEAR_PX = 14;
-const FOOTPRINT = "#2e86c1";
-const HOVER = "#b7950b";
-
-/* The line nearest to a place and its station there, or null where none is within a distance. */
-function nearest(lines, n, e, within) {
-  let best = null;
-  let least = within * within;
-  lines.forEach((line) => {
-    const [dn, de] = [line.n1 - line.n0, line.e1 - line.e0];
-    const square = dn * dn + de * de;
-    const along = square > 0 ? ((n - line.n0) * dn + (e - line.e0) * de) / square : 0;
-    const t = Math.min(1, Math.max(0, along));
-    const off = (line.n0 + t * dn - n) ** 2 + (line.e0 + t * de - e) ** 2;
-    if (off < least) {
-      least = off;
-      best = {line, station: line.stations > 1 ? Math.round(t * (line.stations - 1)) : 0};
-    }
-  });
-  return best;
-}
-
-function stationAt(line, i) {
-  const t = line.stations > 1 ? i / (line.stations - 1) : 0;
-  return [line.n0 + t * (line.n1 - line.n0), line.e0 + t * (line.e1 - line.e0)];
-}
-
-/* Places ahead and to starboard of a station of a line, on the map. */
-function around(line, [n, e], offsets) {
-  const [c, s] = [Math.cos(line.heading), Math.sin(line.heading)];
-  return offsets.map(([ahead, right]) => [n + ahead * c - right * s, e + ahead * s + right * c]);
-}
+/* What the map of a plan's page adds to the kit's: the stations of its lines. */
 
 function extendMap(map, layers, data) {
   const lines = [];
+  const groups = [];
   Object.entries(data.lines).forEach(([name, rows]) => {
     const group = layers.get(name);
+    groups.push(group);
     group.getLayers().filter((shape) => shape.survey).forEach((shape, i) => {
-      const [{lat: n0, lng: e0}, {lat: n1, lng: e1}] = shape.getLatLngs();
+      const [start, end] = shape.getLatLngs().map(({lat, lng}) => [lat, lng]);
       const [index, first, stations] = rows[i];
-      lines.push({
-        group, index, first, stations, n0, e0, n1, e1, colour: shape.options.color,
-        text: shape.survey.text, length: Math.hypot(n1 - n0, e1 - e0),
-        heading: Math.atan2(e1 - e0, n1 - n0),
-      });
+      lines.push(stationLine(start, end, {
+        group, index, first, stations, colour: shape.options.color, text: shape.survey.text,
+      }));
     });
   });
-  const metrePx = () => 2 ** map.getZoom();
-  const shown = () => lines.filter((line) => map.hasLayer(line.group));
-  const arrows = leaflet.featureGroup().addTo(map);
-  const hovered = leaflet.featureGroup().addTo(map);
-  const fixed = {interactive: false};
-
-  /* Stations, footprints and arrows of the lines in view, as far as they can be told apart. */
-  function refresh() {
-    const view = map.getBounds().pad(0.05);
-    const inView = shown().filter((line) => view.intersects([[line.n0, line.e0], [line.n1, line.e1]]));
-    const stations = layers.get("stations").clearLayers();
-    const footprints = layers.get("footprints").clearLayers();
-    arrows.clearLayers();
-    const thick = Math.min(1.7, Math.max(0.2, 0.3 * data.spacing * metrePx()));
-    Object.keys(data.lines).forEach((name) => layers.get(name).eachLayer((shape) => {
-      shape.setStyle(shape.survey ? {weight: thick} : {stroke: thick > 1.6});
-    }));
-    if (inView.length <= 400) inView.forEach(arrow);
-    const apartPx = (line) => line.length / Math.max(1, line.stations - 1) * metrePx();
-    const far = inView.filter((line) => line.stations === 1 || apartPx(line) >= 6);
-    const places = far.flatMap((line) => Array.from({length: line.stations}, (_, i) => [line, stationAt(line, i)]))
-      .filter(([, place]) => view.contains(place));
-    if (map.hasLayer(stations) && places.length <= MOST_SHOWN) {
-      places.forEach(([line, place]) => stations.addLayer(leaflet.circleMarker(place, {
-        ...fixed, radius: Math.min(3.4, Math.max(1.3, apartPx(line) / 7)), stroke: false,
-        fillColor: line.colour, fillOpacity: 1,
-      })));
-    }
-    if (!map.hasLayer(footprints)) return;
-    const style = {...fixed, color: FOOTPRINT, weight: 0.6, opacity: 0.5, fillOpacity: 0.05};
-    if (places.length && places.length <= MOST_SHOWN && data.across * metrePx() > 6) {
-      places.forEach(([line, place]) => footprints.addLayer(leaflet.polygon(around(line, place, data.outline), style)));
-    } else {  /* the bands that they make */
-      inView.forEach((line) => footprints.addLayer(leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {
-        ...fixed, color: FOOTPRINT, weight: data.across * metrePx(), opacity: 0.16, lineCap: "butt",
-      })));
-    }
-  }
-
-  /* The way of flight, at a third of a line. */
-  function arrow(line) {
-    if (line.length * metrePx() < 24) return;
-    const place = stationAt({...line, stations: 101}, 36);
-    const size = 1 / metrePx();
-    const head = [[7, 0], [-5, 4.6], [-2.5, 0], [-5, -4.6]].map(([a, b]) => [a * size, b * size]);
-    arrows.addLayer(leaflet.polygon(around(line, place, head), {
-      ...fixed, stroke: false, fillColor: line.colour, fillOpacity: 1,
-    }));
-  }
-
-  function hover({latlng: {lat: n, lng: e}}) {
-    hovered.clearLayers();
-    const found = nearest(shown(), n, e, NEAR_PX / metrePx());
-    if (!found) return;
-    const {line, station} = found;
-    const place = stationAt(line, station);
-    const style = {...fixed, color: HOVER, weight: 1.2, fillColor: "#f1c40f"};
-    hovered.addLayer(leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {...fixed, color: "#f1c40f", weight: 4, opacity: 0.75}));
-    hovered.addLayer(leaflet.polygon(around(line, place, data.outline), {...style, fillOpacity: 0.18}));
-    const content = document.createElement("span");
-    content.style.whiteSpace = "pre-line";
-    content.textContent = [
-      line.text,
-      "Station " + (line.first + station) + ", " + (station + 1) + " of " + line.stations,
-      place[0].toFixed(3) + " m N, " + place[1].toFixed(3) + " m E",
-    ].join("\n");
-    leaflet.circleMarker(place, {...style, radius: 5, fillOpacity: 1}).addTo(hovered)
-      .bindTooltip(content, {permanent: true, direction: "top", offset: [0, -8]});
-  }
-
-  /* ---- Counts under the pointer: red pictures, green lines, red 255 outside of the area ---- */
-
-  let counts = null;
-  if (data.counts) {
-    const image = new Image();
-    image.addEventListener("load", () => {
-      const canvas = document.createElement("canvas");
-      [canvas.width, canvas.height] = [image.width, image.height];
-      const context = canvas.getContext("2d", {willReadFrequently: true});
-      context.drawImage(image, 0, 0);
-      counts = context.getImageData(0, 0, image.width, image.height);
-    });
-    image.src = data.counts.png;
-  }
-
-  function countsAt(n, e) {
-    if (!counts) return "";
-    const row = Math.floor((data.counts.north - n) / data.counts.pixel);
-    const column = Math.floor((e - data.counts.west) / data.counts.pixel);
-    if (row < 0 || column < 0 || row >= counts.height || column >= counts.width) return "";
-    const [pictures, passes] = counts.data.slice(4 * (row * counts.width + column));
-    if (pictures === 255) return "";
-    return "; " + (pictures === 254 ? "254 or more" : pictures) + " pictures of " + passes
-      + (passes === 1 ? " line" : " lines");
-  }
-
-  map.on("moveend layerschanged", refresh);
-  map.on("mousemove click", hover);
-  map.on("mouseout", () => hovered.clearLayers());
   layers.get("contours")?.eachLayer((shape) => {
     if (shape.survey) shape.bindTooltip(shape.survey.text, {sticky: true});
   });
-  return ({lat, lng}) => countsAt(lat, lng);
-}
-
-if (typeof module !== "undefined") {
-  module.exports = {around, nearest, stationAt};
+  return drawStations(map, {
+    ...data, groups, lines: () => lines.filter((line) => map.hasLayer(line.group)),
+    stations: layers.get("stations"), footprints: layers.get("footprints"),
+  }).textAt;
 }

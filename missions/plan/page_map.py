@@ -114,7 +114,7 @@ def station_data(plan: Plan, rig: Rig, certificate: Certificate) -> dict[str, An
         "outline": np.round(outline, 4).tolist(),
         "across": plan.footprint_m[0],
         "spacing": plan.line_spacing_m,
-        "counts": _counts_data(certificate),
+        "counts": counts_data(certificate),
     }
 
 
@@ -385,7 +385,7 @@ def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, f
     return rgb, (float(high[0]), float(low[1])), pixel_m
 
 
-def _counts_data(seen: Certificate) -> dict[str, Any]:
+def counts_data(seen: Certificate) -> dict[str, Any]:
     """The counts for the script, which reads those under the pointer."""
     rgb, (north, west), pixel_m = counts_picture(seen)
     png = base64.b64encode(_png(rgb)).decode("ascii")

@@ -230,7 +230,11 @@ def with_ties(planned: PlannedDives) -> PlannedDives:
 
 def _from_line(dive: Dive, count: int) -> Dive:
     """A dive whose lines are counted from another one on."""
-    legs = [replace(leg, line=leg.line + count if leg.line >= 0 else -1) for leg in dive.route.legs]
+    if count == 0:
+        return dive
+    legs = [
+        replace(leg, line=leg.line + count) if leg.line >= 0 else leg for leg in dive.route.legs
+    ]
     return replace(
         dive,
         first_line=dive.first_line + count,

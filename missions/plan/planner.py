@@ -76,24 +76,25 @@ class Planned:
     """Every setting with its equation, source and limit."""
 
 
-def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
+def plan_survey(config: SurveyConfig, rig: Rig, *, most_cells: int | None = None) -> Planned:
     """Plan a survey.
 
     Args:
         config: the survey.
         rig: its cameras in water.
+        most_cells: of the certificate of a large area, for a quick look; all else stays the same.
 
     Raises:
         PlanError: no plan meets the settings; the message names the numbers, and of ways out
             those that were tried up to where lines are laid.
     """
     try:
-        return _planned(config, rig)
+        return _planned(config, rig, most_cells)
     except ConflictError as found:
         raise with_tried_ways(found, config, rig) from None
 
 
-def _planned(config: SurveyConfig, rig: Rig) -> Planned:
+def _planned(config: SurveyConfig, rig: Rig, most_cells: int | None) -> Planned:
     with heard() as warnings:
         config, as_set = as_flown(config), config.plan
         wanted = config.plan
@@ -172,7 +173,8 @@ def _planned(config: SurveyConfig, rig: Rig) -> Planned:
             line_depths_m=depths_m,
             details={},
         )
-        seen = certificate(area, rig, _stations(plan, bathymetry), pattern)
+        stations = _stations(plan, bathymetry)
+        seen = certificate(area, rig, stations, pattern, most_cells=most_cells)
         if seen.share_at_overlap < _ENOUGH:
             warn(
                 f"{1 - seen.share_at_overlap:.2%} of the area gets less overlap than requested, "

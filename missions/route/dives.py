@@ -13,16 +13,18 @@ done where it takes no dive more and little energy.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled_ieee
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from missions.route.turns import Turns, route_through
+from missions.route.turns import Turns, legs_alone, legs_through, line_table, route_of
 from missions.route.ways import Ways
-from missions.values.costs import Costs, leg_costs
-from missions.values.legs import Route
+from missions.values.costs import Costs, leg_row_costs
 from missions.values.line import Line
 from missions.values.plan_file import Dive
 
@@ -107,31 +109,27 @@ def split_dives(
         PlanError: a line does not fit a dive by itself; or all do not and may not be split; or a
             course cannot be flown in the current.
     """
+    table = line_table(lines)
+    way: dict[str, Any] = {
+        "ways": ways, "costs": costs, "turns": turns, "home_ne": home_ne,
+        "turn_radius_m": turn_radius_m, "run_in_m": run_in_m,
+    }  # fmt: skip
 
-    def routed(first: int, last: int) -> Route:
-        return route_through(
-            lines[first : last + 1],
-            turn_radius_m,
-            run_in_m,
-            ways=ways,
-            costs=costs,
-            turns=turns,
-            home_ne=home_ne,
-            first_line=first,
-        )
+    def routed(first: int, last: int) -> Array:
+        return legs_through(table[first : last + 1], first_line=first, **way)
 
     limits = DiveLimits(
         energy_j=usable_wh * _J_PER_WH, time_s=math.inf if longest_s is None else longest_s
     )
     down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
     whole = routed(0, len(lines) - 1)
-    legs = np.stack(leg_costs(whole, costs))
-    _check_flyable(whole, legs[0], lines, costs)
-    energy_j, time_s = legs.sum(axis=1) + down_and_up
+    spent = np.stack(leg_row_costs(whole[:, 2:], costs))
+    _check_flyable(whole, spent[0], lines, costs)
+    energy_j, time_s = spent.sum(axis=1) + down_and_up
     if limits.hold(energy_j, time_s):
         return (_dive(0, len(lines) - 1, whole, float(energy_j), float(time_s)),)
 
-    sums = _sums(whole, legs, [routed(i, i) for i in range(len(lines))], costs, depth_m)
+    sums = _sums(whole, spent, *legs_alone(table, **way), costs, depth_m)
     if not split:
         raise PlanError(_too_large(lines, sums, limits, float(energy_j), float(time_s)))
     parted = _least_dives(sums, limits)
@@ -141,9 +139,9 @@ def split_dives(
         parted = _tied(lines, sums, limits, parted)
     dives = []
     for first, last in parted:
-        route = routed(first, last)
-        energy_j, time_s = np.stack(leg_costs(route, costs)).sum(axis=1) + down_and_up
-        dives.append(_dive(first, last, route, float(energy_j), float(time_s)))
+        legs = routed(first, last)
+        energy_j, time_s = np.stack(leg_row_costs(legs[:, 2:], costs)).sum(axis=1) + down_and_up
+        dives.append(_dive(first, last, legs, float(energy_j), float(time_s)))
     return tuple(dives)
 
 
@@ -159,54 +157,60 @@ def _tied(
     return joined if energy_j <= DEAREST_TIE * apart_j else parted
 
 
-def _dive(first: int, last: int, route: Route, energy_j: float, time_s: float) -> Dive:
+def _dive(first: int, last: int, legs: Array, energy_j: float, time_s: float) -> Dive:
     return Dive(
         first_line=first,
         last_line=last,
-        route=route,
+        route=route_of(legs),
         duration_s=time_s,
         energy_wh=energy_j / _J_PER_WH,
     )
 
 
-def _check_flyable(route: Route, energy_j: Array, lines: Sequence[Line], costs: Costs) -> None:
+def _check_flyable(legs: Array, energy_j: Array, lines: Sequence[Line], costs: Costs) -> None:
     stopped = np.flatnonzero(~np.isfinite(energy_j))
     if not len(stopped):
         return
-    leg = route.legs[int(stopped[0])]
-    what = f"line {leg.line} of {len(lines)}" if leg.line >= 0 else "the way between lines"
+    north, east, course, _, _, line, _, _ = legs[stopped[0]]
+    what = f"line {line:.0f} of {len(lines)}" if line >= 0 else "the way between lines"
     where = (
-        f"{what} at {leg.start_ne_m[0]:.1f} m north, {leg.start_ne_m[1]:.1f} m east on course "
-        f"{math.degrees(leg.heading_rad) % 360.0:.0f} deg cannot be flown"
+        f"{what} at {north:.1f} m north, {east:.1f} m east on course "
+        f"{math.degrees(course) % 360.0:.0f} deg cannot be flown"
     )
     if costs.refused is not None:
         raise costs.refused(where)
     raise PlanError(f"{where}: its cost is infinite")
 
 
-def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth_m: float) -> _Sums:
+def _sums(
+    whole: Array,
+    spent: Array,
+    alone: Array,
+    begins: NDArray[np.int64],
+    costs: Costs,
+    depth_m: float,
+) -> _Sums:
     """Sums along the route through all lines, and of the ways of dives along one line each.
 
     Args:
-        whole: route through all lines, from home to home.
-        legs: (2, L) energy and time of its legs.
-        alone: for each line the route along it by itself.
+        whole: (L, 8) legs through all lines, from home to home.
+        spent: (2, L) their energy and time.
+        alone: legs along each line by itself, as of `legs_alone`.
+        begins: rows at which their ways begin.
         costs: of the vehicle.
         depth_m: of a dive.
     """
-    before = np.concatenate([np.zeros((2, 1)), np.cumsum(legs, axis=1)], axis=1)
-    rows = np.array([i for i, leg in enumerate(whole.legs) if leg.line >= 0])
-    joint = Route(legs=tuple(leg for route in alone for leg in route.legs))
-    spent = np.stack(leg_costs(joint, costs))
-    spent = np.concatenate([np.zeros((2, 1)), np.cumsum(spent, axis=1)], axis=1)
-    on_line = np.array([i for i, leg in enumerate(joint.legs) if leg.line >= 0])
-    starts = np.cumsum([0, *(len(route.legs) for route in alone)])
+    rows = np.flatnonzero(whole[:, 5] >= 0)
+    before = np.concatenate([np.zeros((2, 1)), np.cumsum(spent, axis=1)], axis=1)
+    one = np.cumsum(np.stack(leg_row_costs(alone[:, 2:], costs)), axis=1)
+    one = np.concatenate([np.zeros((2, 1)), one], axis=1)
+    on_line = begins[1::2] - 1
     surface = np.array([[costs.dive_j(depth_m)], [costs.dive_s(depth_m)]])
     return _Sums(
-        home_to=spent[:, on_line] - spent[:, starts[:-1]] + surface,
+        home_to=one[:, on_line] - one[:, begins[:-1:2]] + surface,
         until=before[:, rows],
         through=before[:, rows + 1],
-        back=spent[:, starts[1:]] - spent[:, on_line + 1],
+        back=one[:, begins[2::2]] - one[:, on_line + 1],
     )
 
 
@@ -224,32 +228,12 @@ def _least_dives(
         overlap: how many lines of the dive before each dive flies first.
     """
     count = sums.until.shape[1]
-    energy_j, time_s = limits.energy_j, limits.time_s
-    dives, spent = np.zeros(count + 1), np.zeros(count + 1)
-    begins = np.zeros(count + 1, dtype=np.intp)
-    earliest = 0
-    for last in range(count):
-        through = sums.through[:, last] + sums.back[:, last]
-        # Beyond the first line that is too far back all earlier ones are: until only grows.
-        while earliest < last and (
-            sums.through[0, last] - sums.until[0, earliest] > energy_j
-            or sums.through[1, last] - sums.until[1, earliest] > time_s
-        ):
-            earliest += 1
-        first = np.arange(earliest, last + 1)
-        first = first[~np.isin(first, not_at)]
-        flown = np.maximum(first - overlap, 0)
-        dive_j = sums.home_to[0, flown] + through[0] - sums.until[0, flown]
-        dive_s = sums.home_to[1, flown] + through[1] - sums.until[1, flown]
-        fits = (dive_j <= energy_j) & (dive_s <= time_s) & np.isfinite(dives[first])
-        if not fits.any():
-            dives[last + 1] = spent[last + 1] = math.inf
-            continue
-        least = dives[first][fits].min()
-        total = np.where(fits & (dives[first] == least), spent[first] + dive_j, np.inf)
-        best = int(np.argmin(total))
-        dives[last + 1], spent[last + 1] = least + 1, total[best]
-        begins[last + 1] = first[best]
+    may_begin = np.ones(count + 1, dtype=np.bool_)
+    may_begin[list(not_at)] = False
+    begins, dives = _parted(
+        sums.home_to, sums.until, sums.through, sums.back, may_begin[:count], overlap,
+        limits.energy_j, limits.time_s,
+    )  # fmt: skip
     if not math.isfinite(dives[count]):
         return None
     parted, end = [], count
@@ -258,6 +242,57 @@ def _least_dives(
         parted.append((max(begin - overlap, 0), end - 1))
         end = begin
     return parted[::-1]
+
+
+@compiled_ieee
+def _parted(
+    home_to: Array,
+    until: Array,
+    through: Array,
+    back: Array,
+    may_begin: NDArray[np.bool_],
+    overlap: int,
+    energy_j: float,
+    time_s: float,
+) -> tuple[NDArray[np.int64], Array]:
+    """Where the last dive begins of the best division of lines up to each, and how many dives.
+
+    Args:
+        home_to: (2, N) as the fields of `_Sums`.
+        until: the same.
+        through: the same.
+        back: the same.
+        may_begin: (N,) lines that a dive may begin with.
+        overlap: how many lines of the dive before each dive flies first.
+        energy_j: of a dive at most.
+        time_s: of a dive at most.
+
+    Returns:
+        (N + 1,) both; infinitely many where no division holds all lines.
+    """
+    count = until.shape[1]
+    dives, spent = np.zeros(count + 1), np.zeros(count + 1)
+    begins = np.zeros(count + 1, dtype=np.int64)
+    earliest = 0
+    for last in range(count):
+        # Beyond the first line that is too far back all earlier ones are: until only grows.
+        while earliest < last and (
+            through[0, last] - until[0, earliest] > energy_j
+            or through[1, last] - until[1, earliest] > time_s
+        ):
+            earliest += 1
+        least, total = np.inf, np.inf
+        for first in range(earliest, last + 1):
+            flown = max(first - overlap, 0)
+            dive_j = home_to[0, flown] + (through[0, last] + back[0, last]) - until[0, flown]
+            dive_s = home_to[1, flown] + (through[1, last] + back[1, last]) - until[1, flown]
+            if not (may_begin[first] and dive_j <= energy_j and dive_s <= time_s):
+                continue
+            if dives[first] < least or (dives[first] == least and spent[first] + dive_j < total):
+                least, total = dives[first], spent[first] + dive_j
+                begins[last + 1] = first
+        dives[last + 1], spent[last + 1] = least + 1.0, total
+    return begins, dives
 
 
 def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: DiveLimits, depth_m: float) -> str:

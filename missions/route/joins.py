@@ -73,6 +73,57 @@ def joined_lines(
 
 
 @compiled_ieee
+def lines_alone(
+    fence: Fence,
+    costs: Costs,
+    lines: Array,
+    home: Array,
+    radius: float,
+    run_in: float,
+    wanted: int,
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """The legs from home along each line by itself and home again, one line after the other.
+
+    Args:
+        fence: of the allowed area.
+        costs: what to keep low.
+        lines: (N, 5) north and east of start and end, heading.
+        home: (3,) north, east, and a heading of NaN.
+        radius: of arcs.
+        run_in: straight before and, for arcs, after each line.
+        wanted: as of `joined_lines`.
+
+    Returns:
+        (L, 8) legs; (2N + 1,) the rows at which ways begin, out and back by turns: a line's own leg
+        is the last of the way out; (2N,) how the ways go, and (2N,) whether a way round corners
+        should be compared, as of `join`.
+    """
+    count = lines.shape[0]
+    legs = np.empty((count * (2 * _MOST_LEGS + 1), COLUMNS))
+    begins = np.zeros(2 * count + 1, dtype=np.int64)
+    kinds = np.zeros(2 * count, dtype=np.int64)
+    detours = np.zeros(2 * count, dtype=np.bool_)
+    start = np.empty(3)
+    used = 0
+    for i in range(count):
+        start[:2], start[2] = lines[i, :2], lines[i, 4]
+        kinds[2 * i], made, detours[2 * i] = join(fence, costs, home, start, radius, run_in, wanted)
+        legs[used : used + len(made)] = made
+        used += len(made)
+        length = math.hypot(lines[i, 2] - lines[i, 0], lines[i, 3] - lines[i, 1])
+        used = _add(legs, used, lines[i, 0], lines[i, 1], lines[i, 4], length, 0.0)
+        legs[used - 1, 5] = i
+        begins[2 * i + 1] = used
+        kinds[2 * i + 1], made, detours[2 * i + 1] = join(
+            fence, costs, lines[i, 2:], home, radius, run_in, wanted
+        )
+        legs[used : used + len(made)] = made
+        used += len(made)
+        begins[2 * i + 2] = used
+    return legs[:used], begins, kinds, detours
+
+
+@compiled_ieee
 def join(
     fence: Fence,
     costs: Costs,

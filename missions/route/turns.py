@@ -59,9 +59,44 @@ def route_through(
         PlanError: there is no line, a line has no length or leaves the allowed area, or two places
             are in parts of it that are not connected.
     """
-    if not lines:
+    return route_of(
+        legs_through(
+            line_table(lines),
+            turn_radius_m,
+            run_in_m,
+            ways=ways,
+            costs=costs,
+            turns=turns,
+            home_ne=home_ne,
+            first_line=first_line,
+        )
+    )
+
+
+def line_table(lines: Sequence[Line]) -> Array:
+    """North and east of the start and the end of each line, and its heading, (N, 5)."""
+    return np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
+
+
+def route_of(legs: Array) -> Route:
+    """The route of legs (L, 8), columns as of `joins.COLUMNS`."""
+    return Route(legs=_legs(legs))
+
+
+def legs_through(
+    table: Array,
+    turn_radius_m: float,
+    run_in_m: float,
+    *,
+    ways: Ways | None = None,
+    costs: Costs | None = None,
+    turns: Turns = "auto",
+    home_ne: tuple[float, float] | None = None,
+    first_line: int = 0,
+) -> Array:
+    """As `route_through`, of a `line_table` and with (L, 8) legs, columns as of `joins.COLUMNS`."""
+    if not len(table):
         raise PlanError("there is no line to fly")
-    table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
     fence = OPEN_WATER if ways is None else ways.fence
     _check_lines(table, ways, first_line)
     costs = (time_costs(PAPER_SPEED_MPS) if costs is None else costs).compilable()
@@ -92,7 +127,50 @@ def route_through(
         pieces.append(way)
     pieces += [legs[done:], last]
     _warn_of_others(kinds, turns)
-    return Route(legs=_legs(np.concatenate(pieces)))
+    return np.concatenate(pieces)
+
+
+def legs_alone(
+    table: Array,
+    turn_radius_m: float,
+    run_in_m: float,
+    *,
+    ways: Ways | None,
+    costs: Costs,
+    turns: Turns,
+    home_ne: tuple[float, float],
+) -> tuple[Array, NDArray[np.int64]]:
+    """The ways from home along each line by itself and home again; all lines can be flown.
+
+    Args:
+        table: the lines, as `line_table` has them.
+        turn_radius_m: of every arc.
+        run_in_m: as of `route_through`, as is all else.
+        ways: inside the allowed area.
+        costs: what to keep low.
+        turns: how to turn.
+        home_ne: where each way begins and ends.
+
+    Returns:
+        (L, 8) legs, columns as of `joins.COLUMNS`; and (2N + 1,) the rows at which ways out and
+        back begin by turns: a line's own leg is the last of its way out.
+    """
+    fence = OPEN_WATER if ways is None else ways.fence
+    costs, home = costs.compilable(), np.array([*home_ne, _FREE])
+    legs, begins, kinds, detours = joins.lines_alone(
+        fence, costs, table, home, turn_radius_m, run_in_m, _WANTED[turns]
+    )
+    if ways is None or not detours.any():
+        return legs, begins
+    pieces = np.split(legs, begins[1:-1])
+    for i in np.flatnonzero(detours).tolist():
+        line, own = table[i // 2], pieces[i][-1:] if i % 2 == 0 else legs[:0]
+        end, goal = (line[2:], home) if i % 2 else (home, line[[0, 1, 4]])
+        way = _round_corners(ways, end, goal, run_in_m)
+        direct = pieces[i][: len(pieces[i]) - len(own)]
+        pieces[i] = np.concatenate([_cheaper(kinds[i], direct, way, costs)[0], own])
+    begins[1:] = np.cumsum([len(piece) for piece in pieces])
+    return np.concatenate(pieces), begins
 
 
 def _check_lines(table: Array, ways: Ways | None, first_line: int) -> None:

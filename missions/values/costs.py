@@ -122,21 +122,24 @@ def leg_costs(route: Route, costs: Costs) -> tuple[Array, Array]:
 
     The power on an arc is that of each course it passes through.
     """
-    if not route.legs:
+    rows = [
+        (
+            leg.heading_rad,
+            leg.length_m,
+            leg.curvature_per_m,
+            leg.line,
+            leg.turn_rad,
+            leg.side_rad,
+        )
+        for leg in route.legs
+    ]
+    return leg_row_costs(np.array(rows, dtype=np.float64).reshape(-1, 6), costs)
+
+
+def leg_row_costs(rows: Array, costs: Costs) -> tuple[Array, Array]:
+    """The same of (L, 6) course, length, curvature, line or -1, turn and side of each leg."""
+    if not len(rows):
         return np.empty(0), np.empty(0)
-    rows = np.array(
-        [
-            (
-                leg.heading_rad,
-                leg.length_m,
-                leg.curvature_per_m,
-                leg.line,
-                leg.turn_rad,
-                leg.side_rad,
-            )
-            for leg in route.legs
-        ]
-    )
     course, length, curvature, line, turn, side = rows.T
     spot, sway = turn != 0.0, side != 0.0
     seconds = length / np.where(sway, costs.sway_mps, costs.speed_mps)

@@ -18,11 +18,13 @@ before, coming to rest after, and speeding up again.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 
@@ -114,6 +116,11 @@ def _places(begins: Array, along_m: Array) -> Array:
     return ne
 
 
+def places_on(legs: Sequence[Leg], of: NDArray[np.intp], along_m: Array) -> Array:
+    """Where legs are, (N, 2), after distances (N,) along those of indices (N,)."""
+    return _places(np.array([leg._start for leg in legs]).reshape(-1, 4)[of], along_m)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Route:
     """Legs that follow one another without a gap. Places are of the left port's glass."""
@@ -134,5 +141,4 @@ class Route:
         """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
         starts = self.starts_m
         index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
-        begins = np.array([leg._start for leg in self.legs])
-        return _places(begins[index], along_m - starts[index])
+        return places_on(self.legs, index, along_m - starts[index])

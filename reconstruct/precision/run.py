@@ -244,7 +244,7 @@ def _write(folder: Path, base: Candidate, data: Mapping[str, Any]) -> None:
         design, again = design_rig(config.camera, config.water), Path(scratch)
         options = options_of(config.camera, config.plan)
         planned = plan_survey(config, design)
-        write_planned(again, planned, design, options, config.sea, [_layer(heights, grid)])
+        write_planned(again, planned, design, options, config.sea, [heights_layer(heights, grid)])
         if read_json(again / "plan.json") != read_json(folder / "plan.json"):
             warn("plan.html stays without sigmas: settings differ from the plan's; run plan")
             return
@@ -252,7 +252,7 @@ def _write(folder: Path, base: Candidate, data: Mapping[str, Any]) -> None:
             page.write_bytes((again / "plan.html").read_bytes())
 
 
-def _layer(heights: Array, grid: DemGrid) -> PictureLayer:
+def heights_layer(heights: Array, grid: DemGrid) -> PictureLayer:
     """Sigmas of heights as a layer of the plan's page."""
     known = np.isfinite(heights)
     low, high = (_MM * float(x) for x in (np.nanmin(heights), np.nanmax(heights)))

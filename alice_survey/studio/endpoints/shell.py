@@ -37,14 +37,15 @@ class _Shell:
         held = Held.of(workspace.folder)
         found = survey_map(held, ())
         datum = held.frame.datum
+        placed = found.placed or not held.has("sparse")  # a plan is drawn on east and north
         web = resources.files("alice_survey.studio") / "web"
         return {
             "workspace": str(workspace.folder),
             "name": held.name,
             "stages": sorted(held.stages),
             "unit": found.unit,
-            "axes": ["east", "north"] if found.placed else ["along x", "along y"],
-            "placed": found.placed,
+            "axes": ["east", "north"] if placed else ["along x", "along y"],
+            "placed": placed,
             "origin": found.origin,
             "simulated": held.simulated,
             "plane": None if held.plane is None else held.plane.name,

@@ -1,10 +1,7 @@
 """The page is safe, small and right; its script finds stations, alone and in Chromium."""
 
 import json
-import os
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,13 +18,13 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exposure.settings_table import Setting
 from missions.plan import page as page_module
-from missions.plan.page import write_page
+from missions.plan.page import SCRIPTS, write_page
 from missions.plan.page_map import counts_picture, geodetic_fit, plan_map
 from missions.values.plan_file import Plan
 from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.node import run_node
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 
-SCRIPT = Path(page_module.__file__).with_name("page_map.js")
 NASTY = "<script>alert('a')</script>&\"<!--</title>"
 ROW = Setting(
     group="camera", name="<i>exposure</i>", value=1.83, unit="ms", equation="t = p / v",
@@ -38,17 +35,6 @@ ROW = Setting(
 def seen_of(plan: Plan, cell_m: float | None = None) -> Certificate:
     pattern = plan_pattern(plan, RIG)
     return certificate(plan.area, RIG, stations_of_plan(plan), pattern, cell_m=cell_m)
-
-
-def run_node(*arguments: str) -> Any:
-    node = shutil.which("node")
-    if node is None:
-        if os.environ.get("CI"):
-            pytest.fail("CI needs node to run the page's script")
-        pytest.skip("no node here")
-    done = subprocess.run([node, *arguments], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
 
 
 def layers_of(
@@ -84,7 +70,7 @@ def test_the_same_plan_gives_the_same_page_that_loads_nothing(tmp_path: Path) ->
     assert text == (tmp_path / "b.html").read_text(encoding="utf-8")
     assert "default-src 'none'; img-src data: blob:;" in text
     assert re.search(r"<(img|script|link)[^>]*(src|href)=.(?!data:)", text) is None
-    assert "innerHTML" not in SCRIPT.read_text(encoding="utf-8")
+    assert all("innerHTML" not in script.read_text(encoding="utf-8") for script in SCRIPTS)
 
 
 def test_pages_stay_small(tmp_path: Path) -> None:
@@ -137,9 +123,9 @@ def test_the_script_finds_lines_and_stations() -> None:
     ]  # fmt: skip
     places = [[0.5, 0.9], [2.4, 3.05], [4.0, 2.2], [100.0, 3.0]]
     code = (
-        f"const m=require({json.dumps(str(SCRIPT))});"
+        f"const m=require({json.dumps(str(SCRIPTS[0]))});"
         f"console.log(JSON.stringify({json.dumps(places)}.map(([n,e])=>{{"
-        f"const f=m.nearest({json.dumps(ends)},n,e,0.3);"
+        f"const f=m.nearestStation({json.dumps(ends)},n,e,0.3);"
         "return [f&&f.line.index,f&&f.station,f&&m.stationAt(f.line,f.station)]})))"
     )
     stations = [entry.stations_ne for entry in plan.lines]

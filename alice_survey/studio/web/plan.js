@@ -1,0 +1,265 @@
+/* The Plan tab: draw a survey, see it re-planned, save it. */
+
+import {attempt, button, el, get, number, say, send} from "./core.js";
+import {drawing} from "./plan_draw.js";
+import {
+  AS_IN_FILE, canRedo, canUndo, current, record, redo, same, startHistory, undo, withChange, withChanges,
+} from "./plan_history.js";
+import {latest} from "./plan_latest.js";
+import {playback} from "./plan_play.js";
+import {profileView} from "./plan_profile.js";
+import {resultsPanel} from "./plan_results.js";
+import {settingsPanel} from "./plan_settings.js";
+import {noShapes, paths, withImported} from "./plan_shapes.js";
+import {shown} from "./plan_show.js";
+import {summaryOf} from "./plan_words.js";
+
+const QUIET_MS = 900;  /* after which the figures are said */
+const TOO_LARGE = 20e6;
+const AREA_KEYS = /^(polygon|corridor|file$|wkt$|length_m|width_m)/;
+
+export function tab(studio) {
+  let [file, history, active, preview, fitted, quiet] = [null, startHistory(), false, null, false, null];
+  const body = () => current(history);
+  const isDirty = () => !same(body(), AS_IN_FILE);
+  document.head.append(el("link", {rel: "stylesheet", href: new URL("plan.css", import.meta.url).href}));
+
+  /* ---- Parts ---- */
+
+  const view = shown(studio);
+  const draw = drawing(studio, {changed: reshaped, moving: (shapes) => plan({...body(), shapes})});
+  const results = resultsPanel((changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
+  const along = profileView((place) => view.mark(place));
+  const play = playback({ask: () => send("/api/plan/play", body()), mark: view.mark});
+  const controls = el("div");
+  const precision = el("p", {class: "note"}, "How well the model of this survey is expected to be known.");
+  const exports = el("ul");
+  const back = button("Undo", () => step(undo), {title: "Ctrl+Z"});
+  const forth = button("Redo", () => step(redo), {title: "Ctrl+Shift+Z"});
+  const keep = button("Save", save, {class: "primary"});
+  const note = el("p", {class: "note"});
+  const dropped = el("input", {type: "file", onchange: () => { importFile(dropped.files[0]); dropped.value = ""; }});
+  let settings = null;
+
+  const panel = el("div", {},
+    el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep, button("Text", showText, {title: "Show survey.toml as it would be saved"})),
+      results.key, note),
+    results.top,
+    el("h2", {}, "Area"), draw.panel,
+    el("details", {}, el("summary", {}, "Import a file"),
+      el("label", {class: "field"}, "GeoJSON, KML, GeoPackage, zipped shapefile, WKT; or drop it on the map", dropped)),
+    el("h2", {}, "How to fly"), controls,
+    results.below,
+    el("details", {open: true}, el("summary", {}, "Depth along the way"), along.element),
+    el("details", {ontoggle: () => play.pause()}, el("summary", {}, "Play the dive"), play.element),
+    el("details", {}, el("summary", {}, "Expected precision"), precision,
+      el("div", {class: "buttons"}, button("Compute it", () => attempt(showPrecision)))),
+    el("details", {}, el("summary", {}, "Export"), exports));
+
+  /* ---- Planning in the background ---- */
+
+  const planning = latest({
+    ask: (state, signal) => send("/api/plan/preview", state, {signal}),
+    shown: settled,
+    failed: (fault) => say(fault.message, "error"),
+    busy: view.dim,
+  });
+
+  function plan(state, wait) {
+    clearTimeout(quiet);
+    draw.update(shapesOf(state));
+    planning.request(state, wait);
+  }
+
+  function settled(answer) {
+    if (answer.ok) {
+      preview = answer;
+      view.sigma(null);
+      view.show(answer);
+      along.show(answer.profile, answer.routes);
+      if (!fitted) view.fit(shapesOf(body()));
+      fitted = true;
+    }
+    play.forget();
+    results.show(answer);
+    settings.set(body().changes, answer.ok ? answer : preview);
+    panel.dataset.plans = Number(panel.dataset.plans || 0) + 1;
+    quiet = setTimeout(() => say(summaryOf(answer), answer.ok ? "note" : "warn"), QUIET_MS);
+  }
+
+  /* ---- Edits ---- */
+
+  const shapesOf = (state) => ({...noShapes(), ...(state.shapes || file.shapes)});
+
+  /* What is drawn first takes the place of the rectangle that is surveyed where nothing is set. */
+  function reshaped(shapes, tag = "") {
+    const isDefault = !body().shapes && !(file.written.area || []).some((key) => AREA_KEYS.test(key));
+    const added = (kind) => shapes[kind].slice(file.shapes[kind]?.length || 0);
+    const replaced = isDefault && (added("survey").length || added("corridors").length);
+    edit({...body(), shapes: replaced ? {...shapes, survey: added("survey")} : shapes}, tag);
+    if (replaced && added("survey").length) draw.choose({kind: "survey", index: 0, ring: 0});
+  }
+
+  function setting(values, tag) {
+    const changes = values.reduce((all, [section, key, value]) => withChange(all, file, section, key, value), body().changes);
+    edit({...body(), changes}, tag);
+  }
+
+  function edit(state, tag = "") {
+    history = record(history, state, tag, Date.now());
+    buttons();
+    settings.set(state.changes, preview);
+    plan(state);
+  }
+
+  function step(way) {
+    history = way(history);
+    buttons();
+    settings.set(body().changes, preview);
+    plan(body());
+  }
+
+  function buttons() {
+    [back.disabled, forth.disabled] = [!canUndo(history), !canRedo(history)];
+    keep.disabled = !studio.mayWrite();
+    note.textContent = isDirty() ? "Not saved." : file?.token ? "As in survey.toml." : "No survey.toml yet: these are the defaults.";
+  }
+
+  /* ---- The file ---- */
+
+  async function load() {
+    file = await get("/api/plan");
+    settings = settingsPanel(file, setting);
+    controls.replaceChildren(settings.element);
+    exports.replaceChildren(...(file.formats || []).map((name) => el("li", {}, el("a", {
+      href: "/api/plan/export?format=" + encodeURIComponent(name), download: "",
+    }, name))));
+    if (!exports.children.length || !file.saved) exports.replaceChildren(el("li", {}, "Save the plan first."));
+  }
+
+  async function restart(state = AS_IN_FILE) {
+    await load();
+    history = startHistory();
+    if (!same(state, AS_IN_FILE)) history = record(history, state);
+    buttons();
+    settings.set(body().changes, file.saved);
+    draw.update(shapesOf(body()));
+    if (isDirty() || !file.saved) plan(body(), 0);
+    else settled(file.saved);
+  }
+
+  async function save() {
+    keep.disabled = true;
+    say("Saving: the plan is made with all its files");
+    try {
+      const {changes, shapes} = body();
+      await send("/api/plan/save", {changes, shapes, token: file.token});
+      await restart();
+      await studio.refresh();
+      view.alone();
+      say("Saved: survey.toml, and the plan in plan/");
+    } catch (fault) {
+      if (fault.status === 409) conflict(fault);
+      else say(fault.message, "error");
+    }
+    buttons();
+  }
+
+  function dialog(title, ...children) {
+    const box = el("dialog", {"aria-label": title, onclose: () => box.remove()}, el("h2", {}, title), ...children);
+    document.body.append(box);
+    box.showModal();
+    return box;
+  }
+
+  function conflict(fault) {
+    const mine = body();
+    const box = dialog("Changed by somebody else",
+      el("p", {}, fault.message),
+      el("div", {class: "buttons"},
+        button("Load theirs", () => { box.close(); attempt(() => restart()); }, {class: "primary"}),
+        button("Keep mine on top of theirs", () => { box.close(); attempt(() => restart(mine)); }),
+        button("Cancel", () => box.close())));
+    say(fault.message, "warn");
+  }
+
+  function showText() {
+    return attempt(async () => {
+      const text = await send("/api/plan/text", {...body(), token: file.token});
+      const box = dialog("survey.toml, as Save writes it",
+        el("div", {class: "plan-text", tabindex: "0", role: "region", "aria-label": "Text of survey.toml"}, text.survey_toml),
+        el("div", {class: "buttons"}, button("Close", () => box.close(), {class: "primary"})));
+    });
+  }
+
+  /* ---- Precision and import ---- */
+
+  async function showPrecision() {
+    precision.textContent = "Computing ...";
+    const asked = body();
+    const found = await send("/api/plan/precision", asked).finally(() => { precision.textContent = ""; });
+    if (!same(asked, body())) return;
+    precision.textContent = found.text || "Bend " + number(found.bend_mm, "mm") + ", scale " + number(found.scale_ppm, "ppm")
+      + ", heights " + number(found.height_mm, "mm") + ", stations " + number(found.station_mm, "mm");
+    view.sigma(found.layer);
+  }
+
+  function importFile(taken) {
+    if (!taken) return;
+    if (taken.size > TOO_LARGE) {
+      say(taken.name + " has " + Math.round(taken.size / 1e6) + " MB: at most 20 are taken", "error");
+      return;
+    }
+    attempt(async () => {
+      const found = await send("/api/plan/import", taken, {params: {name: taken.name}});
+      const count = paths({...noShapes(), ...found}).length;
+      fitted = false;
+      edit({...body(), shapes: withImported(shapesOf(body()), found)});
+      say(count + " shapes from " + taken.name);
+    });
+  }
+
+  const side = studio.map.leaflet.getContainer();
+  const dragged = (on) => side.classList.toggle("plan-drop", on);
+  side.addEventListener("dragover", (event) => {
+    if (!active || !event.dataTransfer.types.includes("Files")) return;
+    event.preventDefault();
+    dragged(true);
+  });
+  side.addEventListener("dragleave", () => dragged(false));
+  side.addEventListener("drop", (event) => {
+    dragged(false);
+    if (!active || !event.dataTransfer.files.length) return;
+    event.preventDefault();
+    importFile(event.dataTransfer.files[0]);
+  });
+
+  /* ---- The page ---- */
+
+  document.addEventListener("keydown", (event) => {
+    const isText = event.target.closest("textarea, input:not([type=range], [type=checkbox])");
+    if (!active || !file || isText || !(event.ctrlKey || event.metaKey) || event.altKey) return;
+    const way = {z: event.shiftKey ? redo : undo, y: redo}[event.key.toLowerCase()];
+    if (!way) return;
+    event.preventDefault();
+    step(way);
+  });
+  window.addEventListener("beforeunload", (event) => { if (isDirty()) event.preventDefault(); });
+
+  async function enter() {
+    active = true;
+    view.enter();
+    draw.enter();
+    if (!file) await attempt(() => restart());
+  }
+
+  function leave() {
+    active = false;
+    play.pause();
+    draw.leave();
+    view.leave();
+    view.dim(false);
+  }
+
+  return {name: "plan", title: "Plan", panel, enter, leave};
+}

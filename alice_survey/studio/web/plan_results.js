@@ -1,0 +1,55 @@
+/* What a plan comes to: totals, warnings, limits that bind, settings and why; or why there is none,
+   and the ways out. */
+
+import {button, el, table} from "./core.js";
+import {keyFigures, totalRows} from "./plan_words.js";
+
+/* `apply(changes)` takes a way out. */
+export function resultsPanel(apply) {
+  const key = el("dl", {class: "plan-key plan-totals"});
+  const totals = el("div", {class: "plan-totals"});
+  const refused = el("div", {hidden: true});
+  const warnings = el("ul", {class: "warn", hidden: true});
+  const limits = el("div", {class: "plan-limits"});
+  const rows = el("div");
+  const limitsBox = el("details", {hidden: true}, el("summary", {}, "Limits"), limits);
+  const rowsBox = el("details", {hidden: true}, el("summary", {}, "Settings and why"), rows);
+
+  function show(preview) {
+    refused.hidden = preview.ok;
+    if (!preview.ok) {
+      refuse(preview);
+      return;
+    }
+    key.replaceChildren(...keyFigures(preview.totals).map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
+    totals.replaceChildren(table("Totals", [], totalRows(preview.totals)));
+    warnings.hidden = !preview.warnings.length;
+    warnings.replaceChildren(...preview.warnings.map((text) => el("li", {}, text)));
+    const binding = preview.limits.filter((limit) => limit.binds);
+    limitsBox.hidden = !preview.limits.length;
+    limitsBox.querySelector("summary").textContent = "Limits: " + (binding.length
+      ? binding.map((limit) => limit.name).join(", ") + (binding.length > 1 ? " bind" : " binds") : "none binds");
+    limits.replaceChildren(table("Limits", ["", "is", "limit"], preview.limits.map((limit) => [
+      el("span", limit.binds ? {class: "binds"} : {}, limit.name + (limit.binds ? " (binds)" : ""), limit.text ? el("small", {}, " " + limit.text) : null),
+      figure(limit.value), figure(limit.limit),
+    ])));
+    rowsBox.hidden = !preview.rows.length;
+    rows.replaceChildren(table("Settings and why", ["setting", "value", "why"], preview.rows));
+  }
+
+  const figure = (value) => (typeof value === "number" ? String(Number(value.toPrecision(4))) : value ?? "");
+
+  function refuse({error, ways, limits: between}) {
+    refused.replaceChildren(
+      el("p", {class: "error"}, "No plan: " + error),
+      (between || []).length ? el("p", {class: "note"}, "Between " + between.join(" and ") + ". The map shows the last plan.") : null,
+      ways.length ? el("h3", {}, "Ways out") : "",
+      el("ul", {class: "plan-ways"}, ways.map((way) => el("li", {}, button(
+        [way.change, way.price ? el("small", {}, way.price) : null], () => apply(way.changes),
+      )))),
+    );
+  }
+
+  const totalsBox = el("details", {}, el("summary", {}, "All figures"), totals);
+  return {key, top: el("div", {}, refused, warnings), below: el("div", {}, totalsBox, limitsBox, rowsBox), show};
+}

@@ -1,0 +1,359 @@
+"""Shapes of an area as somebody draws them: from settings, and back into settings and files.
+
+One polygon, one corridor, zones and an allowed area of plain polygons stand in the settings
+themselves, in metres; what these cannot hold (holes, several parts, many corners) goes into GeoJSON
+files next to them. Shapes that were not changed leave their settings and files as they are.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from alice_survey.base.config import AreaConfig, Config
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array, Datum
+from missions.areas.crs import FARTHEST_M, LocalFrame, middle
+from missions.areas.files import Role, read_area_file
+from missions.areas.raw import RawShapes
+from missions.areas.survey import GivenShapes, corridor_strip, given_shapes
+
+FILES = {
+    "survey": "drawn-area.geojson", "no_go": "drawn-no-go.geojson",
+    "allowed": "drawn-allowed.geojson",
+}  # fmt: skip
+"""Names of the files that hold drawn shapes."""
+_KEYS = {
+    "survey": (
+        "polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "corridor_latlon_deg", "wkt",
+        "file", "layer",
+    ),
+    "no_go": ("no_go_ne_m", "no_go_latlon_deg", "no_go_file", "no_go_layer"),
+    "allowed": ("allowed_ne_m", "allowed_latlon_deg", "allowed_file", "allowed_layer"),
+}  # fmt: skip
+_NEED_CRS = ("file", "wkt", "no_go_file", "allowed_file")
+_MOST_INLINE = 100
+"""Corners of the shapes that one setting holds; a file holds more."""
+_DECIMALS, _DEGREE_DECIMALS = 4, 11
+"""A tenth of a millimetre; about a micrometre."""
+_SAME_M = 6e-4
+"""Corners this near are the same: whoever draws may round to a millimetre."""
+_MOST_CORNERS = 200_000
+
+Place = tuple[float, float]
+Open = tuple[Place, ...]
+
+
+class DrawnPolygon(Config):
+    """A polygon as a page sends it, north and east of the datum, metres; its rings are open."""
+
+    outer: Open = Field(min_length=3, max_length=_MOST_CORNERS)
+    holes: tuple[Open, ...] = ()
+
+    @property
+    def rings(self) -> tuple[Open, ...]:
+        """Outer ring and holes."""
+        return (self.outer, *self.holes)
+
+
+class DrawnShapes(Config):
+    """All shapes of an area, as a page sends them."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    survey: tuple[DrawnPolygon, ...] = ()
+    no_go: tuple[DrawnPolygon, ...] = ()
+    allowed: tuple[DrawnPolygon, ...] = ()
+    """Where the vehicle may be; empty: the survey area and room to turn."""
+    corridors: tuple[Open, ...] = ()
+    """Lines along which a strip is surveyed."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AreaDrawing:
+    """The shapes of an area's settings, ready to be drawn."""
+
+    shapes: DrawnShapes
+    datum: Datum
+    """To which they count."""
+    marks: tuple[Sequence[Array], Array] = ((), np.empty((0, 2)))
+    """Lines, (N, 2) each, and points, (N, 2), to keep away from; a file's, which cannot be drawn.
+    """
+
+
+def area_drawing(settings: AreaConfig) -> AreaDrawing:
+    """The shapes of an area's settings.
+
+    Args:
+        settings: of the area. Corridors of a width of their own, and lines in an allowed area, are
+            the polygons that they cover.
+
+    Raises:
+        PlanError: a file or text cannot be read.
+    """
+    return _drawing(given_shapes(settings), settings)
+
+
+def area_settings(
+    shapes: DrawnShapes, settings: AreaConfig, datum: Datum | None = None
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Settings and files for drawn shapes.
+
+    Args:
+        shapes: wanted, in the frame of `area_drawing(settings)`.
+        settings: of the area so far.
+        datum: to which the shapes count from now on; None: as so far.
+
+    Returns:
+        The settings that change, None of those to take out; and the contents of files to write, by
+        their names next to the settings. Both are empty where the shapes are the settings' own.
+
+    Raises:
+        PlanError: nothing is left to survey, or a corner is not where it can be.
+    """
+    if not (shapes.survey or shapes.corridors):
+        raise PlanError("area: nothing is drawn to survey: draw a polygon or a corridor")
+    try:
+        given = given_shapes(settings)
+        now, frame = _drawing(given, settings), given.frame
+    except PlanError:  # whatever was there before cannot be read: all is drawn again
+        datum = Datum(settings.latitude_deg, settings.longitude_deg)
+        now = AreaDrawing(shapes=DrawnShapes(), datum=datum)
+        frame = LocalFrame(
+            datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True
+        )
+        given = None
+    if datum is not None:
+        frame = replace(frame, datum=datum, datum_is_given=True)
+    no_go = not _same(shapes.no_go, now.shapes.no_go)
+    survey = not (
+        _same(shapes.survey, now.shapes.survey)
+        and _same_lines(shapes.corridors, now.shapes.corridors)
+    )
+    # A file that holds zones, too, is left out as a whole.
+    survey |= no_go and given is not None and given.survey.no_go is not None
+    allowed = not _same(shapes.allowed, now.shapes.allowed)
+    values: dict[str, Any] = {}
+    files: dict[str, str] = {}
+    if survey:
+        values |= _left_out("survey", settings) | _survey(shapes, frame, files)
+    if no_go or (survey and given is not None and given.survey.no_go is not None):
+        values |= _left_out("no_go", settings) | _no_go(shapes.no_go, now.marks, frame, files)
+    if allowed:
+        values |= _left_out("allowed", settings) | _allowed(shapes.allowed, frame, files)
+    if not values:
+        return {}, {}
+    if len(settings.datum_given) < 2 and (not frame.datum_is_given or "file" in values):
+        values["latitude_deg"] = frame.datum.latitude_deg
+        values["longitude_deg"] = frame.datum.longitude_deg
+    if settings.crs is not None and not _needs_crs(settings, values):
+        values["crs"] = None
+    return values, files
+
+
+def drawing_of_file(
+    path: Path,
+    settings: AreaConfig,
+    *,
+    role: Role = "survey",
+    layer: str | None = None,
+    crs: str | None = None,
+    at_datum: bool = True,
+) -> AreaDrawing:
+    """The shapes of a file, to be drawn.
+
+    Args:
+        path: of a kind that areas are read from.
+        settings: of the area so far.
+        role: what the shapes are for.
+        layer: of a file with several.
+        crs: of a file that does not say.
+        at_datum: whether they count to the datum so far; else to the middle of the file.
+
+    Raises:
+        PlanError: the file cannot be read, or lies too far from the datum.
+    """
+    raw = read_area_file(path, layer, crs, role=role)
+    datum = area_drawing(settings).datum if at_datum or not raw.geographic else middle(raw)
+    frame = LocalFrame(datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True)
+    given = GivenShapes(
+        survey=raw if role == "survey" else replace(raw, polygons=(), lines=()),
+        no_go=tuple(
+            zone for zone in (raw if role == "no_go" else None, raw.no_go) if zone is not None
+        ),
+        allowed=raw if role == "allowed" else None,
+        frame=frame,
+    )
+    return _drawing(given, settings)
+
+
+def _drawing(given: GivenShapes, settings: AreaConfig) -> AreaDrawing:
+    frame, width_m = given.frame, settings.corridor_width_m
+    survey = frame.localised(given.survey)
+    plain = [line for line in survey.lines if line.width_m in (None, width_m)]
+    wide = [line for line in survey.lines if line.width_m not in (None, width_m)]
+    strips = [
+        corridor_strip(line.points, line.width_m or width_m, survey.origin, "corridor")
+        for line in wide
+    ]
+    zones = [frame.localised(zone) for zone in given.no_go]
+    room: list[DrawnPolygon] = []
+    if given.allowed is not None:
+        allowed = frame.localised(given.allowed)
+        ways = [corridor_strip(x.points, width_m, allowed.origin, "line") for x in allowed.lines]
+        room = [*_polygons(allowed), *_covered(ways)]
+    points = [zone.points for zone in zones if len(zone.points)]
+    return AreaDrawing(
+        shapes=DrawnShapes(
+            survey=(*_polygons(survey), *_covered(strips)),
+            no_go=tuple(polygon for zone in zones for polygon in _polygons(zone)),
+            allowed=tuple(room),
+            corridors=tuple(_rounded(line.points) for line in plain),
+        ),
+        datum=frame.datum,
+        marks=(
+            [line.points for zone in zones for line in zone.lines],
+            np.concatenate([np.empty((0, 2)), *points]),
+        ),
+    )
+
+
+def _polygons(raw: RawShapes) -> Iterator[DrawnPolygon]:
+    """The polygons of a source in local metres; rings of fewer than three corners hold nothing."""
+    for rings in raw.polygons:
+        outer, *holes = (_open(ring) for ring in rings)
+        if len(outer) >= 3:
+            yield DrawnPolygon(outer=outer, holes=tuple(hole for hole in holes if len(hole) >= 3))
+
+
+def _covered(strips: Iterable[Any]) -> Iterator[DrawnPolygon]:
+    for strip in strips:
+        for part in getattr(strip, "geoms", [strip]):
+            outer, *holes = (_open(np.asarray(r.coords)) for r in (part.exterior, *part.interiors))
+            yield DrawnPolygon(outer=outer, holes=tuple(holes))
+
+
+def _open(ring: Array) -> Open:
+    closed = len(ring) > 1 and np.allclose(ring[0], ring[-1], atol=1e-9, rtol=0.0)
+    return _rounded(ring[:-1] if closed else ring)
+
+
+def _rounded(points: Array) -> Open:
+    rows = (np.round(np.asarray(points)[:, :2], _DECIMALS) + 0.0).tolist()
+    return tuple((north, east) for north, east in rows)
+
+
+def _same(one: Sequence[DrawnPolygon], other: Sequence[DrawnPolygon]) -> bool:
+    return len(one) == len(other) and all(
+        _same_lines(a.rings, b.rings) for a, b in zip(one, other, strict=True)
+    )
+
+
+def _same_lines(one: Sequence[Open], other: Sequence[Open]) -> bool:
+    return len(one) == len(other) and all(
+        len(a) == len(b) and bool(np.all(np.abs(np.subtract(a, b)) <= _SAME_M))
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def _left_out(role: str, settings: AreaConfig) -> dict[str, Any]:
+    """The settings of a role, which are taken out."""
+    return {key: None for key in _KEYS[role] if key in settings.model_fields_set}
+
+
+def _inline(polygons: Sequence[DrawnPolygon]) -> bool:
+    corners = sum(len(polygon.outer) for polygon in polygons)
+    return corners <= _MOST_INLINE and not any(polygon.holes for polygon in polygons)
+
+
+def _survey(shapes: DrawnShapes, frame: LocalFrame, files: dict[str, str]) -> dict[str, Any]:
+    polygons, corridors = shapes.survey, shapes.corridors
+    if len(polygons) == 1 and not corridors and _inline(polygons):
+        return {"polygon_ne_m": _listed(polygons[0].outer)}
+    if len(corridors) == 1 and not polygons and len(corridors[0]) <= _MOST_INLINE:
+        return {"corridor_ne_m": _listed(corridors[0])}
+    name = FILES["survey"]
+    files[name] = _geojson(frame, polygons, [np.array(line) for line in corridors])
+    return {"file": name, **({"closed_lines": "corridor"} if corridors else {})}
+
+
+def _no_go(
+    polygons: Sequence[DrawnPolygon],
+    marks: tuple[Sequence[Array], Array],
+    frame: LocalFrame,
+    files: dict[str, str],
+) -> dict[str, Any]:
+    lines, points = marks
+    if _inline(polygons) and not len(lines) and not len(points):
+        rings = [_listed(polygon.outer) for polygon in polygons]
+        return {"no_go_ne_m": rings} if rings else {}
+    name = FILES["no_go"]
+    files[name] = _geojson(frame, polygons, lines, points)
+    return {"no_go_file": name}
+
+
+def _allowed(
+    polygons: Sequence[DrawnPolygon], frame: LocalFrame, files: dict[str, str]
+) -> dict[str, Any]:
+    if not polygons:
+        return {}
+    if len(polygons) == 1 and _inline(polygons):
+        return {"allowed_ne_m": _listed(polygons[0].outer)}
+    name = FILES["allowed"]
+    files[name] = _geojson(frame, polygons)
+    return {"allowed_file": name}
+
+
+def _needs_crs(settings: AreaConfig, values: Mapping[str, Any]) -> bool:
+    """Whether a text or file is left, besides those that are drawn, that may not say its system."""
+    kept = (values.get(name, getattr(settings, name)) for name in _NEED_CRS)
+    return any(value is not None and value not in FILES.values() for value in kept)
+
+
+def _listed(places: Open) -> list[list[float]]:
+    return [list(place) for place in _rounded(np.array(places))]
+
+
+def _geojson(
+    frame: LocalFrame,
+    polygons: Sequence[DrawnPolygon],
+    lines: Sequence[Array] = (),
+    points: Sequence[Array] | Array = (),
+) -> str:
+    """Shapes as GeoJSON (RFC 7946), a feature a line, in the order and direction of their corners.
+
+    Raises:
+        PlanError: a corner is too far from the datum.
+    """
+
+    def degrees(places: Any) -> list[list[float]]:
+        array = np.asarray(places, dtype=np.float64).reshape(-1, 2)
+        far = np.flatnonzero(~(np.hypot(*array.T) <= FARTHEST_M))
+        if len(far):
+            raise PlanError(
+                f"area: a corner at north {array[far[0], 0]:g}, east {array[far[0], 1]:g} m is "
+                f"more than {FARTHEST_M / 1e3:.0f} km from the datum: draw nearer to it, or move "
+                "the datum"
+            )
+        lat_lon = frame.latlon_from_ne(array)
+        rows: list[list[float]] = np.round(lat_lon[:, ::-1], _DEGREE_DECIMALS).tolist()
+        return rows
+
+    def closed(ring: Open) -> list[list[float]]:
+        corners = degrees(ring)
+        return [*corners, corners[0]]
+
+    geometries = [
+        *({"type": "Polygon", "coordinates": [closed(r) for r in p.rings]} for p in polygons),
+        *({"type": "LineString", "coordinates": degrees(line)} for line in lines),
+        *({"type": "Point", "coordinates": degrees(point)[0]} for point in points),
+    ]
+    features = [
+        json.dumps({"type": "Feature", "properties": {}, "geometry": geometry})
+        for geometry in geometries
+    ]
+    return '{"type": "FeatureCollection", "features": [\n' + ",\n".join(features) + "\n]}\n"
