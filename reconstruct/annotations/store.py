@@ -1,6 +1,7 @@
 """`annotations.json` of a workspace: read, changed by one writer at a time, seen by a GIS."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -91,9 +92,10 @@ def change_annotations(
         with FileLock(workspace / f".{FILE}.lock", timeout=_WAIT_S):
             check_token(FILE, content_of(workspace / FILE), token)
             values = change(read_annotations(workspace, frame))
+            datum = None if frame is None else frame.datum
             AnnotationsRecord(
                 frame="ned" if frame is None else frame.name,
-                datum=_place(frame),
+                datum=None if datum is None else PlaceRecord(**asdict(datum)),
                 labels=values.labels,
                 annotations=values.annotations,
             ).write(workspace / FILE)
@@ -142,20 +144,8 @@ def geojson(values: AnnotationSet, datum: Datum | None) -> dict[str, Any]:
 
 
 def _lon_lat(places: Array, datum: Datum | None) -> list[list[float]]:
-    if datum is None:
-        return [[float(east), float(north)] for east, north in places]
-    ned = np.column_stack([places[:, 1], places[:, 0], np.zeros(len(places))])
-    return [[round(float(lon), 10), round(float(lat), 10)]
-            for lat, lon, _ in datum.geodetic_from_ned(ned)]  # fmt: skip
-
-
-def _place(frame: WorldFrame | None) -> PlaceRecord | None:
-    if frame is None or frame.datum is None:
-        return None
-    datum = frame.datum
-    return PlaceRecord(
-        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
-    )
+    found = places if datum is None else np.round(datum.lon_lat_from_en(places), 10)
+    return [[float(x), float(y)] for x, y in found]
 
 
 def _check_frame(path: Path, record: AnnotationsRecord, frame: WorldFrame) -> None:
