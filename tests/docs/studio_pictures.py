@@ -1,0 +1,80 @@
+"""Make the pictures of `docs/studio.md` again, from a reconstructed workspace.
+
+    python -m tests.docs.studio_pictures WORKSPACE
+
+The workspace is copied first: nothing in it changes.
+"""
+
+import argparse
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from tests.alice_survey.kit.browser import chromium
+from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.test_model_browser import click
+from tests.docs.pages import DOCS
+
+WIDE, NARROW = {"width": 1280, "height": 800}, {"width": 400, "height": 800}
+WAIT_MS = 60_000
+
+
+def main() -> None:
+    """Serve a copy of a workspace, and photograph its tabs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("workspace", type=Path)
+    workspace = parser.parse_args().workspace
+    out = DOCS / "studio"
+    out.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        copy = Path(shutil.copytree(workspace, Path(scratch) / "reef"))
+        with serving(copy) as server, chromium() as browser:
+            page = browser.new_page(viewport=WIDE, reduced_motion="reduce")
+            page.set_default_timeout(WAIT_MS)
+            page.goto(server.address)
+            page.wait_for_selector("body[data-ready]")
+            for name in ("plan", "model", "pictures", "run"):
+                page.locator(f"#tab-{name}").click()
+                page.wait_for_timeout(4000)
+                {"model": measure, "pictures": open_pictures}.get(name, lambda _: None)(page)
+                photograph(page, out / f"{name}.jpg")
+            page.set_viewport_size(NARROW)
+            page.locator("#tab-plan").click()
+            page.wait_for_timeout(1500)
+            photograph(page, out / "narrow.jpg")
+
+
+def measure(page: Any) -> None:
+    """A profile over the middle of the map, and an area beside it."""
+    box = page.locator("#map-canvas")
+    east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
+    size = 130 / 2 ** float(box.get_attribute("data-zoom"))
+    page.get_by_role("button", name="Area", exact=True).click()
+    corners = ((-1, -1), (0.2, -1.3), (0.6, 0.1), (-0.5, 0.5))
+    click(page, *((east + size * e, north + size * n) for e, n in corners))
+    page.get_by_role("button", name="Finish (D)").click()
+    page.wait_for_selector("tr[data-measure]")
+    page.get_by_role("button", name="Profile", exact=True).click()
+    click(page, (east - 1.2 * size, north + size), (east + 1.2 * size, north + 0.6 * size))
+    page.get_by_role("button", name="Finish (D)").click()
+    page.wait_for_selector(".profile svg polyline")
+    page.wait_for_timeout(1000)
+
+
+def open_pictures(page: Any) -> None:
+    """The pictures that see the middle of the map."""
+    page.get_by_role("button", name="Choose it on the map").click()
+    page.locator("#map-canvas").focus()
+    page.keyboard.press("Enter")
+    page.locator(".picture-view[data-ready]").nth(3).wait_for(timeout=WAIT_MS)
+    page.wait_for_timeout(1500)
+
+
+def photograph(page: Any, path: Path) -> None:
+    """What the page shows now."""
+    page.screenshot(path=str(path), type="jpeg", quality=72)
+
+
+if __name__ == "__main__":
+    main()
