@@ -1,6 +1,8 @@
 /* The Annotate tab: labels, annotations on the mosaic, their areas, and other tools' files. */
 
-import {attempt, button, download, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
+import {attempt, button, download, el, field, get, on, save as saveFile, say, send, table} from "./core.js";
+import {BLUE} from "./palette.js";
+import {counted, csv, number, withSigma} from "./words.js";
 import {annotationsOn, drawing} from "./annotate_map.js";
 import {shownPictures} from "./annotate_pictures.js";
 
@@ -115,7 +117,7 @@ export function tab(studio) {
   const labelList = el("div", {role: "radiogroup", "aria-label": "Label of what is drawn next"});
   const name = el("input", {type: "text", maxlength: 200, autocomplete: "off"});
   const aphia = el("input", {type: "text", inputmode: "numeric", autocomplete: "off"});
-  const colour = el("input", {type: "color", value: "#0072b2"});
+  const colour = el("input", {type: "color", value: BLUE});
   const addLabel = el("form", {onsubmit(event) {
     event.preventDefault();
     const id = name.value.trim().split(/\s*>\s*/).filter(Boolean).join(" > ");
@@ -295,14 +297,13 @@ export function tab(studio) {
       ...(side ? [row.quadrat] : []), row.label, String(row.count), withSigma(row.area, row.sigma),
       withSigma(100 * row.cover, 100 * row.cover_sigma, "%"),
     ]);
-    const csv = () => {
+    const save = () => {
       const keys = Object.keys(found.rows[0]);
-      const cell = (value) => (value === null ? "" : /[",\n]/.test(value) ? '"' + String(value).replaceAll('"', '""') + '"' : String(value));
-      download("cover.csv", [keys.join(","), ...found.rows.map((row) => keys.map((key) => cell(row[key])).join(","))].join("\n") + "\n", "text/csv");
+      download("cover.csv", csv(keys, found.rows.map((row) => keys.map((key) => row[key]))), "text/csv");
     };
     return el("div", {}, el("div", {style: {overflowX: "auto"}, tabindex: "0", role: "region", "aria-label": "What labels cover"},
       table("Of " + number(found.known, square) + " known ground", [...(side ? ["Quadrat"] : []), "Label", "Count", "Area, " + square, "Cover"], lines)),
-    el("p", {class: "buttons"}, button("Save as CSV", csv)));
+    el("p", {class: "buttons"}, button("Export CSV", save)));
   }
 
   /* ---- Files ---- */
@@ -320,13 +321,6 @@ export function tab(studio) {
     file.value = "";
   }));
   const save = el("p", {class: "buttons"});
-
-  async function give(kind) {
-    const response = await fetch("/api/annotations/export/" + kind);
-    if (!response.ok) throw new Error((await response.json()).error);
-    const named = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") || "");
-    download(named ? decodeURIComponent(named[1]) : "annotations", await response.blob(), response.headers.get("Content-Type"));
-  }
 
   /* ---- The panel ---- */
 
@@ -364,7 +358,7 @@ export function tab(studio) {
     card.replaceChildren(...cardOf());
     rows.replaceChildren(...rowsOf());
     format.replaceChildren(...formats.map((one) => el("option", {value: one.name}, one.title)));
-    save.replaceChildren(...[...formats, {name: "geojson", title: "GeoJSON"}].map((one) => button(one.title, () => attempt(() => give(one.name)), {"data-export": one.name, disabled: !annotations.size})));
+    save.replaceChildren(...[...formats, {name: "geojson", title: "GeoJSON"}].map((one) => button(one.title, () => attempt(() => saveFile("/api/annotations/export/" + one.name, "annotations")), {"data-export": one.name, disabled: !annotations.size})));
     back.disabled = !past.length;
     forth.disabled = !future.length;
     const writes = studio.mayWrite();

@@ -1,6 +1,7 @@
 /* Annotations on the map: drawn with colour, letters and dashes; tools that draw and edit them. */
 
 import {el} from "./core.js";
+import {INK, WHITE} from "./palette.js";
 
 const DASHES = [null, "8 4", "2 5", "12 4 2 4", "4 4", "16 6", "1 4 6 4", "10 3 3 3"];
 const LETTERED = 400;
@@ -59,8 +60,8 @@ class Sign extends leaflet.Layer {
 function letters(label, at, chosen) {
   return new Sign(el("span", {"aria-hidden": "true", style: {
     transform: "translate(-50%, -50%)", padding: "1px 5px", borderRadius: "4px", pointerEvents: "none",
-    font: "700 12px/1.3 system-ui, sans-serif", color: "#fff", background: "#16232b",
-    border: "2px solid " + (chosen ? "#fff" : label.colour), whiteSpace: "nowrap",
+    font: "700 12px/1.3 system-ui, sans-serif", color: WHITE, background: INK,
+    border: "2px solid " + (chosen ? WHITE : label.colour), whiteSpace: "nowrap",
   }}, label.code || "?"), at);
 }
 
@@ -68,7 +69,7 @@ function letters(label, at, chosen) {
 function handle(at, name, dropped, keyed) {
   const body = el("button", {type: "button", "aria-label": name, onkeydown: keyed, style: {
     transform: "translate(-50%, -50%)", width: "18px", height: "18px", padding: "0", borderRadius: "50%",
-    background: "#fff", border: "4px solid #16232b", cursor: "move", touchAction: "none", zIndex: "500",
+    background: WHITE, border: "4px solid #16232b", cursor: "move", touchAction: "none", zIndex: "500",
   }});
   const sign = new Sign(body, at);
   ["mousedown", "click", "dblclick"].forEach((kind) => body.addEventListener(kind, (event) => event.stopPropagation()));
@@ -107,11 +108,11 @@ export function annotationsOn(studio, choose) {
         color: label.colour, weight: chosen ? 4 : 2.5, dashArray: DASHES[number % DASHES.length],
         fillColor: label.colour, fillOpacity: chosen ? 0.4 : 0.25,
       };
-      const rim = {color: chosen ? "#fff" : "#16232b", weight: (chosen ? 4 : 2.5) + 2.5, opacity: 0.8, fill: false, interactive: false};
+      const rim = {color: chosen ? WHITE : INK, weight: (chosen ? 4 : 2.5) + 2.5, opacity: 0.8, fill: false, interactive: false};
       let drawn = null;
       if (shape.kind === "point") {
         drawn = leaflet.circleMarker(places[0][0], {
-          radius: chosen ? 8 : 6, color: "#fff", weight: 2, fillColor: label.colour, fillOpacity: 1,
+          radius: chosen ? 8 : 6, color: WHITE, weight: 2, fillColor: label.colour, fillOpacity: 1,
         });
       } else if (shape.kind === "polyline") {
         group.addLayer(leaflet.polyline(places[0], rim));
@@ -201,8 +202,8 @@ function moveCorner(corners, n, at) {
 export function drawing(studio, kind, done, ended) {
   const map = studio.map.leaflet;
   const places = [];
-  const line = leaflet.polyline([], {color: "#fff", weight: 3, dashArray: "5 4", interactive: false}).addTo(map);
-  const rim = leaflet.polyline([], {color: "#16232b", weight: 6, opacity: 0.6, interactive: false}).addTo(map);
+  const line = leaflet.polyline([], {color: WHITE, weight: 3, dashArray: "5 4", interactive: false}).addTo(map);
+  const rim = leaflet.polyline([], {color: INK, weight: 6, opacity: 0.6, interactive: false}).addTo(map);
   const least = {polyline: 2, polygon: 3}[kind];
   const box = ([a, b]) => [a, [b[0], a[1]], b, [a[0], b[1]]];
 

@@ -1,6 +1,8 @@
 /* The pictures that show an annotation, each cut around its projected outline. */
 
-import {el, get, number} from "./core.js";
+import {el, get} from "./core.js";
+import {INK, WHITE} from "./palette.js";
+import {number} from "./words.js";
 import {isArea} from "./annotate_map.js";
 
 export async function shownPictures(one) {
@@ -22,11 +24,11 @@ function figure(one, shown) {
   const lines = shown.rings.map((ring) => {
     const points = ring.filter((p) => p[0] !== null).map(([x, y]) => [x - left, y - top]);
     if (one.shape.kind === "point") {
-      return [3, 1.4].map((size, n) => el("circle", {cx: points[0][0], cy: points[0][1], r: size * thick * 1.5, fill: n ? "#fff" : "#16232b"}));
+      return [3, 1.4].map((size, n) => el("circle", {cx: points[0][0], cy: points[0][1], r: size * thick * 1.5, fill: n ? WHITE : INK}));
     }
     const tag = isArea(one.shape) ? "polygon" : "polyline";
     const all = points.map((p) => p.join(",")).join(" ");
-    return [["#16232b", 2.4], ["#fff", 1]].map(([stroke, wide]) => el(tag, {points: all, fill: "none", stroke, "stroke-width": wide * thick}));
+    return [[INK, 2.4], [WHITE, 1]].map(([stroke, wide]) => el(tag, {points: all, fill: "none", stroke, "stroke-width": wide * thick}));
   });
   const over = el("svg", {
     viewBox: "0 0 " + width + " " + height, "aria-hidden": "true",

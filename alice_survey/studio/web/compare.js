@@ -1,10 +1,10 @@
 /* The Compare tab: another survey next to this one or swiped over it, and what has changed. */
 
-import {attempt, button, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
+import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {BLUE, RED} from "./palette.js";
+import {fixed, number, withSigma} from "./words.js";
 import {boundsOf, comparedMaps} from "./compare_maps.js";
 
-const GAINED = "#0072b2";
-const LOST = "#d55e00";
 const NEAR_M = 0.5;
 
 export function tab(studio) {
@@ -104,8 +104,8 @@ export function tab(studio) {
     ["difference", "significance", "change-gained", "change-lost"].forEach((name) => studio.map.remove(name));
     if (!result) return;
     result.layers.forEach((layer) => studio.map.put({...layer, group: "Change", shown: false}));
-    [["change-gained", "Gained", GAINED, (r) => r.volume_l > 0, false],
-      ["change-lost", "Lost", LOST, (r) => r.volume_l < 0, true]].forEach(([name, title, colour, wanted, dashed]) => {
+    [["change-gained", "Gained", BLUE, (r) => r.volume_l > 0, false],
+      ["change-lost", "Lost", RED, (r) => r.volume_l < 0, true]].forEach(([name, title, colour, wanted, dashed]) => {
       const shapes = [];
       const texts = [];
       result.regions.filter(wanted).forEach((region) => region.outlines.forEach((ring) => {
@@ -136,15 +136,15 @@ export function tab(studio) {
     if (!result) return [el("p", {class: "note"}, "No comparison has been made yet.")];
     const lines = result.regions.map((region, n) => [
       button((n + 1) + (region.volume_l > 0 ? " gained" : " lost"), () => go(region)),
-      region.area_m2.toFixed(3), withSigma(region.volume_l, region.sigma_l),
+      fixed(region.area_m2, 3), withSigma(region.volume_l, region.sigma_l),
     ]);
     const still = result.unchanged;
     const facts = [
-      ["Common ground", result.area_m2.toFixed(2) + " m²"], ["Changed", result.changed_m2.toFixed(2) + " m²"],
+      ["Common ground", fixed(result.area_m2, 2, "m²")], ["Changed", fixed(result.changed_m2, 2, "m²")],
       ["Gained", withSigma(result.gained.volume_l, result.gained.sigma_l, "l")],
       ["Lost", withSigma(Math.abs(result.lost.volume_l), result.lost.sigma_l, "l")],
     ];
-    if (still && still.robust_sigma_mm !== null) facts.push(["Unchanged ground differs by", still.robust_sigma_mm.toFixed(2) + " mm"]);
+    if (still && still.robust_sigma_mm !== null) facts.push(["Unchanged ground differs by", fixed(still.robust_sigma_mm, 2, "mm")]);
     return [
       table("Against " + result.name, [], facts),
       lines.length ? table("Changed places", ["Place", "Area, m²", "Volume, l"], lines)

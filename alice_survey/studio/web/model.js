@@ -1,11 +1,11 @@
 /* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
 
-import {attempt, button, download, el, field, get, number, say, send, table, withSigma} from "./core.js";
+import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
+import {PINK, RED, WHITE} from "./palette.js";
+import {counted, number, withSigma} from "./words.js";
 import {profileView} from "./model_profile.js";
 import {meshPart} from "./model_mesh.js";
 
-const COLOUR = "#d55e00";
-const FAINT = "#cc79a7";
 const ASK_MS = 120;
 /* What each tool draws, how many places end it, and the figure that stands for the measure. */
 const TOOLS = {
@@ -24,7 +24,6 @@ const FILES = [
 
 export function tab(studio) {
   const {map, state} = studio;
-  document.head.append(el("link", {rel: "stylesheet", href: "/app/model.css"}));
   const kept = "alice-survey measures " + state.workspace;
   let measures = restored();
   let chosen = null;
@@ -84,7 +83,7 @@ export function tab(studio) {
 
   /* ---- Drawing ---- */
 
-  const draft = leaflet.polyline([], {color: COLOUR, weight: 3, dashArray: "6 4", interactive: false});
+  const draft = leaflet.polyline([], {color: RED, weight: 3, dashArray: "6 4", interactive: false});
   const dots = leaflet.featureGroup();
   let drawing = null;
   const hint = el("p", {class: "note", role: "status"});
@@ -110,7 +109,7 @@ export function tab(studio) {
     draft.setLatLngs(drawing.tool.kind === "polygon" && places.length > 2 ? [...places, places[0]] : places);
     dots.clearLayers();
     drawing.places.forEach((place) => dots.addLayer(leaflet.circleMarker(place, {
-      radius: 5, color: "#fff", weight: 1.5, fillColor: COLOUR, fillOpacity: 1, interactive: false,
+      radius: 5, color: WHITE, weight: 1.5, fillColor: RED, fillOpacity: 1, interactive: false,
     })));
     const least = drawing.tool.kind === "polygon" ? 3 : 2;
     finishing.disabled = drawing.places.length < least;
@@ -218,7 +217,7 @@ export function tab(studio) {
     const described = (kind) => {
       const some = measures.filter((one) => (one.kind === "polygon") === (kind === "polygon"));
       return {
-        kind, name: "measured-" + kind, title: kind === "polygon" ? "Measured areas" : "Measured lines", colour: COLOUR,
+        kind, name: "measured-" + kind, title: kind === "polygon" ? "Measured areas" : "Measured lines", colour: RED,
         dashed: false, fill: 0.12, width: 3, group: "Measures",
         shapes: some.map((one) => one.places.map(([east, north]) => [east, north])),
         texts: some.map((one) => one.name + ": " + withSigma(mainOf(one).value, mainOf(one).sigma, mainOf(one).unit)),
@@ -233,7 +232,7 @@ export function tab(studio) {
     map.remove("quadrats");
     if (squares.length) {
       map.put({
-        kind: "polygon", name: "quadrats", title: "Quadrats", colour: FAINT, dashed: false, fill: 0.1, width: 1.5, group: "Measures",
+        kind: "polygon", name: "quadrats", title: "Quadrats", colour: PINK, dashed: false, fill: 0.1, width: 1.5, group: "Measures",
         shapes: squares.map((one) => one.places),
         texts: squares.map((one) => figureText(one.figures.find((figure) => figure.name === "rugosity"))),
       });
@@ -311,25 +310,22 @@ export function tab(studio) {
   }
 
   async function exported(form) {
-    const body = JSON.stringify({
+    await save("/api/model/export", "measures." + form, {
       form,
       measures: measures.map(({name, kind, places, figures, notes}) => ({name, kind, places, figures, notes})),
     });
-    const answer = await fetch("/api/model/export", {method: "POST", body, headers: {"Content-Type": "application/json"}});
-    if (!answer.ok) throw new Error((await answer.json()).error);
-    download("measures." + form, await answer.text(), answer.headers.get("Content-Type"));
-    say(measures.length + (measures.length === 1 ? " measure" : " measures") + " written to measures." + form);
+    say(counted(measures.length, "measure") + " written to measures." + form);
   }
 
   /* ---- What sigmas count, and the files ---- */
 
-  const counted = el("ul", {});
-  const about = el("details", {hidden: true}, el("summary", {}, "What the sigmas count"), counted);
+  const noted = el("ul", {});
+  const about = el("details", {hidden: true}, el("summary", {}, "What the sigmas count"), noted);
   async function fillAbout() {
     const found = await get("/api/model/about").catch(() => null);
     about.hidden = !found;
     if (!found) return;
-    counted.replaceChildren(...found.notes.map((note) => el("li", {}, note)),
+    noted.replaceChildren(...found.notes.map((note) => el("li", {}, note)),
       el("li", {}, "areas and rugosity are of cells of " + number(found.cell, found.unit, 3)));
   }
 
@@ -347,7 +343,7 @@ export function tab(studio) {
     "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with the protocol HTTP(S) and the address "
     + window.location.origin + "/files/mosaic/mosaic.tif"));
 
-  const mesh = meshPart(studio, {colour: COLOUR, measured: (points) => measure("length", {kind: "points", places: points})});
+  const mesh = meshPart(studio, {colour: RED, measured: (points) => measure("length", {kind: "points", places: points})});
 
   const panel = el("div", {class: "model"},
     el("h2", {}, "Look and measure"),

@@ -1,6 +1,7 @@
 /* A profile: heights along a line with the band of one sigma, linked to the map. */
 
-import {el, number, withSigma} from "./core.js";
+import {el} from "./core.js";
+import {number, withSigma} from "./words.js";
 
 const WIDTH = 340;
 const HEIGHT = 170;

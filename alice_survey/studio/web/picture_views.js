@@ -1,7 +1,8 @@
 /* Views of pictures as taken, each about a pixel, with crosses for what is expected and picked.
    Pixels count from 0 at the middle of the first one, as in picks.csv. */
 
-import {attempt, el, get, number} from "./core.js";
+import {attempt, el, get} from "./core.js";
+import {number} from "./words.js";
 
 const CLOSE = 2;  /* zoom at which a pixel has four of the screen's */
 const place = (x, y) => [-(y + 0.5), x + 0.5];

@@ -1,6 +1,8 @@
 /* Pictures: a spot picked in the pictures as taken, lengths with sigma, control, scale. */
 
-import {attempt, button, download, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
+import {attempt, button, download, el, field, get, on, say, send, table} from "./core.js";
+import {ORANGE} from "./palette.js";
+import {counted, csv, number, withSigma} from "./words.js";
 import {controlForm, controlRows} from "./picture_control.js";
 import {Wall} from "./picture_views.js";
 
@@ -8,7 +10,6 @@ const BAD_PX = 2;
 const mm = (value) => number(1000 * value, "", 3);
 
 export function tab(studio) {
-  document.head.append(el("link", {rel: "stylesheet", href: "/app/pictures.css"}));
   let held = {token: "", points: [], control: null, last: null, unit: studio.state.unit};
   let control = {token: "", rows: []};
   let chosen = [];
@@ -230,17 +231,17 @@ export function tab(studio) {
       ];
     })), el("div", {class: "buttons"}, button("Save the table as CSV", exportPoints)));
     studio.map.put({
-      kind: "point", name: "picked", title: "Picked points", colour: "#e69f00", group: "Pictures",
+      kind: "point", name: "picked", title: "Picked points", colour: ORANGE, group: "Pictures",
       shapes: held.points.filter((point) => point.spot).map((point) => [[point.spot.e, point.spot.n]]),
       texts: held.points.filter((point) => point.spot).map((point) => point.name),
     });
   }
 
   function exportPoints() {
-    const quoted = (text) => (/[",\n]/.test(text) ? "\"" + text.replaceAll("\"", "\"\"") + "\"" : text);
     const rows = held.points.filter((point) => point.spot).map(({name: of, spot}) => [
-      quoted(of), spot.n, spot.e, spot.down, ...spot.sigma, spot.views, spot.rms_px].join(","));
-    download("points.csv", ["name,north,east,down,sigma_north,sigma_east,sigma_down,views,rms_px", ...rows].join("\n") + "\n", "text/csv");
+      of, spot.n, spot.e, spot.down, ...spot.sigma, spot.views, spot.rms_px]);
+    const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down", "views", "rms_px"];
+    download("points.csv", csv(header, rows), "text/csv");
   }
 
   function choose(point, isOn) {

@@ -1,6 +1,7 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
-import {attempt, button, el, field, get, number, on, say, send} from "./core.js";
+import {attempt, button, el, field, get, on, say, send} from "./core.js";
+import {number} from "./words.js";
 import {drawing} from "./plan_draw.js";
 import {
   AS_IN_FILE, canRedo, canUndo, current, record, redo, same, startHistory, undo, withChange, withChanges,
@@ -24,7 +25,6 @@ export function tab(studio) {
   let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(), false, null, false, null, false];
   const body = () => current(history);
   const isDirty = () => !same(body(), AS_IN_FILE);
-  document.head.append(el("link", {rel: "stylesheet", href: new URL("plan.css", import.meta.url).href}));
 
   /* ---- Parts ---- */
 

@@ -1,6 +1,7 @@
 /* Areas, zones and corridors on the map: draw them by clicks, choose one, edit it by its handles. */
 
 import {button, el, say} from "./core.js";
+import {WHITE} from "./palette.js";
 import {handles} from "./plan_handles.js";
 import {
   KINDS, addRing, isClosed, leastPoints, nameOf, noShapes, pathAt, paths, pointsOf, removeRing, samePath, sizeOf,
@@ -31,7 +32,7 @@ export function drawing(studio, {changed, moving}) {
     const bold = samePath(path, chosen);
     const many = isClosed(path) ? leaflet.polygon : leaflet.polyline;
     const style = {...fixed, renderer, fill: false};
-    drawn.addLayer(many(points, {...style, color: "#fff", weight: bold ? 6 : 5, opacity: 0.75}));
+    drawn.addLayer(many(points, {...style, color: WHITE, weight: bold ? 6 : 5, opacity: 0.75}));
     drawn.addLayer(many(points, {
       ...style, color: colour, weight: bold ? 3.4 : 2.2,
       dashArray: path.kind === "allowed" ? "7 5" : null,
@@ -119,7 +120,7 @@ export function drawing(studio, {changed, moving}) {
     const style = {...fixed, renderer, color: colour, weight: 2.4, dashArray: "6 4", fillOpacity: 0.08};
     sketch.addLayer(many(all, style));
     points.forEach((point) => sketch.addLayer(leaflet.circleMarker(point, {
-      ...fixed, renderer, radius: 4, color: "#fff", weight: 1.5, fillColor: colour, fillOpacity: 1,
+      ...fixed, renderer, radius: 4, color: WHITE, weight: 1.5, fillColor: colour, fillOpacity: 1,
     })));
     if (pointer) return;
     const missing = leastPoints(path) - points.length;

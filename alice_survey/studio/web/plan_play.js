@@ -2,7 +2,7 @@
 
 import {attempt, button, el, field} from "./core.js";
 import {countUpTo, stateAt} from "./plan_way.js";
-import {clockOf} from "./plan_words.js";
+import {clock} from "./words.js";
 
 const SPEEDS = [1, 10, 30, 100];
 const STILL_MS = 1000;  /* between steps where motion is to be reduced */
@@ -59,11 +59,11 @@ export function playback({ask, mark}) {
   function show() {
     const state = stateAt(dive, time);
     const taken = countUpTo(dive.pictures_s, time);
-    const text = clockOf(time) + " of " + clockOf(Number(scrub.max)) + ", " + dive.what + ": depth " + state.depth.toFixed(2)
+    const text = clock(time) + " of " + clock(Number(scrub.max)) + ", " + dive.what + ": depth " + state.depth.toFixed(2)
       + " m" + (Number.isNaN(state.altitude) ? "" : ", altitude " + state.altitude.toFixed(2) + " m") + ", heading " + Math.round(state.heading) % 360 + "°, "
       + taken.toLocaleString("en") + " of " + dive.pictures_s.length.toLocaleString("en") + " pictures";
     scrub.value = time;
-    scrub.setAttribute("aria-valuetext", clockOf(time));
+    scrub.setAttribute("aria-valuetext", clock(time));
     readout.textContent = text;
     const every = Math.max(1, Math.ceil((state.index + 1) / WAY_POINTS));
     const way = [];

@@ -4,11 +4,13 @@
    [north, east] in metres, a ring's first not repeated. A path {kind, index, ring} names one ring:
    ring 0 is the outer one, ring 1 the first hole; of a corridor it is 0. */
 
+import {PLAN} from "./palette.js";
+
 export const KINDS = {
-  survey: {title: "Survey area", colour: "#c8553d"},
-  no_go: {title: "No-go zone", colour: "#b03a2e"},
-  allowed: {title: "Allowed area", colour: "#566573"},
-  corridors: {title: "Corridor", colour: "#117a65"},
+  survey: {title: "Survey area", colour: PLAN.area},
+  no_go: {title: "No-go zone", colour: PLAN.no_go},
+  allowed: {title: "Allowed area", colour: PLAN.allowed},
+  corridors: {title: "Corridor", colour: PLAN.corridor},
 };
 
 export const noShapes = () => ({survey: [], no_go: [], allowed: [], corridors: []});

@@ -1,8 +1,8 @@
 /* The Run tab: what is made, what is left and what it takes; the job that runs, its log, its end. */
 
-import {attempt, button, el, field, get, mayWrite, number, on, say, send, table} from "./core.js";
+import {attempt, button, el, field, get, mayWrite, on, say, send, table} from "./core.js";
 import {startPage} from "./start.js";
-import {ago, duration, gigabytes, styled} from "./run_words.js";
+import {ago, counted, duration, gigabytes, number} from "./words.js";
 
 const STATES = {
   "up to date": ["✓", "good", "made"],
@@ -22,7 +22,6 @@ const LOUD_EVERY_S = 60;
 const SILENT_MS = 6000;
 
 export function tab(studio) {
-  styled();
   const job = el("section", {class: "job", "aria-label": "Running now", hidden: true});
   const last = el("section", {class: "job", "aria-label": "Last run", hidden: true});
   const begin = el("section", {"aria-label": "Start"});
@@ -97,7 +96,7 @@ export function tab(studio) {
     showSteps(job.querySelector(".bars"), running);
     const warned = job.querySelector(".warn");
     warned.hidden = !running.warned;
-    warned.textContent = running.warned ? `${running.warned} warning${running.warned > 1 ? "s" : ""}; the last: ${running.warnings.at(-1)}` : "";
+    warned.textContent = running.warned ? `${counted(running.warned, "warning")}; the last: ${running.warnings.at(-1)}` : "";
     job.querySelector(".stop").disabled = stopping || !mayWrite();
     speak();
   }
@@ -158,7 +157,7 @@ export function tab(studio) {
   /* ---- What is left ---- */
 
   function costText(cost) {
-    return cost ? `about ${duration(cost.time_s)} on ${known.cores} core${known.cores > 1 ? "s" : ""}, ${gigabytes(cost.disk_mb)} of disk` : "";
+    return cost ? `about ${duration(cost.time_s)} on ${counted(known.cores, "core")}, ${gigabytes(cost.disk_mb)} of disk` : "";
   }
 
   function showBegin() {

@@ -267,7 +267,8 @@ def test_totals_as_words(tmp_path: Path) -> None:
         tmp_path, "plan_words",
         """[m.totalRows(t), m.summaryOf({ok: true, totals: t, warnings: [], holes: [1]}),
             m.summaryOf({ok: false, error: "too steep"}),
-            [...[98, 3600, 14400].map(m.durationOf), m.clockOf(3723), m.clockOf(48)]]""",
+            await import("./words.js").then(
+              (w) => [...[98, 3600, 14400].map(w.duration), w.clock(3723), w.clock(48)])]""",
         t=totals,
     )  # fmt: skip
     assert dict(rows)["Covered"] == "99.99 %"
