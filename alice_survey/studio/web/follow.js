@@ -2,6 +2,7 @@
 
 import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
 import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.js";
+import {profileChart} from "./profile_chart.js";
 import {clock, counted, number, share} from "./words.js";
 
 const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"]];  /* as the coverage's own */
@@ -44,7 +45,7 @@ export function tab(studio) {
     box.classList.toggle("bad", bad);
   };
 
-  const profile = el("svg", {class: "profile", viewBox: "0 0 340 110", role: "img", "aria-label": "Altitude over time"});
+  const profile = profileChart("Altitude over time", {high: 120});
   const holeTable = el("div", {});
   const proposalText = el("p", {}, "");
   const minutes = el("input", {type: "number", min: "0.5", max: "6000", step: "0.5", inputmode: "decimal"});
@@ -68,7 +69,7 @@ export function tab(studio) {
     el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"}, LEGEND.map(([colour, text]) => el("li", {},
       el("span", {class: "swatch", style: {background: colour}}), text))),
     el("div", {class: "field"}, el("label", {}, keep, " Keep the vehicle in view")),
-    el("h3", {}, "Altitude against the plan"), profile,
+    el("h3", {}, "Altitude against the plan"), profile.element,
     el("h3", {}, "Lines that close the holes"), proposalText,
     el("div", {class: "row"}, field("May take, minutes", minutes, "Empty: what is to spare"), field("Format", format)),
     el("div", {class: "buttons"}, button("Look for lines", propose), accept, again),
@@ -333,20 +334,13 @@ export function tab(studio) {
     const last = fixes[fixes.length - 1][0];
     const shown = fixes.filter((fix) => fix[0] > last - PROFILE_S && fix[3] !== null);
     const plan = state.planned_altitude_m;
-    const [wide, high, left] = [340, 110, 34];
-    const top = 2 * plan;
-    const x = (s) => left + ((s - (last - PROFILE_S)) / PROFILE_S) * (wide - left);
-    const y = (m) => 8 + (1 - Math.min(Math.max(m / top, 0), 1)) * (high - 26);
-    const points = shown.map((fix) => x(fix[0]).toFixed(1) + "," + y(fix[3]).toFixed(1)).join(" ");
+    const minutes = (fix) => (fix[0] - last) / 60;
     const latest = shown.length ? shown[shown.length - 1][3] : null;
-    profile.setAttribute("aria-label", "Altitude over the last five minutes: now " + number(latest, "m", 3) + ", planned " + number(plan, "m", 3));
-    profile.replaceChildren(
-      el("line", {x1: left, x2: wide, y1: y(plan), y2: y(plan), stroke: "var(--blue)", "stroke-dasharray": "6 4", "stroke-width": 1.5}),
-      el("text", {x: 2, y: y(plan) + 4}, number(plan, "m", 2)),
-      el("text", {x: 2, y: y(0) + 4}, "0 m"),
-      el("text", {x: left, y: high - 3}, "5 min ago"),
-      el("text", {x: wide - 26, y: high - 3}, "now"),
-      el("polyline", {points, fill: "none", stroke: "var(--ink)", "stroke-width": 1.8}));
+    profile.show({
+      lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]}, {kind: "flown", xs: shown.map(minutes), ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
+      range: [0, 2 * plan], caption: "minutes from now; altitude, m",
+    });
+    profile.element.firstChild.setAttribute("aria-label", "Altitude over the last five minutes: now " + number(latest, "m") + ", planned " + number(plan, "m"));
   }
 
   return {

@@ -3,7 +3,7 @@
 import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
 import {PINK, RED, WHITE} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
-import {profileView} from "./model_profile.js";
+import {measuredProfile} from "./model_profile.js";
 import {meshPart} from "./model_mesh.js";
 
 const ASK_MS = 120;
@@ -279,7 +279,7 @@ export function tab(studio) {
     map.leaflet.fitBounds(bounds.pad(0.4), {animate: false});
   }
 
-  const profile = profileView(map, state.unit);
+  const profile = measuredProfile(map, state.unit);
 
   async function showChosen() {
     const one = measures.find((other) => other.id === chosen);

@@ -1,19 +1,18 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
 import {attempt, button, el, field, get, on, say, send} from "./core.js";
-import {number} from "./words.js";
+import {AS_IN_FILE, withChange, withChanges} from "./plan_changes.js";
 import {drawing} from "./plan_draw.js";
-import {
-  AS_IN_FILE, canRedo, canUndo, current, record, redo, same, startHistory, undo, withChange, withChanges,
-} from "./plan_history.js";
 import {latest} from "./plan_latest.js";
 import {playback} from "./plan_play.js";
-import {profileView} from "./plan_profile.js";
+import {planProfile} from "./plan_profile.js";
 import {resultsPanel} from "./plan_results.js";
 import {settingsPanel} from "./plan_settings.js";
 import {noShapes, paths, withImported} from "./plan_shapes.js";
 import {shown} from "./plan_show.js";
 import {summaryOf} from "./plan_words.js";
+import {canRedo, canUndo, current, record, redo, same, startHistory, undo} from "./undo.js";
+import {number} from "./words.js";
 
 const QUIET_MS = 900;  /* after which the figures are said */
 const PAGE = crypto.randomUUID();
@@ -22,7 +21,7 @@ const ROLES = {survey: "area to survey", no_go: "no-go zones", allowed: "allowed
 const EMPTY = "Draw the area to survey on the map, or import a file with it.";
 
 export function tab(studio) {
-  let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(), false, null, false, null, false];
+  let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(AS_IN_FILE), false, null, false, null, false];
   const body = () => current(history);
   const isDirty = () => !same(body(), AS_IN_FILE);
 
@@ -31,7 +30,7 @@ export function tab(studio) {
   const view = shown(studio);
   const draw = drawing(studio, {changed: reshaped, moving: (shapes) => plan({...body(), shapes})});
   const results = resultsPanel((changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
-  const along = profileView((place) => view.mark(place));
+  const along = planProfile((place) => view.mark(place));
   const play = playback({ask: () => send("/api/plan/play", body()), mark: view.mark});
   const controls = el("div");
   const precision = el("p", {class: "note plan-precision"}, "How well the model of this survey is expected to be known.");
@@ -145,7 +144,7 @@ export function tab(studio) {
 
   async function restart(state = AS_IN_FILE) {
     await load();
-    history = startHistory();
+    history = startHistory(AS_IN_FILE);
     if (!same(state, AS_IN_FILE)) history = record(history, state);
     buttons();
     settings.set(body().changes, file.saved);

@@ -1,7 +1,7 @@
 /* Playback of a dive on the map: play, pause, scrub, at several speeds. */
 
 import {attempt, button, el, field} from "./core.js";
-import {countUpTo, stateAt} from "./plan_way.js";
+import {countUpTo, stateAt} from "./way.js";
 import {clock} from "./words.js";
 
 const SPEEDS = [1, 10, 30, 100];

@@ -103,10 +103,10 @@ def test_lengths_areas_and_exports(tmp_path: Path) -> None:
         true = math.dist(*length["places"])
         assert true == pytest.approx(0.4, abs=0.01)
         assert named(length)["length"]["value"] == pytest.approx(true * RISE, rel=1e-3)
-        page.wait_for_selector(".profile svg polyline")
-        page.locator(".profile").focus()
+        page.wait_for_selector(".model .profile-chart path.of")
+        page.get_by_role("slider", name="Place along the profile").focus()
         page.keyboard.press("End")
-        assert "along: −9.8" in page.locator(".profile + p").inner_text()
+        assert "along: −9.8" in page.locator(".model .profile-chart p").inner_text()
 
         page.get_by_role("button", name="Volume", exact=True).click()
         page.get_by_label("Plane of the volume").select_option("level")

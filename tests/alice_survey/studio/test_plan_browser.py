@@ -332,7 +332,7 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
         page.keyboard.press("End")
         words = profile.get_attribute("aria-valuetext")
         assert "dive 1" in words and "over the sea floor" in words
-        assert words == page.locator(".plan-profile .note").inner_text()
+        assert words == page.locator("#panel-plan .profile-chart .note").inner_text()
 
         page.get_by_text("Play the dive").click()
         page.get_by_role("button", name="Play", exact=True).click()

@@ -138,7 +138,7 @@ def test_undoing_all_of_random_edits_returns_to_the_start(
     start, end, again, states = run(
         tmp_path_factory.mktemp("undo"), "plan_shapes",
         """(async () => {
-          const h = await import("./plan_history.js");
+          const h = await import("./undo.js");
           let history = h.startHistory({changes: {}, shapes: s});
           let count = 1;
           edits.forEach(([what, a, b, x]) => {
@@ -179,10 +179,10 @@ def test_undoing_all_of_random_edits_returns_to_the_start(
 
 def test_edits_of_one_tag_within_a_second_are_one_step(tmp_path: Path) -> None:
     sizes = run(
-        tmp_path, "plan_history",
+        tmp_path, "undo",
         """(() => {
           const state = (v) => ({changes: {plan: {altitude_m: v}}, shapes: null});
-          let h = m.startHistory();
+          let h = m.startHistory(state(0));
           h = m.record(h, state(1), "altitude", 0);
           h = m.record(h, state(2), "altitude", 900);
           h = m.record(h, state(3), "altitude", 1800);
@@ -204,7 +204,7 @@ def test_a_value_that_the_file_has_is_no_change(tmp_path: Path) -> None:
         "written": {"plan": ["line_spacing_m"]},
     }
     changed = run(
-        tmp_path, "plan_history",
+        tmp_path, "plan_changes",
         """[
           m.withChange({}, f, "plan", "altitude_m", 2.5),
           m.withChange({plan: {altitude_m: 2.5}}, f, "plan", "altitude_m", 2.0),
@@ -301,7 +301,7 @@ def test_places_along_a_way_agree_with_shapely(tmp_path: Path) -> None:
     line = shapely.LineString(way)
     lengths = rng.uniform(0, line.length, 60)
     found, beyond = run(
-        tmp_path, "plan_way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
+        tmp_path, "way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
         p=way.tolist(), s=lengths.tolist(),
     )  # fmt: skip
     expected = shapely.get_coordinates(shapely.line_interpolate_point(line, lengths))
@@ -318,7 +318,7 @@ def test_a_profile_leads_to_its_place_whether_or_not_dives_begin_at_zero(tmp_pat
     }  # fmt: skip
     goes_on = {**ends, "s_m": [0, 10, 10, 30]}
     found, along = run(
-        tmp_path, "plan_way",
+        tmp_path, "way",
         "[both.map((p) => s.map((x) => m.profileAt(p, routes, m.growing(p.s_m), x))),"
         " both.map((p) => m.growing(p.s_m))]",
         both=[ends, goes_on], routes=routes, s=[0, 5, 20, 30, 99],
@@ -337,7 +337,7 @@ def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> N
         "altitude_m": [12, 2, 2, 2], "heading_deg": [350, 10, 10, 190],
     }  # fmt: skip
     states, counts = run(
-        tmp_path, "plan_way",
+        tmp_path, "way",
         "[[0, 1, 2, 3.5, 9, -1].map((t) => m.stateAt(d, t)),"
         " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t))]",
         d=dive,
@@ -350,5 +350,5 @@ def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> N
 
 
 def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
-    path = run(tmp_path, "plan_way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
+    path = run(tmp_path, "way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
     assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
