@@ -1,6 +1,7 @@
 /* The Compare tab: another survey next to this one or swiped over it, and what has changed. */
 
 import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
 import {BLUE, RED} from "./palette.js";
 import {fixed, number, withSigma} from "./words.js";
 import {boundsOf, comparedMaps} from "./compare_maps.js";
@@ -69,7 +70,9 @@ export function tab(studio) {
     await load();
     if (!studio.mayWrite()) return;
     const found = await send("/api/compare/near");
-    near.replaceChildren(el("option", {value: ""}, found.surveys.length ? "Choose one" : "There is none in " + found.folder),
+    [alone.hidden, nearField.hidden] = [found.surveys.length > 0, !found.surveys.length];
+    alone.textContent = "No other survey is in " + found.folder + ": type the path of one that is elsewhere.";
+    near.replaceChildren(el("option", {value: ""}, "Choose one"),
       ...found.surveys.map((one) => el("option", {value: one.path}, one.name)));
   }
 
@@ -154,14 +157,20 @@ export function tab(studio) {
   }
 
   const about = el("div", {});
+  const alone = el("p", {class: "note", hidden: true});
+  const nearField = field("Next to this one", near);
   const colours = el("p", {class: "note"});
   const whichField = field("Comparison", which);
-  const panel = el("div", {},
-    el("h2", {}, "Other survey"), field("Next to this one", near), field("Folder", path, "It is only read"),
+  const content = el("div", {},
+    el("h2", {}, "Other survey"), alone, nearField, field("Folder", path, "It is only read"),
     el("p", {class: "buttons"}, choose), about,
     el("fieldset", {style: {border: "0", padding: "0", margin: "0 0 12px"}}, el("legend", {style: {fontWeight: "650"}}, "Show"), radios),
     field("Raster", kind), colours, swipeField,
     el("h2", {}, "Change"), el("p", {class: "buttons"}, find), whichField, changes);
+  const {has} = studio.state;
+  const lack = missing(studio, content, () => (has.dem || has.mosaic ? null
+    : ["There is no model of this survey to compare yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
+  const panel = el("div", {}, lack.element, content);
 
   function render() {
     const writes = studio.mayWrite();
@@ -181,6 +190,7 @@ export function tab(studio) {
   return {
     name: "compare", title: "Compare", panel,
     enter() {
+      if (!lack.show()) return;
       render();
       show();
       if (!looked) attempt(look);

@@ -1,6 +1,7 @@
 /* Follow a dive: figures to read on deck, the map of what is seen, holes, and lines that close them. */
 
 import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
 import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.js";
 import {profileChart} from "./profile_chart.js";
 import {clock, counted, number, share} from "./words.js";
@@ -25,7 +26,7 @@ export function tab(studio) {
 
   /* ---- The panel ---- */
 
-  const now = el("p", {class: "now"}, "Loading");
+  const now = el("p", {class: "now"}, "Loading …");
   const figure = (name, title) => {
     const value = el("dd", {"data-figure": name}, "–");
     return {box: el("div", {}, el("dt", {}, title), value), value};
@@ -78,7 +79,10 @@ export function tab(studio) {
       el("div", {class: "row"}, field("Up in, minutes", upIn, "When the vehicle has to be at the surface")),
       el("div", {class: "buttons"}, button("Set", () => change("/api/follow/allow", {minutes: upIn.value ? Number(upIn.value) : null}))),
       more));
-  const panel = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
+  const content = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
+  const lack = missing(studio, content, () => (studio.state.has.plan || state?.following ? null
+    : ["A dive is followed along its plan, and there is none yet: draw it in Plan, and save it.", "plan", "Open Plan"]));
+  const panel = el("div", {}, lack.element, content);
 
   /* ---- What the server says ---- */
 
@@ -120,12 +124,13 @@ export function tab(studio) {
     const source = state && state.source;
     state = {...(state || {}), ...heard};
     if (heard.logs) fillChoices(heard);
+    lack.show();
     live.hidden = !state.following;
     choose.open = choose.open || !state.following;
     if (!state.following) {
       forget();
       now.className = state.fault ? "now bad" : "now";
-      now.textContent = state.fault || (state.has_plan ? "No dive is followed: choose its log" : "There is no plan yet: plan the survey first");
+      now.textContent = state.fault || "No dive is followed: choose its log";
       return;
     }
     if (source !== state.source) forget();
@@ -350,6 +355,7 @@ export function tab(studio) {
     enter() {
       isHere = true;
       blocks.forEach((block) => block.overlay.addTo(map.leaflet));
+      lack.show();
       attempt(async () => take(await get("/api/follow/state")));
     },
     leave() {

@@ -1,19 +1,21 @@
 /* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
 
 import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
 import {PINK, RED, WHITE} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
-import {measuredProfile} from "./model_profile.js";
+import {drawingTool} from "./drawing.js";
 import {meshPart} from "./model_mesh.js";
+import {measuredProfile} from "./model_profile.js";
 
 const ASK_MS = 120;
 /* What each tool draws, how many places end it, and the figure that stands for the measure. */
 const TOOLS = {
-  length: {title: "Length", key: "l", kind: "line", ends: 2, main: "length", hint: "Click two places."},
-  profile: {title: "Profile", key: "p", kind: "line", main: "surface_length", hint: "Click along a line, then finish."},
-  area: {title: "Area", key: "a", kind: "polygon", main: "surface_area", hint: "Click the corners in order, then finish."},
-  volume: {title: "Volume", key: "v", kind: "polygon", main: "volume", hint: "Click the corners in order, then finish."},
-  rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity", hint: "Click the corners in order, then finish."},
+  length: {title: "Length", key: "l", kind: "line", ends: 2, main: "length"},
+  profile: {title: "Profile", key: "p", kind: "line", main: "surface_length"},
+  area: {title: "Area", key: "a", kind: "polygon", main: "surface_area"},
+  volume: {title: "Volume", key: "v", kind: "polygon", main: "volume"},
+  rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity"},
 };
 const FILES = [
   ["report/report.html", "The report"], ["mosaic/mosaic.tif", "The mosaic, cloud-optimised GeoTIFF"],
@@ -83,13 +85,7 @@ export function tab(studio) {
 
   /* ---- Drawing ---- */
 
-  const draft = leaflet.polyline([], {color: RED, weight: 3, dashArray: "6 4", interactive: false});
-  const dots = leaflet.featureGroup();
-  let drawing = null;
-  const hint = el("p", {class: "note", role: "status"});
-  const finishing = button("Finish (D)", () => finish(), {class: "primary"});
-  const steps = el("div", {class: "buttons", hidden: true}, finishing,
-    button("Undo the last place", () => undo()), button("Cancel", () => map.release()));
+  const drawing = drawingTool(studio, "model");
   const toolButtons = Object.entries(TOOLS).map(([name, tool]) => button(tool.title, () => begin(name), {
     "aria-pressed": "false", "data-tool": name, title: tool.title + " (" + tool.key.toUpperCase() + ")",
   }));
@@ -104,79 +100,40 @@ export function tab(studio) {
   base.addEventListener("change", () => { levelField.hidden = base.value !== "level"; });
   levelField.hidden = true;
 
-  function redraw(pointer) {
-    const places = [...drawing.places, ...(pointer ? [pointer] : [])];
-    draft.setLatLngs(drawing.tool.kind === "polygon" && places.length > 2 ? [...places, places[0]] : places);
-    dots.clearLayers();
-    drawing.places.forEach((place) => dots.addLayer(leaflet.circleMarker(place, {
-      radius: 5, color: WHITE, weight: 1.5, fillColor: RED, fillOpacity: 1, interactive: false,
-    })));
-    const least = drawing.tool.kind === "polygon" ? 3 : 2;
-    finishing.disabled = drawing.places.length < least;
-    hint.textContent = drawing.tool.hint + " Enter takes the middle of the map. " + drawing.places.length + " so far.";
-  }
-
+  let inHand = null;
   function begin(name) {
-    if (drawing?.name === name) {
+    if (inHand === name) {
       map.release();
       return;
     }
     const tool = TOOLS[name];
-    map.take({
-      name,
-      click: (place) => add(place),
-      move: (place) => drawing && redraw(place),
-      end: ended,
-      keys: {d: () => finish(), Backspace: () => undo()},
+    drawing.begin({
+      kind: tool.kind, colour: RED, most: tool.ends, ended: () => held(null),
+      ready: () => name !== "volume" || hasPlane(),
+      done: (points) => finish(name, points.map(([north, east]) => [east, north])),
     });
-    drawing = {name, tool, places: []};
-    draft.addTo(map.leaflet);
-    dots.addTo(map.leaflet);
+    held(name);
+  }
+
+  function held(name) {
+    inHand = name;
     toolButtons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === name)));
-    steps.hidden = false;
+    if (!name) return;
     forVolume.hidden = name !== "volume";
     forRugosity.hidden = name !== "rugosity";
-    redraw();
   }
 
-  function ended() {
-    drawing = null;
-    draft.remove();
-    dots.remove();
-    toolButtons.forEach((one) => one.setAttribute("aria-pressed", "false"));
-    steps.hidden = true;
-    hint.textContent = "";
+  function hasPlane() {
+    if (base.value === "rim" || Number.isFinite(level.valueAsNumber)) return true;
+    say("Give the height of the plane", "warn");
+    level.focus();
+    return false;
   }
 
-  function add(place) {
-    if (drawing.places.length && drawing.places[drawing.places.length - 1].equals(place, 1e-12)) {
-      say("That is the last place again: move the map or the pointer first.", "warn");
-      return;
-    }
-    drawing.places.push(leaflet.latLng(place.lat, place.lng));
-    redraw();
-    if (drawing.places.length === drawing.tool.ends) finish();
-  }
-
-  function undo() {
-    drawing?.places.pop();
-    if (drawing) redraw();
-  }
-
-  async function finish() {
-    if (!drawing || finishing.disabled) return;
-    const {name, tool, places} = drawing;
-    const asked = {kind: tool.kind, places: places.map((place) => [place.lng, place.lat])};
-    if (name === "volume") {
-      if (base.value === "level" && !Number.isFinite(level.valueAsNumber)) {
-        say("Give the height of the plane.", "warn");
-        level.focus();
-        return;
-      }
-      asked.base = base.value === "level" ? level.valueAsNumber : "rim";
-    }
+  async function finish(name, places) {
+    const asked = {kind: TOOLS[name].kind, places};
+    if (name === "volume") asked.base = base.value === "level" ? level.valueAsNumber : "rim";
     if (name === "rugosity" && quadrat.value) asked.quadrat = quadrat.valueAsNumber;
-    map.release();
     await measure(name, asked);
   }
 
@@ -345,20 +302,21 @@ export function tab(studio) {
 
   const mesh = meshPart(studio, {colour: RED, measured: (points) => measure("length", {kind: "points", places: points})});
 
-  const panel = el("div", {class: "model"},
+  const content = el("div", {},
     el("h2", {}, "Look and measure"),
     el("div", {class: "buttons", role: "group", "aria-label": "Measure on the map"}, toolButtons),
-    forVolume, forRugosity, hint, steps, under, results, details, mesh.element, about, files);
+    drawing.element, forVolume, forRugosity, under, results, details, mesh.element, about);
+  const lack = missing(studio, content, () => (state.has.dem ? null
+    : ["There is no model of the sea floor to look at yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
+  const panel = el("div", {class: "model"}, lack.element, content, files);
 
   return {
     name: "model", title: "Model", panel,
     enter() {
       active = true;
-      const there = Boolean(state.has.dem);
-      toolButtons.forEach((one) => { one.disabled = !there; });
-      if (!there) hint.textContent = "There is no surface yet: run 'alice-survey reconstruct', or the tab Run.";
-      fillAbout();
       fillFiles();
+      if (!lack.show()) return;
+      fillAbout();
       mesh.enter();
       changed();
       map.refresh();

@@ -1,6 +1,7 @@
 /* Pictures: a spot picked in the pictures as taken, lengths with sigma, control, scale. */
 
 import {attempt, button, download, el, field, get, on, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
 import {ORANGE} from "./palette.js";
 import {counted, csv, number, withSigma} from "./words.js";
 import {controlForm, controlRows} from "./picture_control.js";
@@ -30,7 +31,7 @@ export function tab(studio) {
   const controlBox = el("div", {});
   const lastBox = el("div", {});
 
-  const panel = el("div", {class: "pictures"},
+  const content = el("div", {},
     el("h2", {}, "Pick a spot"),
     el("div", {class: "buttons"},
       button("Choose it on the map", takeSpot, {class: "primary"}),
@@ -43,6 +44,10 @@ export function tab(studio) {
     el("h2", {}, "Length"), lengthText, scaleBox,
     el("h2", {}, "Control"), controlBox, lastBox,
   );
+  const lack = missing(studio, content, () => (studio.state.has.sparse ? null : studio.state.has.pictures
+    ? ["These pictures are not in a model yet, which says where a spot is seen: reconstruct them in Run.", "run", "Open Run"]
+    : ["There are no pictures to pick in yet: fly the plan or import your own in Run, then reconstruct them.", "run", "Open Run"]));
+  const panel = el("div", {class: "pictures"}, lack.element, content);
   find.addEventListener("input", () => attempt(listPictures));
 
   function ready() {
@@ -229,7 +234,7 @@ export function tab(studio) {
         point.coded ? "marker" : [button("Open", () => openPoint(point), {"aria-label": "Open " + point.name}), " ",
           button("Delete", () => attempt(() => removePoint(point.name)), {"aria-label": "Delete " + point.name})],
       ];
-    })), el("div", {class: "buttons"}, button("Save the table as CSV", exportPoints)));
+    })), el("div", {class: "buttons"}, button("Export CSV", exportPoints)));
     studio.map.put({
       kind: "point", name: "picked", title: "Picked points", colour: ORANGE, group: "Pictures",
       shapes: held.points.filter((point) => point.spot).map((point) => [[point.spot.e, point.spot.n]]),
@@ -318,6 +323,7 @@ export function tab(studio) {
   return {
     name: "pictures", title: "Pictures", panel,
     enter(args) {
+      if (!lack.show()) return;
       attempt(async () => {
         await load();
         if (!name.value) name.value = freeName();

@@ -1,6 +1,7 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
 import {attempt, button, el, field, get, on, say, send} from "./core.js";
+import {fileDrop} from "./file_drop.js";
 import {AS_IN_FILE, withChange, withChanges} from "./plan_changes.js";
 import {drawing} from "./plan_draw.js";
 import {latest} from "./plan_latest.js";
@@ -59,7 +60,9 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Export"), exports));
   const missing = el("div", {hidden: true}, el("p", {}, "The settings cannot be read; the line below says why."),
     el("div", {class: "buttons"}, button("Read them again", () => start())));
-  const panel = el("div", {}, missing, content);
+  const waiting = el("p", {class: "note"}, "Planning …");
+  const wait = (on) => { waiting.hidden = !on; };
+  const panel = el("div", {}, waiting, missing, content);
 
   /* ---- Planning in the background ---- */
 
@@ -67,7 +70,10 @@ export function tab(studio) {
     ask: (state, signal) => send("/api/plan/preview", {...state, page: PAGE}, {signal}),
     shown: settled,
     failed: (fault) => say(fault.message, "error"),
-    busy: view.dim,
+    busy(on) {
+      view.dim(on);
+      wait(on && !preview);
+    },
   });
 
   function plan(state, wait) {
@@ -117,6 +123,7 @@ export function tab(studio) {
   }
 
   function step(way) {
+    if (!file) return;
     history = way(history);
     buttons();
     settings.set(body().changes, preview);
@@ -239,31 +246,10 @@ export function tab(studio) {
   /* The middle of a file is the datum of a new survey. */
   const moved = (datum) => (same(datum, file.datum) ? {} : {area: datum});
 
-  const side = studio.map.leaflet.getContainer();
-  const dragged = (on) => side.classList.toggle("plan-drop", on);
-  side.addEventListener("dragover", (event) => {
-    if (!active || !event.dataTransfer.types.includes("Files")) return;
-    event.preventDefault();
-    dragged(true);
-  });
-  side.addEventListener("dragleave", () => dragged(false));
-  side.addEventListener("drop", (event) => {
-    dragged(false);
-    if (!active || !event.dataTransfer.files.length) return;
-    event.preventDefault();
-    importFile(event.dataTransfer.files[0]);
-  });
+  fileDrop(studio.map.leaflet.getContainer(), ([first]) => importFile(first), () => active && Boolean(file));
 
   /* ---- The page ---- */
 
-  document.addEventListener("keydown", (event) => {
-    const isText = event.target.closest("textarea, input:not([type=range], [type=checkbox])");
-    if (!active || !file || isText || !(event.ctrlKey || event.metaKey) || event.altKey) return;
-    const way = {z: event.shiftKey ? redo : undo, y: redo}[event.key.toLowerCase()];
-    if (!way) return;
-    event.preventDefault();
-    step(way);
-  });
   window.addEventListener("beforeunload", (event) => { if (isDirty()) event.preventDefault(); });
 
   async function enter() {
@@ -274,8 +260,11 @@ export function tab(studio) {
   }
 
   async function start() {
+    wait(true);
+    missing.hidden = true;
     await attempt(() => restart());
     [content.hidden, missing.hidden] = [!file, Boolean(file)];
+    if (!file || file.saved || !hasArea(body())) wait(false);
   }
 
   function leave() {
@@ -286,5 +275,6 @@ export function tab(studio) {
     view.dim(false);
   }
 
-  return {name: "plan", title: "Plan", panel, enter, leave};
+  const keys = {"Ctrl+z": () => step(undo), "Ctrl+Z": () => step(redo), "Ctrl+y": () => step(redo)};
+  return {name: "plan", title: "Plan", panel, enter, leave, keys};
 }

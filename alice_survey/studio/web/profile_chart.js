@@ -21,7 +21,7 @@ export function profileChart(label, {describe = null, pointed = () => {}, high =
      do; `rules` are places that get an upright line. */
   function show({lines, range, downwards = false, caption, rules = []}) {
     element.hidden = false;
-    const xs = lines.flatMap((line) => [line.xs[0], line.xs[line.xs.length - 1]]);
+    const xs = lines.flatMap((line) => [line.xs[0], line.xs.at(-1)]).filter(Number.isFinite);
     [start, end] = [Math.min(...xs), Math.max(...xs)];
     const [low, most] = range || rangeOf(lines);
     const base = high - BELOW;

@@ -1,6 +1,7 @@
 /* The first start: what shall become of this folder, a survey to plan or a model of pictures. */
 
 import {attempt, button, el, field, mayWrite, say, send} from "./core.js";
+import {fileDrop} from "./file_drop.js";
 import {counted, duration, gigabytes, number} from "./words.js";
 
 const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt,.plan";
@@ -43,20 +44,16 @@ function planForm(studio) {
     el("small", {}, "Left empty, it lies at the example's place, off Haifa; all lengths are right there too."),
     el("p", {}, "or a file of the area from a map program: choose it, or drop it here"),
     field("Map file", file, "GeoJSON, KML, KMZ, GeoPackage, zipped shapefile, WKT or QGroundControl plan; its outline is then the area"));
-  ["dragover", "dragleave", "drop"].forEach((kind) => place.addEventListener(kind, (event) => {
-    event.preventDefault();
-    place.classList.toggle("over", kind === "dragover");
-    if (kind === "drop" && event.dataTransfer.files.length) {
-      file.files = event.dataTransfer.files;
-      taken();
-    }
-  }));
   const taken = () => {
     const has = Boolean(file.files.length);
     [latitude, longitude, along, across].forEach((input) => { input.disabled = has; });
     if (has) say(`${file.files[0].name}: the area is taken from it`);
   };
   file.addEventListener("change", taken);
+  fileDrop(place, (files) => {
+    file.files = files;
+    taken();
+  });
   const make = button("Make the survey", null, {class: "primary", type: "submit", disabled: !mayWrite()});
   const form = el("form", {hidden: true, onsubmit: save},
     el("h2", {}, "Plan a survey"),

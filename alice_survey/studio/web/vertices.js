@@ -1,14 +1,12 @@
-/* Handles over the map by which a ring is edited: its corners, the middles of its edges, and one
+/* Handles over the map by which shapes are edited: their vertices, the middles of their edges, and one
    that moves all of it. Each is a button, so that all can be done by keyboard. */
 
 import {el} from "./core.js";
-import {
-  insertVertex, isClosed, moveRing, moveVertex, nameOf, pointsOf, removeRing, removeVertex,
-} from "./plan_shapes.js";
+import {fixed} from "./words.js";
 
 const MOST_HANDLES = 400;
 const LONG_PRESS_MS = 650;
-const APART_PX = 26;  /* between corners whose middle gets a handle */
+const APART_PX = 26;  /* between vertices whose middle gets a handle */
 const ARROWS = {ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowRight: [0, 1], ArrowLeft: [0, -1]};
 
 /* 1, 2 or 5 times a power of ten, not above a length. */
@@ -17,19 +15,21 @@ export function roundStep(length) {
   return [5, 2, 1].find((step) => step * power <= length * (1 + 1e-9)) * power;
 }
 
-/* `map` is Leaflet's; `changed(shapes, tag)` takes an edit, `moving(shapes)` one that goes on, and
-   `left()` is called when Escape gives the focus back. */
-export function handles(map, {changed, moving, left}) {
-  const pane = map.createPane("plan-handles");
-  pane.classList.add("leaflet-zoom-hide");
+/* What is edited is shown as a target: `name`, `word` of a vertex, and rings [{points, closed}] of points
+   [north, east]; `value` is what is edited and `move(ring, i, place)` returns a new one; so do, where it can be done,
+   `insert(ring, after, place or null)`, `remove(ring, i)`, `shift(north, east)` and `drop()` of all of it.
+   `changed(value, tag)` takes an edit, `moving(value)` one that goes on, and `left()` is called when
+   Escape gives the focus back. */
+export function vertexHandles(map, name, {unit = "m", changed, moving, left}) {
+  const pane = map.createPane(name + "-vertices");
+  pane.classList.add("vertices", "leaflet-zoom-hide");
   /* Where a handle was replaced meanwhile, the click is the pane's. */
   pane.addEventListener("click", (event) => event.stopPropagation());
-  let [shapes, path, pressed] = [null, null, null];
+  let [target, pressed] = [null, null];
 
   const place = ([n, e]) => map.latLngToLayerPoint([n, e]);
   const step = (fine) => Math.max(0.001, roundStep((fine ? 1 : 8) / 2 ** map.getZoom()));
-  const text = ([n, e]) => n.toFixed(2) + " m north, " + e.toFixed(2) + " m east";
-  const word = () => (isClosed(path) ? "Corner " : "Point ");
+  const text = ([n, e]) => fixed(n, 2, unit) + " north, " + fixed(e, 2, unit) + " east";
 
   const at = (name) => pane.querySelector(`[data-at="${name}"]`);
   const focus = (made) => made?.focus({preventScroll: true});
@@ -37,98 +37,105 @@ export function handles(map, {changed, moving, left}) {
     made.style.transform = `translate(${Math.round(spot.x)}px, ${Math.round(spot.y)}px)`;
   };
   const centre = (spots) => spots.reduce((a, b) => a.add(b)).divideBy(spots.length);
+  const of = (made) => made.dataset.at.slice(1).split("-").map(Number);
+  const nextOf = (ring, i) => (i + 1) % target.rings[ring].points.length;
 
-  /* Handles of a ring, or of none where one of both is null. */
-  function show(newShapes, newPath) {
-    [shapes, path] = [newShapes, newPath];
-    if (pressed) follow();
+  /* Handles of a target, or of none. */
+  function show(newTarget) {
+    target = newTarget;
+    if (pressed && target) follow();
     else draw();
   }
 
   /* While one is dragged all handles stay the same elements: the browser holds on to it. */
   function follow() {
-    const spots = pointsOf(shapes, path).map(place);
-    if (pressed.does.tag.startsWith("middle")) {
-      put(pressed.made, spots[pressed.does.index + 1]);
+    const spots = target.rings.map(({points}) => points.map(place));
+    if (pressed.does.between) {
+      const [ring, i] = pressed.does.between;
+      put(pressed.made, spots[ring][i + 1]);
       return;
     }
-    pane.querySelectorAll(".corner").forEach((made) => put(made, spots[Number(made.dataset.at.slice(1))]));
-    pane.querySelectorAll(".middle").forEach((made) => {
-      const i = Number(made.dataset.at.slice(1));
-      put(made, centre([spots[i], spots[(i + 1) % spots.length]]));
+    pane.querySelectorAll(".corner").forEach((made) => {
+      const [ring, i] = of(made);
+      put(made, spots[ring][i]);
     });
-    put(at("move"), centre(spots));
+    pane.querySelectorAll(".middle").forEach((made) => {
+      const [ring, i] = of(made);
+      put(made, centre([spots[ring][i], spots[ring][nextOf(ring, i)]]));
+    });
+    if (at("move")) put(at("move"), centre(spots[0]));
   }
 
   function draw() {
     const focused = pane.contains(document.activeElement) ? document.activeElement.dataset.at : null;
     pane.replaceChildren();
-    fill();
+    if (target) target.rings.forEach(fill);
+    if (target?.shift && target.rings[0].points.length) {
+      pane.append(handle("mover", "move", centre(target.rings[0].points.map(place)), {
+        "aria-label": "Move " + target.name,
+        title: "Drag, or arrow keys, to move all of it" + (target.drop ? "; Delete removes it" : ""),
+      }, whole()));
+    }
     if (focused) focus(at(focused) || pane.querySelector(".corner") || map.getContainer());
   }
 
-  function fill() {
-    const points = path && shapes ? pointsOf(shapes, path) : [];
-    if (!points.length) return;
+  function fill({points, closed}, ring) {
     const view = map.getBounds().pad(0.2);
     const spots = points.map(place);
     const seen = points.map((_, i) => i).filter((i) => view.contains(points[i])).slice(0, MOST_HANDLES);
+    const hole = ring ? ", hole " + ring : "";
     seen.forEach((i) => {
-      pane.append(handle("corner", "c" + i, spots[i], {
-        "aria-label": word() + (i + 1) + " of " + points.length + " of " + nameOf(shapes, path).toLowerCase() + ": " + text(points[i]),
-        title: "Drag, or arrow keys; Delete removes; Enter adds one after it",
-      }, corner(i)));
+      pane.append(handle("corner", "c" + ring + "-" + i, spots[i], {
+        "aria-label": target.word + " " + (i + 1) + " of " + points.length + " of " + target.name + hole + ": " + text(points[i]),
+        title: "Drag, or arrow keys, with Shift by less" + (target.insert ? "; Delete removes; Enter adds one after it" : ""),
+      }, corner(ring, i, closed)));
     });
+    if (!target.insert) return;
     seen.forEach((i) => {
-      const next = (i + 1) % points.length;
-      if ((next === 0 && !isClosed(path)) || spots[i].distanceTo(spots[next]) < APART_PX) return;
-      pane.append(handle("middle", "m" + i, centre([spots[i], spots[next]]), {
-        "aria-label": "Add one after " + word().toLowerCase() + (i + 1), tabindex: "-1",
-      }, middle(i)));
+      const next = nextOf(ring, i);
+      if ((next === 0 && !closed) || spots[i].distanceTo(spots[next]) < APART_PX) return;
+      pane.append(handle("middle", "m" + ring + "-" + i, centre([spots[i], spots[next]]), {
+        "aria-label": "Add one after " + target.word.toLowerCase() + " " + (i + 1) + hole, tabindex: "-1",
+      }, middle(ring, i)));
     });
-    pane.append(handle("mover", "move", centre(spots), {
-      "aria-label": "Move " + nameOf(shapes, path).toLowerCase(),
-      title: "Drag, or arrow keys, to move all of it; Delete removes it",
-    }, whole()));
   }
 
-  /* What each kind of handle does: `drag(from, to, shapes)` and `keys`. */
-  function corner(i) {
+  /* What each kind of handle does: `drag(from, to, start)`, of the target at the start, and keys. */
+  function corner(ring, i, closed) {
     return {
-      tag: "corner " + i,
-      drag: (from, to, start) => moveVertex(start, path, i, to),
+      tag: "corner " + ring + "-" + i,
+      drag: (from, to, start) => start.move(ring, i, to),
       shift: (north, east) => {
-        const [n, e] = pointsOf(shapes, path)[i];
-        return moveVertex(shapes, path, i, [n + north, e + east]);
+        const [n, e] = target.rings[ring].points[i];
+        return target.move(ring, i, [n + north, e + east]);
       },
-      remove: () => removeVertex(shapes, path, i),
+      remove: target.remove && (() => target.remove(ring, i)),
       enter() {
-        const points = pointsOf(shapes, path);
-        if (!isClosed(path) && i === points.length - 1) return;
-        inserted(insertVertex(shapes, path, i), i);
+        if (!target.insert || (!closed && nextOf(ring, i) === 0)) return;
+        inserted(target.insert(ring, i, null), ring, i);
       },
     };
   }
-  const middle = (i) => ({
-    tag: "middle " + i,
-    index: i,
-    drag: (from, to, start) => insertVertex(start, path, i, to),
-    dropped: (next) => inserted(next, i),
-    click: () => inserted(insertVertex(shapes, path, i), i),
+  const middle = (ring, i) => ({
+    tag: "middle " + ring + "-" + i,
+    between: [ring, i],
+    drag: (from, to, start) => start.insert(ring, i, to),
+    dropped: (next) => inserted(next, ring, i),
+    click: () => inserted(target.insert(ring, i, null), ring, i),
   });
-  function inserted(next, after) {
-    changed(next);
-    focus(at("c" + (after + 1)));
+  function inserted(next, ring, after) {
+    changed(next, "");
+    focus(at("c" + ring + "-" + (after + 1)));
   }
   const whole = () => ({
     tag: "all",
-    drag: (from, to, start) => moveRing(start, path, to[0] - from[0], to[1] - from[1]),
-    shift: (north, east) => moveRing(shapes, path, north, east),
-    remove: () => removeRing(shapes, path),
+    drag: (from, to, start) => start.shift(to[0] - from[0], to[1] - from[1]),
+    shift: (north, east) => target.shift(north, east),
+    remove: target.drop && (() => target.drop()),
   });
 
   function handle(name, key, spot, attributes, does) {
-    const made = el("button", {type: "button", class: "plan-handle " + name, "data-at": key, ...attributes});
+    const made = el("button", {type: "button", class: "vertex " + name, "data-at": key, ...attributes});
     put(made, spot);
     /* Neither the map nor its tool must take what is meant for a handle. */
     ["mousedown", "touchstart", "dblclick", "click"].forEach(
@@ -150,12 +157,12 @@ export function handles(map, {changed, moving, left}) {
     event.stopPropagation();
     event.preventDefault();
     focus(made);
-    pressed = {does, made, from: northEast(event), at: [event.clientX, event.clientY], start: shapes, now: null};
+    pressed = {does, made, from: northEast(event), at: [event.clientX, event.clientY], start: target, now: null};
     const held = pressed;
     pressed.timer = setTimeout(() => {
       if (pressed !== held || held.now || !does.remove || event.pointerType === "mouse") return;
       release();
-      changed(does.remove());
+      changed(does.remove(), "");
     }, LONG_PRESS_MS);
     map.getContainer().dataset.tool = "handle";
     window.addEventListener("pointermove", move);
@@ -184,13 +191,13 @@ export function handles(map, {changed, moving, left}) {
     release();
     if (!now) does.click?.();
     else if (does.dropped) does.dropped(now);
-    else changed(now);
+    else changed(now, "");
   }
 
   function cancel() {
     const {start} = pressed;
     release();
-    moving(start);
+    moving(start.value);
   }
 
   function typed(event, does) {
@@ -198,8 +205,8 @@ export function handles(map, {changed, moving, left}) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (way && does.shift) {
       const metres = step(event.shiftKey);
-      changed(does.shift(metres * way[0], metres * way[1]), "arrow " + does.tag + path.kind + path.index + path.ring);
-    } else if ((event.key === "Delete" || event.key === "Backspace") && does.remove) changed(does.remove());
+      changed(does.shift(metres * way[0], metres * way[1]), "arrow " + does.tag + target.name);
+    } else if ((event.key === "Delete" || event.key === "Backspace") && does.remove) changed(does.remove(), "");
     else if (event.key === "Enter" || event.key === " ") (does.enter || does.click)?.();
     else if (event.key === "Escape") {
       if (pressed) cancel();

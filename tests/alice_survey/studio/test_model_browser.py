@@ -112,7 +112,7 @@ def test_lengths_areas_and_exports(tmp_path: Path) -> None:
         page.get_by_label("Plane of the volume").select_option("level")
         page.get_by_label("Height of the plane, m").fill("-10")
         click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
-        page.get_by_role("button", name="Finish (D)").click()
+        page.get_by_role("button", name="Finish", exact=True).click()
         volume = measured(page, 2)[1]
         assert named(volume)["volume"]["value"] == pytest.approx(0.2 * 0.5 * SLOPE, rel=0.05)
         assert named(volume)["aspect"]["value"] == pytest.approx(270.0, abs=1.0)
@@ -145,7 +145,7 @@ def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
             page.wait_for_timeout(400)
         page.keyboard.press("Enter")
         page.keyboard.press("Backspace")
-        page.keyboard.press("d")
+        page.keyboard.press("f")
         (line,) = measured(page, 1)
         assert len(line["places"]) == 3
         page.keyboard.press("r")
@@ -191,12 +191,12 @@ def test_it_is_accessible(width: int, tmp_path: Path) -> None:
         page.get_by_label("Side of quadrats, m").fill("0.2")
         click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
         assert Axe().run(page).violations_count == 0
-        page.keyboard.press("d")
+        page.keyboard.press("f")
         (area,) = measured(page, 1)
         assert 4 <= len(area["quadrats"]) <= 6  # a row that is half outside
         page.get_by_role("button", name="Profile", exact=True).click()
         click(page, (0.2, 0.5), (0.6, 0.5), (0.6, 0.9))
-        page.keyboard.press("d")
+        page.keyboard.press("f")
         measured(page, 2)
         page.get_by_text("Mesh", exact=True).click()
         page.wait_for_selector(".mesh[data-ready]", timeout=30_000)

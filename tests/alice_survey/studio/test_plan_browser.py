@@ -73,7 +73,7 @@ class PlanPage:
         self.settled(before)
 
     def corner(self, number: int) -> Any:
-        return self.page.locator(".plan-handle.corner").nth(number)
+        return self.page.locator(".vertex.corner").nth(number)
 
     def drag(self, handle: Any, right: float, down: float) -> None:
         before = self.plans
@@ -142,16 +142,16 @@ def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: 
         assert plan.text() != drawn
         plan.press("Control+z")
 
-        plan.drag(page.locator(".plan-handle.middle").first, -10, 0)
-        assert page.locator(".plan-handle.corner").count() == 5
+        plan.drag(page.locator(".vertex.middle").first, -10, 0)
+        assert page.locator(".vertex.corner").count() == 5
         plan.press("Delete")
-        assert page.locator(".plan-handle.corner").count() == 4
+        assert page.locator(".vertex.corner").count() == 4
         plan.corner(1).focus()
         plan.press("ArrowUp")
         plan.press("Control+z")
         if size == "phone":
             _press_long(plan, plan.corner(1))
-            assert page.locator(".plan-handle.corner").count() == 3
+            assert page.locator(".vertex.corner").count() == 3
             plan.press("Control+z")
         for _ in range(2):  # what was removed, and what was inserted
             plan.press("Control+z")
@@ -351,7 +351,8 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
             "() => /\\d mm/.test(document.querySelector('.plan-precision').textContent)",
             timeout=120_000,
         )
-        page.get_by_text("Layers").click()
+        if not page.locator("#layers").evaluate("(layers) => layers.open"):
+            page.locator("#layers summary").click()
         expected = page.locator("[data-layer=plan-sigma]")
         expected.wait_for()
         assert expected.get_by_role("checkbox").is_checked()
