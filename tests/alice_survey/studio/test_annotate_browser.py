@@ -11,7 +11,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.report.tiny import tiny_workspace
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
@@ -28,6 +28,7 @@ def opened(browser: Any, server: Any, tab: str, width: int = 1280) -> tuple[Any,
     )
     heard = Heard()
     heard.listen(page)
+    page.add_init_script(FOLDED)
     page.goto(server.address)
     page.wait_for_selector("body[data-ready]", timeout=20_000)
     page.get_by_role("tab", name=tab, exact=True).click()
@@ -96,7 +97,7 @@ def test_a_polygon_is_drawn_edited_taken_back_and_exported(folder: Path) -> None
         page.get_by_role("button", name="Delete", exact=True).click()
         page.get_by_text("Nothing is annotated yet.").wait_for()
         page.get_by_label("Tool", exact=True).select_option("coco")
-        page.get_by_label("File", exact=True).set_input_files(downloading.value.path())
+        page.locator("#panel-annotate").get_by_label("File", exact=True).set_input_files(downloading.value.path())
         page.get_by_role("button", name="Import").click()
         page.get_by_text("1 annotations and 0 labels added").wait_for()
         np.testing.assert_allclose(

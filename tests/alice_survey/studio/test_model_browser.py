@@ -19,7 +19,7 @@ from alice_survey.base.artefacts import write_json
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import sketch_mesh
 from tests.alice_survey.report.tiny import SLOPE, tiny_workspace
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
@@ -46,6 +46,7 @@ def opened(folder: Path, width: int = 1280) -> Iterator[tuple[Any, Heard]]:
         page = browser.new_page(viewport={"width": width, "height": 900}, reduced_motion="reduce")
         heard = Heard()
         heard.listen(page)
+        page.add_init_script(FOLDED)
         page.goto(server.address + "#model")
         page.wait_for_selector("body[data-ready]", timeout=20_000)
         page.wait_for_selector("#panel-model:visible")

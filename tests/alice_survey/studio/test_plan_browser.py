@@ -13,7 +13,7 @@ from axe_playwright_python.sync_playwright import Axe
 from alice_survey.base.config import SurveyConfig, load_config
 from missions.plan.preview import preview
 from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 800), "phone": (400, 800)}
@@ -117,6 +117,7 @@ def opened(browser: Any, address: str, size: str = "desk") -> PlanPage:
     page.set_default_timeout(15_000)
     heard = Heard()
     heard.listen(page)
+    page.add_init_script(FOLDED)
     page.goto(f"{address}#plan")
     page.wait_for_selector("#panel-plan[data-read]")
     return PlanPage(page=page, heard=heard)
@@ -310,7 +311,7 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
         assert "current_mps = 0.06" in plan.text()
 
         before = plan.plans
-        page.locator("input[type=file]").set_input_files(
+        page.locator("#panel-plan input[type=file]").set_input_files(
             {
                 "name": "reef.geojson",
                 "mimeType": "application/json",
