@@ -1,6 +1,7 @@
 /* The Compare tab: another survey next to this one or swiped over it, and what has changed. */
 
 import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {showSteps} from "./job_progress.js";
 import {missing} from "./missing.js";
 import {BLUE, RED} from "./palette.js";
 import {fixed, number, withSigma} from "./words.js";
@@ -12,7 +13,7 @@ export function tab(studio) {
   const maps = comparedMaps(studio, (share) => { swipe.value = String(Math.round(100 * share)); });
   let other = null;
   let results = [];
-  let running = false;
+  let job = null;  /* that runs in this survey */
   let looked = false;
 
   /* ---- The other survey ---- */
@@ -79,16 +80,21 @@ export function tab(studio) {
   /* ---- What has changed ---- */
 
   const find = button("Find what has changed", () => attempt(async () => {
-    await send("/api/compare/" + other.id + "/evaluate");
-    running = true;
-    say("Heights are compared; this takes some seconds to minutes");
+    await send("/api/run/start", {name: "evaluate", arguments: {against: other.path}});
+    say("Heights are compared");
+    job = {steps: []};
     render();
   }));
-  on("compare", (data) => attempt(async () => {
-    running = false;
-    say(data.text, data.ok ? "note" : "error");
-    await load();
-  }));
+  const progress = el("div", {class: "run"});
+  on("run", (data) => {
+    if (data.job) {
+      job = data.job;
+      if (!panel.hidden) render();
+    } else if (data.ended) {
+      job = null;
+      attempt(load);
+    }
+  });
 
   const which = el("select", {});
   which.addEventListener("change", render);
@@ -96,7 +102,7 @@ export function tab(studio) {
 
   async function load() {
     const found = await get("/api/compare/results");
-    ({results, running} = found);
+    ({results} = found);
     const before = which.value;
     which.replaceChildren(...results.map((one) => el("option", {value: one.name}, one.name)));
     if (results.some((one) => one.name === before)) which.value = before;
@@ -166,7 +172,7 @@ export function tab(studio) {
     el("p", {class: "buttons"}, choose), about,
     el("fieldset", {style: {border: "0", padding: "0", margin: "0 0 12px"}}, el("legend", {style: {fontWeight: "650"}}, "Show"), radios),
     field("Raster", kind), colours, swipeField,
-    el("h2", {}, "Change"), el("p", {class: "buttons"}, find), whichField, changes);
+    el("h2", {}, "Change"), el("p", {class: "buttons"}, find), progress, whichField, changes);
   const {has} = studio.state;
   const lack = missing(studio, content, () => (has.dem || has.mosaic ? null
     : ["There is no model of this survey to compare yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
@@ -175,8 +181,8 @@ export function tab(studio) {
   function render() {
     const writes = studio.mayWrite();
     choose.disabled = !writes;
-    find.disabled = !writes || !other || !other.comparable || running;
-    find.textContent = running ? "Comparing…" : "Find what has changed";
+    find.disabled = !writes || !other || !other.comparable || Boolean(job);
+    showSteps(progress, job || {steps: []});
     const scale = other?.layers.find((layer) => layer.name === kind.value)?.scale;
     colours.textContent = scale && mode !== "off"
       ? "Colours of the other run from " + [scale.low, scale.high].map((v) => number(v, "", 4)).join(" to ") + " (" + scale.label + "); those of this one are in the list of layers." : "";

@@ -190,9 +190,11 @@ def test_a_fault_and_the_report_inside(page: Any, tmp_path: Path) -> None:
         is_accessible(page)
         page.keyboard.press("Escape")
         page.wait_for_selector("dialog.report", state="detached")
-        page.get_by_text("Further commands").click()
-        page.get_by_label("Folder of an earlier survey").fill(str(workspace / "dense"))
-        named(page, "Find what has changed").click()
+        page.evaluate(
+            "(against) => import('/app/core.js').then(({send}) =>"
+            " send('/api/run/start', {name: 'evaluate', arguments: {against}}))",
+            str(workspace / "dense"),
+        )
         page.get_by_role("heading", name="Score the survey: failed").wait_for(timeout=LONG_MS)
         line = page.locator("section[aria-label='Last run'] .error").inner_text()
         assert line and "Traceback" not in line
