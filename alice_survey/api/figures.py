@@ -6,6 +6,7 @@ import numpy as np
 
 from alice_survey.api.rasters import Dem, Mosaic
 from alice_survey.api.track import Track
+from alice_survey.kit.document import EAST_NORTH, OWN_AXES
 from alice_survey.kit.figure import (
     INK,
     INKS,
@@ -71,7 +72,7 @@ def plot_dem(dem: Dem) -> Sheet:
             cmap="viridis" if values is dem.height else "cividis",
         )  # fmt: skip
         colour_bar(image, axes, label)
-        map_axes(axes, dem.unit, placed=dem.crs is not None)
+        map_axes(axes, dem.unit, names=EAST_NORTH if dem.crs is not None else OWN_AXES)
     return sheet
 
 
@@ -88,7 +89,7 @@ def plot_mosaic(mosaic: Mosaic) -> Sheet:
     """
     sheet, axes = _map()
     axes.imshow(mosaic.rgba, extent=mosaic.extent)
-    map_axes(axes, mosaic.unit, placed=mosaic.crs is not None)
+    map_axes(axes, mosaic.unit, names=EAST_NORTH if mosaic.crs is not None else OWN_AXES)
     return sheet
 
 
@@ -112,7 +113,7 @@ def plot_track(track: Track) -> Sheet:
     )  # fmt: skip
     if sigma is not None:
         colour_bar(dots, axes, f"standard deviation of the position, {track.frame.unit}")
-    map_axes(axes, track.frame.unit, placed=track.frame.name == "ned")
+    map_axes(axes, track.frame.unit, names=EAST_NORTH if track.frame.name == "ned" else OWN_AXES)
     return sheet
 
 

@@ -10,6 +10,11 @@ LEVELS: tuple[Level, ...] = ("bad", "look", "good")
 """Worst first."""
 
 
+EAST_NORTH = ("east", "north")
+OWN_AXES = ("y", "x")
+"""Axes of the map of a model without a place: seen from above, its first axis is up."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """One judgement with its numbers."""
@@ -177,8 +182,8 @@ class SurveyMap:
     """Unit of its axes: m, or unit where the model has no scale."""
     origin: str
     """Where (0, 0) is, in words."""
-    placed: bool = True
-    """Whether its axes are east and north; those of a model without positions are its own."""
+    axes: tuple[str, str] = EAST_NORTH
+    """What its axes are called, across and up."""
     geodetic: tuple[Sequence[float], Sequence[float]] | None = None
     """Degrees of latitude and longitude as quadratics of metres north n and east e: coefficients
     of 1, n, e, n², ne and e²; the map then shows them under the pointer."""

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import ConfigError, WorkspaceError
 from alice_survey.base.frames import Array
-from alice_survey.kit.document import Figure
+from alice_survey.kit.document import EAST_NORTH, Figure
 from alice_survey.kit.map import round_length
 
 __all__ = [
@@ -217,18 +217,18 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> Any:
     return bar
 
 
-def map_axes(axes: Any, unit: str = "m", *, placed: bool = True) -> None:
+def map_axes(axes: Any, unit: str = "m", *, names: tuple[str, str] = EAST_NORTH) -> None:
     """East to the right and north up, at one scale, with a scale bar and an arrow to the north.
 
-    The axes of a model that is not `placed` are its own, and have no north. Call it when everything
-    is drawn, since bar and arrow follow the limits.
+    Axes of other names have no north. Call it when everything is drawn, since bar and arrow follow
+    the limits.
     """
-    across, up = ("east", "north") if placed else ("x", "y")
+    across, up = names
     axes.set(aspect="equal", xlabel=f"{across}, {unit}", ylabel=f"{up}, {unit}")
     for spine in axes.spines.values():
         spine.set_visible(True)
     scale_bar(axes, unit)
-    if placed:
+    if names == EAST_NORTH:
         north_arrow(axes)
 
 

@@ -42,7 +42,7 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
             tiles.append((f"tiles-{index}", text))
     data = {
         "unit": survey_map.unit,
-        "axes": ["east", "north"] if survey_map.placed else ["along x", "along y"],
+        "axes": list(survey_map.axes),
         "extent": [_short(value) for value in map_extent(survey_map)],
         "layers": described,
         "more": None if survey_map.script is None else survey_map.script.data,

@@ -79,7 +79,7 @@ def map_figure(
     for shape in sorted(shapes, key=lambda layer: _KINDS.index(layer.kind)):
         _paint_shapes(axes, shape)
     axes.set(xlim=(west - margin, east + margin), ylim=(south - margin, north + margin))
-    map_axes(axes, survey_map.unit, placed=survey_map.placed)
+    map_axes(axes, survey_map.unit, names=survey_map.axes)
     if shapes:
         sheet.legend(loc="outside lower center", ncols=min(4, len(shapes)), fontsize=8)
     titles = ", ".join(layer.title.lower() for layer in layers)

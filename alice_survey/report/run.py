@@ -10,7 +10,7 @@ from alice_survey.base.artefacts import STAGE_FILE, atomic_path
 from alice_survey.base.executor import Executor
 from alice_survey.base.records import ReportRecord
 from alice_survey.base.run import progress
-from alice_survey.kit.document import PictureLayer, Report, ShapeLayer, SurveyMap
+from alice_survey.kit.document import OWN_AXES, PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.kit.map_figure import with_stills
 from alice_survey.kit.page import render_html
 from alice_survey.kit.paper import render_pdf
@@ -106,9 +106,11 @@ def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> Surve
     datum = held.frame.datum
     if held.plane is not None:
         origin = f"the plane {held.plane.name}, {held.plane.about}: right and up in it"
-        return SurveyMap(layers=layers, unit=held.unit, origin=origin, placed=False)
+        return SurveyMap(layers=layers, unit=held.unit, origin=origin, axes=("right", "up"))
     if datum is None or held.frame.name != "ned":
-        return SurveyMap(layers=layers, unit=held.unit, origin="the model's own axes", placed=False)
+        return SurveyMap(
+            layers=layers, unit=held.unit, origin="the model's own axes", axes=OWN_AXES
+        )
     place = f"{datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"
     return SurveyMap(layers=layers, unit=held.unit, origin=f"metres east and north of {place}")
 

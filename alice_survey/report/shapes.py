@@ -79,8 +79,8 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
 
 
 def camera_place(row: Mapping[str, str]) -> Array:
-    """East and north of a row of the track; a model's own x and y where it has no place."""
-    columns = (("east_m", "north_m"), ("x_m", "y_m"), ("x", "y"))
+    """Right and up on the map: east and north, or of a model without a place its own y and x."""
+    columns = (("east_m", "north_m"), ("y_m", "x_m"), ("y", "x"))
     names = next(names for names in columns if names[0] in row)
     return np.array([number(row, name) for name in names])
 

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from alice_survey.kit.document import OWN_AXES
 from reconstruct.measure.errors import REACH_CELLS, SharedErrors, own_correlation, shared_errors
 from reconstruct.measure.sight import sight_lines
 from reconstruct.planes import Plane, read_plane
@@ -126,7 +127,7 @@ class MeasuredSurface:
         """What its coordinates are called."""
         if not self.plane.is_level:
             return "right", "up", "out"
-        return ("east", "north", "up") if self.frame.name == "ned" else ("x", "y", "up")
+        return ("east", "north", "up") if self.frame.name == "ned" else (*OWN_AXES, "up")
 
     def window(self, row: int, column: int, rows: int, columns: int) -> tuple[Array, Array]:
         """Heights and sigmas of own errors (rows, columns) of a window; NaN beyond the grid."""

@@ -10,6 +10,7 @@ from alice_survey.base.artefacts import read_csv
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
+from alice_survey.kit.document import EAST_NORTH, OWN_AXES
 from alice_survey.kit.figure import (
     EllipseCollection,
     figure_style,
@@ -104,7 +105,9 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
                   max(extent[3], places[:, 0].max()) + margin)  # fmt: skip
     axes.set_facecolor("0.15")
     axes.grid(visible=False)
-    map_axes(axes, tags.get("UNIT", "m"), placed=tags.get("FRAME") != "model")
+    map_axes(
+        axes, tags.get("UNIT", "m"), names=OWN_AXES if tags.get("FRAME") == "model" else EAST_NORTH
+    )
     axes.set_title(
         f"Camera positions over the mosaic: {len(poses)} pictures at {len(names)} stations"
     )

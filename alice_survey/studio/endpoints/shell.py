@@ -7,7 +7,7 @@ from importlib import resources
 from typing import Any
 
 from alice_survey.base.errors import AliceError
-from alice_survey.kit.document import PictureLayer, ShapeLayer
+from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 from alice_survey.report.held import Held
 from alice_survey.report.run import survey_map
@@ -37,14 +37,16 @@ class _Shell:
         held = Held.of(workspace.folder)
         found = survey_map(held, ())
         datum = held.frame.datum
-        placed = found.placed or not held.has("sparse")  # a plan is drawn on east and north
+        placed = found.axes == EAST_NORTH or not held.has(
+            "sparse"
+        )  # a plan is drawn on east and north
         web = resources.files("alice_survey.studio") / "web"
         return {
             "workspace": str(workspace.folder),
             "name": held.name,
             "stages": sorted(held.stages),
             "unit": found.unit,
-            "axes": ["east", "north"] if placed else ["along x", "along y"],
+            "axes": EAST_NORTH if placed else found.axes,
             "placed": placed,
             "origin": found.origin,
             "simulated": held.simulated,

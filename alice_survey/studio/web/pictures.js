@@ -83,7 +83,9 @@ export function tab(studio) {
   }
 
   async function listPictures() {
-    const found = await get("/api/pictures", {find: find.value, count: 60});
+    const wanted = find.value;
+    const found = await get("/api/pictures", {find: wanted, count: 60});
+    if (wanted !== find.value) return;  /* an answer that a later one has overtaken */
     list.replaceChildren(...found.pictures.map((one) => button(one.name + (one.registered ? "" : " (not in the model)"),
       () => showOne(one.name), {disabled: !one.registered})));
     if (found.total > found.pictures.length) list.append(el("small", {}, "and " + (found.total - found.pictures.length) + " more"));

@@ -1,8 +1,10 @@
 """Projects of TagLab: pictures with regions and points, and the dictionary of labels.
 
 Regions of a picture are outlines with holes through the middles of pixels: half a pixel less in
-x and y than from the outer corner. Boxes are top, left, width, height. TagLab has no lines; a
-rectangle or circle is a region, whose `data` says what it was.
+x and y than from the outer corner; TagLab writes them as text, the first point and then each one's
+way from the one before, in tenths of a pixel, and reads lists of pairs too, which lose nothing.
+Boxes are top, left, width, height. TagLab has no lines; a rectangle or circle is a region, whose
+`data` says what it was.
 """
 
 import contextlib
@@ -32,6 +34,7 @@ from reconstruct.annotations.values import AnnotationSet, DrawnShape, Label, Pla
 _MIDDLE = 0.5
 """Of the first pixel, from its outer corner."""
 _BORDER = [200, 200, 200]
+_TENTHS = 10.0
 _APHIA = "AphiaID "
 _EMPTY = "Empty"
 """Class of regions without a label."""
@@ -72,7 +75,7 @@ def read_taglab(data: bytes, backdrops: Backdrops) -> AnnotationSet:
 
 
 def _labels(given: Any) -> list[tuple[str, int | None, str]]:
-    """Id, AphiaID and colour of the labels of a project: a list, or by their ids in older ones."""
+    """Id, AphiaID and colour of the labels of a project: by their ids, or a list."""
     entries = list(given.values()) if isinstance(given, dict) else given or []
     if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
         raise WorkspaceError("no TagLab project: 'labels' is no list of objects")
@@ -133,10 +136,22 @@ def _region(where: str, region: Mapping[str, Any]) -> tuple[DrawnShape, dict[str
     holes = region.get("inner contours") or []
     if not isinstance(holes, list):
         raise WorkspaceError(f"{where}: its inner contours are no list")
-    rings = [pairs(where, ring) for ring in (region.get("contour"), *holes)]
+    rings = [_ring(where, ring) for ring in (region.get("contour"), *holes)]
     corner = [[(x + _MIDDLE, y + _MIDDLE) for x, y in ring] for ring in rings]
     hint, values = _said(region.get("note"), region.get("data"))
     return with_hint(shape_of(where, "polygon", corner), hint), values
+
+
+def _ring(where: str, given: Any) -> list[Place]:
+    """Points of a contour, as a list of pairs or as TagLab's text of ways in tenths of a pixel."""
+    if not isinstance(given, str):
+        return pairs(where, given)
+    try:
+        steps = [int(word) for word in given.split()]
+    except ValueError:
+        raise WorkspaceError(f"{where}: its contour is no text of whole numbers") from None
+    ways = np.array(pairs(where, steps))
+    return pairs(where, np.cumsum(ways, axis=0) / _TENTHS)
 
 
 def _said(note: Any, data: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -175,12 +190,13 @@ def write_taglab(values: AnnotationSet, backdrops: Backdrops) -> ToolFiles:
                           "Data": data})  # fmt: skip
         else:
             region = _outlined(shape) | {
-                "class name": one.label, "id": n, "note": one.note, "data": data,
+                "class name": one.label, "instance name": f"coral{n}", "blob name": f"c-{n}",
+                "id": n, "note": one.note, "data": data,
             }  # fmt: skip
             image["annotations"]["regions"].append(region)
     whole: dict[str, Any] = {
         "filename": "",
-        "labels": [_label(label) for label in values.labels],
+        "labels": {label.id: _label(label) for label in values.labels},
         "images": list(images.values()),
         "correspondences": {},
         "spatial_reference_system": None,

@@ -66,8 +66,8 @@ def test_a_scale_bar_is_as_long_as_it_says() -> None:
 
 def test_a_map_of_a_model_without_positions_has_no_north() -> None:
     axes = new_figure(3.0).subplots()
-    map_axes(axes, "unit", placed=False)
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, unit", "y, unit")
+    map_axes(axes, "unit", names=("y", "x"))
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("y, unit", "x, unit")
     assert "N" not in [text.get_text() for text in axes.texts]
 
 

@@ -81,8 +81,9 @@ def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit:
     assert f"0.25 {unit}²" in page
     shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
     cameras = next(layer for layer in shown["layers"] if layer["name"] == "cameras")
-    # A model's own x goes east and its y north.
-    assert cameras["shapes"][0] == [[0.3, 0.4]]
+    # As in its rasters, a model's own y goes to the right and its x up.
+    assert cameras["shapes"][0] == [[0.4, 0.3]]
+    assert shown["axes"] == ["y", "x"]
 
 
 def plane_of(name: str, tilt: str) -> dict[str, Any]:
@@ -123,7 +124,7 @@ def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) ->
     assert {layer["name"] for layer in shown["layers"]}.isdisjoint(
         {"cameras", "footprints", "plan"}
     )
-    assert shown["axes"] == ["along x", "along y"]
+    assert shown["axes"] == ["right", "up"]
     assert (
         json.loads((workspace / "report" / "report.json").read_text())["surface"]["covered"] is None
     )

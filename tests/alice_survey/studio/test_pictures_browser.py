@@ -98,9 +98,10 @@ def test_points_are_picked_measured_and_made_control(small_survey: Path, tmp_pat
             assert {p.matched_to for p in mine} == {"", image}
 
         for pair in ((0, 1), (1, 2), (0, 2)):
-            for number in (*range(3), *pair):
-                box = page.get_by_label(f"spot {number}", exact=True)
-                box.set_checked(not box.is_checked() and number in pair)
+            for number in range(3):
+                page.get_by_label(f"spot {number}", exact=True).uncheck()
+            for number in pair:
+                page.get_by_label(f"spot {number}", exact=True).check()
             page.wait_for_function(
                 "(words) => document.querySelector('[data-value]')?.textContent.includes(words)",
                 arg=f"spot {pair[0]} to spot {pair[1]}", timeout=WAIT_MS,

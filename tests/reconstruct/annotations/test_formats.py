@@ -155,24 +155,26 @@ TAGLAB_BY_HAND = {
     "working_area": None,
     "dictionary_name": "reef",
     "dictionary_description": "",
-    "labels": [
-        {"id": "Empty", "name": "Empty", "description": None, "fill": [0, 0, 0],
-         "border": [200, 200, 200], "visible": True},
-        {"id": "Pocillopora", "name": "Pocillopora", "description": "AphiaID 206938",
-         "fill": [255, 0, 128], "border": [200, 200, 200], "visible": True},
-    ],
+    "labels": {
+        "Empty": {"id": "Empty", "name": "Empty", "description": None, "fill": [0, 0, 0],
+                  "border": [200, 200, 200], "visible": True},
+        "Pocillopora": {"id": "Pocillopora", "name": "Pocillopora", "description": "AphiaID 206938",
+                        "fill": [255, 0, 128], "border": [200, 200, 200], "visible": True},
+    },
     "images": [{
         "rect": [0.0, 0.0, 0.0, 0.0], "map_px_to_mm_factor": "2.7", "width": 1020, "height": 1035,
         "annotations": {
             "regions": [{
                 "bbox": [9, 9, 21, 21], "centroid": [19.5, 19.5], "area": 300.0, "perimeter": 80.0,
-                "contour": [[9.5, 9.5], [29.5, 9.5], [29.5, 29.5], [9.5, 29.5]],
-                "inner contours": [[[14.5, 14.5], [24.5, 14.5], [24.5, 24.5], [14.5, 24.5]]],
-                "class name": "Pocillopora", "id": 3, "note": "bleached", "data": {"dead": 20},
+                "contour": "95 95 200 0 0 200 -200 0",
+                "inner contours": ["145 145 100 0 0 100 -100 0"], "instance name": "coral3",
+                "blob name": "c-3-19.5x-19.5y", "class name": "Pocillopora", "id": 3,
+                "note": "bleached", "data": {"dead": 20},
             }, {
                 "bbox": [1, 1, 2, 2], "centroid": [1, 1], "area": 2.0, "perimeter": 6.8,
                 "contour": [[0, 0], [2, 0], [0, 2]], "inner contours": [], "class name": "Empty",
-                "id": 4, "note": "", "data": {},
+                "instance name": "coral4", "blob name": "c-4-1.0x-1.0y", "id": 4,
+                "note": "", "data": {},
             }],
             "points": [{"X": 100.0, "Y": 50.0, "Class": "Sponge", "Id": 1, "Note": "", "Data": {}}],
         },
@@ -185,11 +187,30 @@ TAGLAB_BY_HAND = {
 }  # fmt: skip
 
 
+TAGLAB_ASKS = {
+    "bbox", "centroid", "area", "perimeter", "contour", "inner contours", "class name",
+    "instance name", "blob name", "id", "note",
+}  # fmt: skip
+"""What TagLab takes from every region when it opens a project."""
+
+
+def test_a_taglab_project_has_what_taglab_asks_for() -> None:
+    values = FORMATS["taglab"].read(json.dumps(TAGLAB_BY_HAND).encode(), BACKDROPS)
+    whole = json.loads(FORMATS["taglab"].write(values, BACKDROPS).texts[""])
+    assert {key: label["id"] for key, label in whole["labels"].items()} == {
+        label.id: label.id for label in values.labels
+    }
+    marks = whole["images"][0]["annotations"]
+    assert len(marks["regions"]) == 2
+    assert all(region.keys() >= TAGLAB_ASKS for region in marks["regions"])
+    assert all(point.keys() >= {"Id", "X", "Y", "Class", "Note"} for point in marks["points"])
+
+
 @pytest.mark.parametrize("old", [False, True], ids=["2023", "older"])
 def test_a_taglab_project_by_hand(old: bool) -> None:
     whole = json.loads(json.dumps(TAGLAB_BY_HAND))
-    if old:  # labels by their ids, regions alone
-        whole["labels"] = {one["id"]: one for one in whole["labels"]}
+    if old:  # a list of labels, regions alone
+        whole["labels"] = list(whole["labels"].values())
         whole["images"][0]["annotations"] = whole["images"][0]["annotations"]["regions"]
     found = FORMATS["taglab"].read(json.dumps(whole).encode(), BACKDROPS)
     assert len(found.annotations) == (2 if old else 3)
