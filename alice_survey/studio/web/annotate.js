@@ -2,11 +2,11 @@
 
 import {attempt, button, download, el, field, get, on, save as saveFile, say, send, table} from "./core.js";
 import {BLUE} from "./palette.js";
+import {Wall} from "./picture_views.js";
 import {canRedo, canUndo, current, record, redo, startHistory, undo} from "./undo.js";
 import {vertexHandles} from "./vertices.js";
 import {counted, csv, number, withSigma} from "./words.js";
-import {annotationsOn, targetOf} from "./annotate_map.js";
-import {shownPictures} from "./annotate_pictures.js";
+import {annotationsOn, isArea, targetOf} from "./annotate_map.js";
 import {drawingTool} from "./drawing.js";
 import {missing} from "./missing.js";
 
@@ -205,13 +205,22 @@ export function tab(studio) {
   /* ---- One annotation ---- */
 
   const card = el("section", {"aria-label": "Chosen annotation"});
-  const pictures = el("div", {});
+  let wall = null;
 
-  function choose(id, keep = false) {
+  function choose(id) {
     chosen = id;
-    if (!keep) pictures.replaceChildren();
+    wall?.hide();
     redraw();
     render();
+  }
+
+  async function showPictures(one) {
+    const {pictures} = await get("/api/annotations/" + one.id + "/pictures");
+    if (!pictures.length) throw new Error("no registered picture shows it");
+    wall = wall || new Wall();
+    wall.show(counted(pictures.length, "picture that shows it best", "pictures that show it best"), pictures.map(({image, rings, sigma_px}) => ({
+      name: image, rings, closed: isArea(one.shape), x: 0, y: 0, about: "outline known to " + number(sigma_px, "px", 2),
+    })));
   }
 
   function cardOf() {
@@ -232,7 +241,7 @@ export function tab(studio) {
     return [
       el("h2", {}, "Chosen"), field("Label", choice), field("Note", note), table("What is known of it", [], facts),
       el("p", {class: "buttons"},
-        button("Show in pictures", () => attempt(async () => pictures.replaceChildren(...await shownPictures(one))), {disabled: !studio.state.has.dem}),
+        button("Show in pictures", () => attempt(() => showPictures(one)), {disabled: !studio.state.has.dem}),
         button("Go there", () => go(one)),
         button("Delete", () => remove(one.id)),
         button("Close", () => choose(null))),
@@ -323,7 +332,7 @@ export function tab(studio) {
     el("h2", {}, "Labels"), labelList, el("details", {}, el("summary", {}, "Add a label"), addLabel),
     el("h2", {}, "Draw"), el("p", {class: "buttons"}, tools, back, forth), drawing.element,
     el("details", {}, el("summary", {}, "Your name"), field("Goes with what you draw", author)),
-    card, pictures,
+    card,
     el("h2", {}, "Annotations"), field("Filter", words, "Labels, notes, names, pictures"), rows,
     el("h2", {}, "Cover"), field("Quadrats of side, " + unit, quadrat, "Empty: the whole mosaic"), cover,
     el("details", {}, el("summary", {}, "Files of other tools"), field("Tool", format), field("File", file), el("p", {class: "buttons"}, bring),
@@ -376,6 +385,7 @@ export function tab(studio) {
       entered = false;
       drawn.show(false);
       handles.show(null);
+      wall?.hide();
     },
     keys: {
       "Ctrl+z": () => step(undo, "Undone"), "Ctrl+y": () => step(redo, "Done again"), "Ctrl+Z": () => step(redo, "Done again"),
