@@ -152,7 +152,7 @@ export function tab(studio) {
       });
       const count = counts.get(one.id) || 0;
       const gone = button("×", () => edit({labels: labels.filter((other) => other !== one)}), {
-        "aria-label": "Remove the label " + one.id, disabled: count > 0, title: count ? "It is in use" : "Remove",
+        "aria-label": "Delete the label " + one.id, disabled: count > 0, title: count ? "It is in use" : "Delete",
       });
       return el("div", {style: {display: "flex", alignItems: "center", gap: "8px", margin: "4px 0"}},
         shown, el("label", {style: {display: "flex", alignItems: "center", gap: "8px", flex: "1", minWidth: "0"}},

@@ -166,12 +166,13 @@ export function tab(studio) {
   const alone = el("p", {class: "note", hidden: true});
   const nearField = field("Next to this one", near);
   const colours = el("p", {class: "note"});
+  const looks = el("div", {}, el("fieldset", {style: {border: "0", padding: "0", margin: "0 0 12px"}}, el("legend", {style: {fontWeight: "650"}}, "Show"), radios),
+    field("Raster", kind), colours, swipeField);
   const whichField = field("Comparison", which);
   const content = el("div", {},
     el("h2", {}, "Other survey"), alone, nearField, field("Folder", path, "It is only read"),
     el("p", {class: "buttons"}, choose), about,
-    el("fieldset", {style: {border: "0", padding: "0", margin: "0 0 12px"}}, el("legend", {style: {fontWeight: "650"}}, "Show"), radios),
-    field("Raster", kind), colours, swipeField,
+    looks,
     el("h2", {}, "Change"), el("p", {class: "buttons"}, find), progress, whichField, changes);
   const {has} = studio.state;
   const lack = missing(studio, content, () => (has.dem || has.mosaic ? null
@@ -188,7 +189,7 @@ export function tab(studio) {
       ? "Colours of the other run from " + [scale.low, scale.high].map((v) => number(v, "", 4)).join(" to ") + " (" + scale.label + "); those of this one are in the list of layers." : "";
     about.replaceChildren(...(other ? [el("p", {class: other.note ? "warn" : "note"}, other.note ? other.note : other.name + ", " + other.path)] : []));
     swipeField.hidden = !other || mode !== "swipe";
-    [kind, ...radios.map((one) => one.firstChild)].forEach((one) => { one.disabled = !other; });
+    looks.hidden = !other;
     whichField.hidden = results.length < 2;
     changes.replaceChildren(...changesOf());
   }

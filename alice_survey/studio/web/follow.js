@@ -4,7 +4,7 @@ import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
 import {missing} from "./missing.js";
 import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.js";
 import {profileChart} from "./profile_chart.js";
-import {clock, counted, number, share} from "./words.js";
+import {clock, counted, number, paceText, share} from "./words.js";
 
 const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"]];  /* as the coverage's own */
 const PROFILE_S = 300;
@@ -57,13 +57,14 @@ export function tab(studio) {
   const more = el("div", {});
   const keep = el("input", {type: "checkbox", checked: true});
   const logs = el("select", {});
-  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map((n) => el("option", {value: n}, n + " times")));
+  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map((n) => el("option", {value: n}, paceText(n))));
+  const stop = button("Stop", () => change("/api/follow/end", {}), {hidden: true});
   const choose = el("details", {}, el("summary", {}, "Choose a log"),
     field("Navigation CSV of this workspace", logs),
-    field("Replay, for training", pace, "A finished log as if it were flown now"),
+    field("Pace of a replay", pace, "For training: a finished log as if it were flown now"),
     el("div", {class: "buttons"}, button("Follow it", () => opened({log: logs.value})),
       button("Replay it", () => opened({log: logs.value, replay: Number(pace.value)})),
-      button("Stop", () => change("/api/follow/end", {}))),
+      stop),
     el("p", {class: "note"}, "For files elsewhere and for vehicles: alice-survey studio --log nav.csv, udp:14600, mavlink:udpin:127.0.0.1:14550 or ros."));
 
   const live = el("div", {hidden: true}, big,
@@ -125,7 +126,7 @@ export function tab(studio) {
     state = {...(state || {}), ...heard};
     if (heard.logs) fillChoices(heard);
     lack.show();
-    live.hidden = !state.following;
+    [live.hidden, stop.hidden] = [!state.following, !state.following];
     choose.open = choose.open || !state.following;
     if (!state.following) {
       forget();

@@ -51,7 +51,7 @@ export function tab(studio) {
   }
 
   function valueOf({value, unit}) {
-    if (!Array.isArray(value)) return Number.isInteger(value) ? value + " " + unit : number(value, unit, 5);
+    if (!Array.isArray(value)) return number(value, unit, unit === state.unit ? 5 : 3);
     return el("span", {title: value.join(", ")}, el("span", {class: "swatch", style: {background: "rgb(" + value.join(",") + ")"}}), " ", value.join(" "));
   }
 
@@ -64,7 +64,7 @@ export function tab(studio) {
       under.replaceChildren(el("p", {class: "error"}, found.fault.message));
       return;
     }
-    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], "", 6) + " " + axis).join(", ");
+    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], state.unit, 6) + " " + axis).join(", ");
     under.replaceChildren(el("p", {}, found.values.length ? "At " + at : "No raster knows anything at " + at + "."),
       el("dl", {}, found.values.map((row) => el("div", {}, el("dt", {}, row.title.replace(" of height", "")), el("dd", {}, valueOf(row))))));
     if (wanted === place) readout.textContent += heightText(found);

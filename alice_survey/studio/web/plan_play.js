@@ -2,7 +2,7 @@
 
 import {attempt, button, el, field} from "./core.js";
 import {countUpTo, stateAt} from "./way.js";
-import {clock} from "./words.js";
+import {clock, paceText} from "./words.js";
 
 const SPEEDS = [1, 10, 30, 100];
 const STILL_MS = 1000;  /* between steps where motion is to be reduced */
@@ -13,7 +13,7 @@ export function playback({ask, mark}) {
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   const toggle = button("Play", () => (running ? pause() : play()));
   const scrub = el("input", {type: "range", min: 0, max: 1, step: "any", value: 0, disabled: true});
-  const speed = el("select", {}, SPEEDS.map((times) => el("option", {value: times}, times + " times as fast")));
+  const speed = el("select", {}, SPEEDS.map((times) => el("option", {value: times}, paceText(times))));
   const readout = el("p", {class: "note"}, "The vehicle on its way, as planned, or as flown where it was.");
   speed.selectedIndex = 2;
   let [dive, time, running, before] = [null, 0, false, 0];

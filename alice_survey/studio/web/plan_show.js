@@ -22,7 +22,7 @@ export function shown(studio) {
   const off = new Set(["plan-footprints"]);
   const away = new Set();
   const marks = leaflet.featureGroup();
-  let [names, stations, number, active, last, sigmaLayer] = [new Set(), null, 0, false, null, null];
+  let [names, stations, number, active, last, sigmaLayer, whole] = [new Set(), null, 0, false, null, null, null];
   map.moreAt((place) => (active && stations ? stations.textAt(place) : ""));
 
   function put(about) {
@@ -176,7 +176,8 @@ export function shown(studio) {
     if (!bounds) return;
     const [south, west, north, east] = bounds;
     const margin = 0.04 * Math.max(north - south, east - west, 1);
-    map.extend([west - margin, south - margin, east + margin, north + margin]);
+    whole = [west - margin, south - margin, east + margin, north + margin];
+    map.extend(whole);
     map.fit();
   }
 
@@ -190,6 +191,7 @@ export function shown(studio) {
 
   function enter() {
     active = true;
+    if (whole) map.extend(whole);
     marks.addTo(map.leaflet);
     alone();
     show(last);
@@ -206,6 +208,7 @@ export function shown(studio) {
     stations?.remove();
     stations = null;
     active = false;
+    map.extend(map.data.extent);
     marks.remove();
     away.forEach((name) => map.show(name, true));
     away.clear();

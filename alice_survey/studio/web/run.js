@@ -158,7 +158,7 @@ export function tab(studio) {
   /* ---- What is left ---- */
 
   function costText(cost) {
-    return cost ? `about ${duration(cost.time_s)} on ${counted(known.cores, "core")}, ${gigabytes(cost.disk_mb)} of disk` : "";
+    return cost ? `About ${duration(cost.time_s)} on ${counted(known.cores, "core")}, ${gigabytes(cost.disk_mb)} of disk` : "";
   }
 
   function showBegin() {

@@ -114,6 +114,7 @@ let current = null;
 async function refresh() {
   Object.assign(state, await get("/api/state"));
   const now = await get("/api/map");
+  mapData.extent = now.extent;
   core.extend(now.extent);
   now.layers.forEach(put);
 }

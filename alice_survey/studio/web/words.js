@@ -44,6 +44,9 @@ export function clock(seconds) {
   return (seconds <= -1 ? MINUS : "") + (hours ? hours + ":" + pair(minutes) : minutes) + ":" + pair(whole % 60);
 }
 
+/* How fast a dive is shown. */
+export const paceText = (times) => (times === 1 ? "as fast as it was" : times + " times as fast");
+
 /* How long ago a time of the clock was. */
 export function ago(utc) {
   const seconds = (Date.now() - new Date(utc).getTime()) / 1000;
