@@ -51,7 +51,7 @@ export function tab(studio) {
   }
 
   function valueOf({value, unit}) {
-    if (!Array.isArray(value)) return number(value, unit, unit === state.unit ? 5 : 3);
+    if (!Array.isArray(value)) return Number.isInteger(value) ? value + " " + unit : number(value, unit, unit === state.unit ? 5 : 3);
     return el("span", {title: value.join(", ")}, el("span", {class: "swatch", style: {background: "rgb(" + value.join(",") + ")"}}), " ", value.join(" "));
   }
 

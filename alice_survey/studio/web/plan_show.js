@@ -22,7 +22,7 @@ export function shown(studio) {
   const off = new Set(["plan-footprints"]);
   const away = new Set();
   const marks = leaflet.featureGroup();
-  let [names, stations, number, active, last, sigmaLayer, whole] = [new Set(), null, 0, false, null, null, null];
+  let [names, stations, number, active, last, sigmaLayer, whole, fitted] = [new Set(), null, 0, false, null, null, null, ""];
   map.moreAt((place) => (active && stations ? stations.textAt(place) : ""));
 
   function put(about) {
@@ -178,8 +178,10 @@ export function shown(studio) {
     const margin = 0.04 * Math.max(north - south, east - west, 1);
     whole = [west - margin, south - margin, east + margin, north + margin];
     map.extend(whole);
-    map.fit();
+    map.fit(false);
+    fitted = viewOf();
   }
+  const viewOf = () => [map.leaflet.getZoom(), ...Object.values(map.leaflet.getCenter())].join();
 
   /* The plan as it was made is put away while the one in work is shown. */
   function alone() {
@@ -208,7 +210,9 @@ export function shown(studio) {
     stations?.remove();
     stations = null;
     active = false;
+    const isMoved = viewOf() !== fitted;
     map.extend(map.data.extent);
+    if (!isMoved) map.fit(false);
     marks.remove();
     away.forEach((name) => map.show(name, true));
     away.clear();

@@ -101,6 +101,8 @@ function fold() {
 }
 new ResizeObserver(() => { if (layers.open && !sessionStorage.getItem(layersKey) && !fits()) layers.open = false; }).observe(list);
 fold();
+mapData.room = () => (layers.open && fits() ? {paddingTopLeft: [56, 24], paddingBottomRight: [layers.offsetWidth + 32, 40]} : {});
+core.fit(false);
 
 /* ---- Tabs ---- */
 
