@@ -154,10 +154,10 @@ export function tab(studio) {
       const gone = button("×", () => edit({labels: labels.filter((other) => other !== one)}), {
         "aria-label": "Delete the label " + one.id, disabled: count > 0, title: count ? "It is in use" : "Delete",
       });
-      return el("div", {style: {display: "flex", alignItems: "center", gap: "8px", margin: "4px 0"}},
-        shown, el("label", {style: {display: "flex", alignItems: "center", gap: "8px", flex: "1", minWidth: "0"}},
+      return el("div", {class: "option"},
+        shown, el("label", {class: "option"},
           radio, el("span", {class: "swatch", style: {background: one.colour}}), el("b", {}, one.code),
-          el("span", {style: {overflowWrap: "anywhere"}}, one.id + " (" + count + ")")), gone);
+          el("span", {}, one.id + " (" + count + ")")), gone);
     });
   }
 

@@ -10,7 +10,7 @@ const CIRCLE_SIDES = 64;
 const latLng = ([east, north]) => leaflet.latLng(north, east);
 
 /* The rings of a shape; a circle's as a polygon. */
-export function ringsOf(shape) {
+function ringsOf(shape) {
   if (shape.kind !== "circle") return [shape.points, ...(shape.holes || [])];
   const [[x, y]] = shape.points;
   return [Array.from({length: CIRCLE_SIDES}, (_, n) => {

@@ -42,7 +42,7 @@ export function tab(studio) {
       render();
       show();
     });
-    return el("label", {style: {display: "flex", gap: "8px", alignItems: "center", margin: "4px 0"}}, input, text);
+    return el("label", {class: "option"}, input, text);
   });
   const swipe = el("input", {type: "range", min: "0", max: "100", step: "1", value: "50"});
   swipe.addEventListener("input", () => maps.setShare(Number(swipe.value) / 100));
@@ -166,7 +166,7 @@ export function tab(studio) {
   const alone = el("p", {class: "note", hidden: true});
   const nearField = field("Next to this one", near);
   const colours = el("p", {class: "note"});
-  const looks = el("div", {}, el("fieldset", {style: {border: "0", padding: "0", margin: "0 0 12px"}}, el("legend", {style: {fontWeight: "650"}}, "Show"), radios),
+  const looks = el("div", {}, el("fieldset", {class: "options"}, el("legend", {}, "Show"), radios),
     field("Raster", kind), colours, swipeField);
   const whichField = field("Comparison", which);
   const content = el("div", {},

@@ -98,11 +98,14 @@ export function field(label, control, hint) {
   return el("div", {class: "field"}, el("label", {for: control.id}, label), control, about);
 }
 
-/* A table of figures: rows of texts or elements; the first cell of a row heads it. */
+/* A table of figures: rows of texts or elements, or {cells, attributes of the row}; the first cell of a
+   row heads it. */
 export function table(caption, header, rows) {
   const head = header.length ? el("thead", {}, el("tr", {}, header.map((text) => el("th", {scope: "col"}, text)))) : null;
-  return el("table", {class: "figures"}, el("caption", {}, caption), head, el("tbody", {}, rows.map((row) => el("tr", {},
-    row.map((cell, i) => (i ? el("td", {}, cell) : el("th", {scope: "row"}, cell)))))));
+  return el("table", {class: "figures"}, el("caption", {}, caption), head, el("tbody", {}, rows.map((row) => {
+    const {cells, ...attributes} = Array.isArray(row) ? {cells: row} : row;
+    return el("tr", attributes, cells.map((cell, i) => (i ? el("td", {}, cell) : el("th", {scope: "row"}, cell))));
+  })));
 }
 
 /* A line for everybody, screen readers too; it stays until the next one. */

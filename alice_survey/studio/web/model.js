@@ -2,7 +2,7 @@
 
 import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
 import {missing} from "./missing.js";
-import {PINK, RED, WHITE} from "./palette.js";
+import {PINK, RED} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
 import {drawingTool} from "./drawing.js";
 import {meshPart} from "./model_mesh.js";
@@ -210,15 +210,13 @@ export function tab(studio) {
         changed();
       });
       const main = mainOf(one);
-      return el("tr", {"data-measure": one.id, "aria-current": one.id === chosen ? "true" : null},
-        el("td", {}, name), el("td", {}, withSigma(main.value, main.sigma, main.unit)),
-        el("td", {}, button("Show", () => { chosen = one.id; changed(); lookAt(one); }, {"aria-label": "Show " + one.name}), " ",
-          button("×", () => drop(one), {"aria-label": "Delete " + one.name})));
+      const cells = [name, withSigma(main.value, main.sigma, main.unit),
+        [button("Show", () => { chosen = one.id; changed(); lookAt(one); }, {"aria-label": "Show " + one.name}), " ",
+          button("×", () => drop(one), {"aria-label": "Delete " + one.name})]];
+      return {cells, "data-measure": one.id, "aria-current": one.id === chosen ? "true" : null};
     });
     results.replaceChildren(
-      el("table", {class: "figures measures"}, el("caption", {}, "Measures"),
-        el("thead", {}, el("tr", {}, ["Name", "Result", "Actions"].map((text) => el("th", {scope: "col"}, text)))),
-        el("tbody", {}, rows)),
+      el("div", {class: "measures"}, table("Measures", ["Name", "Result", "Actions"], rows)),
       el("div", {class: "buttons"}, button("Export CSV", () => attempt(() => exported("csv"))),
         button("Export GeoJSON", () => attempt(() => exported("geojson"))),
         button("Delete all", () => { measures = []; chosen = null; changed(); })),

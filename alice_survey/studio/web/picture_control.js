@@ -4,7 +4,7 @@ import {button, el, field, table} from "./core.js";
 import {number} from "./words.js";
 
 const BAD_SIGMAS = 4;
-const mm = (value) => number(1000 * value, "", 3);
+export const mm = (value) => number(1000 * value, "", 3);
 
 function fitOf(row, preview) {
   if (!preview) return "";

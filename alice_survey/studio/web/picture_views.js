@@ -7,7 +7,7 @@ import {number} from "./words.js";
 
 const CLOSE = 2;  /* zoom at which a pixel has four of the screen's */
 const place = (x, y) => [-(y + 0.5), x + 0.5];
-const escaped = (name) => name.split("/").map(encodeURIComponent).join("/");
+export const addressOf = (name) => "/api/pictures/" + name.split("/").map(encodeURIComponent).join("/");
 
 /* A cross of lines with a gap in its middle, so that the pixel under it is seen. */
 function cross(kind) {
@@ -18,7 +18,7 @@ function cross(kind) {
     el("path", {d: paths, ...dark}), el("path", {d: paths, ...light}));
 }
 
-export class PictureView {
+class PictureView {
   /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the `rings` that are
      seen in it. `changed(view)` is called where a person picks, if one may, `used(view)` where one takes
      or drops its pick. */
@@ -47,7 +47,7 @@ export class PictureView {
 
   /* Once it is on the page. */
   async open() {
-    const about = await attempt(() => get("/api/pictures/" + escaped(this.name) + "/about"));
+    const about = await attempt(() => get(addressOf(this.name) + "/about"));
     if (!about || !this.card.isConnected) return;
     const map = new leaflet.Map(this.box, {
       crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false, zoomSnap: 0.5, keyboard: false,
@@ -61,7 +61,7 @@ export class PictureView {
     map.setView(place(seen.x, seen.y), seen.whole ? Math.log2(this.box.clientWidth / about.width) : CLOSE);
     new Pyramid({
       west: 0, north: 0, pixel: 1, width: about.width, height: about.height, tile: about.tile, levels: about.levels,
-      address: "/api/pictures/" + escaped(this.name) + "/tile/{}.webp?v=" + about.token,
+      address: addressOf(this.name) + "/tile/{}.webp?v=" + about.token,
     }, "pictures").addTo(map);
     if (seen.rings) this.outline(seen);
     this.crosses = seen.whole || seen.rings ? [] : [[cross("expected"), place(seen.x, seen.y)]];

@@ -4,11 +4,11 @@ import {attempt, button, download, el, field, get, on, say, send, table} from ".
 import {missing} from "./missing.js";
 import {ORANGE} from "./palette.js";
 import {counted, csv, number, withSigma} from "./words.js";
-import {controlForm, controlRows} from "./picture_control.js";
-import {Wall} from "./picture_views.js";
+import {controlForm, controlRows, mm} from "./picture_control.js";
+import {Wall, addressOf} from "./picture_views.js";
 
 const BAD_PX = 2;
-const mm = (value) => number(1000 * value, "", 3);
+const shownBy = (count) => counted(count, "picture shows the spot", "pictures show the spot");
 
 export function tab(studio) {
   let held = {token: "", points: [], control: null, last: null, unit: studio.state.unit};
@@ -76,7 +76,7 @@ export function tab(studio) {
     const found = await get("/api/pictures/seeing", {...params, count: 40});
     if (!found.pictures.length) throw new Error("no picture shows that spot");
     clearSpot();
-    ready().show(found.total + " pictures show the spot", found.pictures);
+    ready().show(shownBy(found.total), found.pictures);
     say("The spot is at " + number(found.place.n, held.unit, 5) + " north, " + number(found.place.e, held.unit, 5)
       + " east. Click it in a picture" + (found.hidden ? "; in " + found.hidden + " it is hidden." : "."));
     return found;
@@ -94,7 +94,7 @@ export function tab(studio) {
   /* A picture whole; what is picked in it says which others show the spot. */
   async function showOne(image) {
     clearSpot();
-    const about = await attempt(() => get("/api/pictures/" + image.split("/").map(encodeURIComponent).join("/") + "/about"));
+    const about = await attempt(() => get(addressOf(image) + "/about"));
     if (!about) return;
     ready().show("Click the spot in the picture", [{name: image, x: about.width / 2, y: about.height / 2, whole: true}]);
   }
@@ -116,7 +116,7 @@ export function tab(studio) {
       const {x, y} = view.pick;
       attempt(async () => {
         const found = await get("/api/pictures/seeing", {image: view.name, x, y, count: 40});
-        wall.title.textContent = found.total + " pictures show the spot";
+        wall.title.textContent = shownBy(found.total);
         wall.waiting = found.pictures.filter((one) => !wall.of(one.name));
         view.seen = {...view.seen, whole: false};
         wall.showMore(5);
@@ -138,7 +138,7 @@ export function tab(studio) {
     const found = await send("/api/picks/spot", {picks: views.map(asPick)});
     if (mine !== checking) return;
     const {spot} = found;
-    spotText.textContent = spot.views + " pictures, " + number(spot.rms_px, "px", 2) + " rms; sigma north "
+    spotText.textContent = counted(spot.views, "picture") + ", " + number(spot.rms_px, "px", 2) + " rms; sigma north "
       + mm(spot.sigma[0]) + ", east " + mm(spot.sigma[1]) + ", down " + mm(spot.sigma[2]) + (held.unit === "m" ? " mm" : " thousandths");
     found.residuals.forEach((one) => {
       const view = wall.of(one.image);
@@ -160,7 +160,7 @@ export function tab(studio) {
       if (!target.pick || target.pick.matched_to) target.set({x: one.x, y: one.y, sigma_px: one.sigma_px, matched_to: view.name});
     });
     found.refused.forEach((one) => wall.of(one.name)?.say("not found: " + one.why, "warn"));
-    say("Found in " + (found.picks.length - 1) + " pictures, not in " + found.refused.length + ".");
+    say("Found in " + counted(found.picks.length - 1, "picture") + ", not in " + found.refused.length + ".");
     await look();
   }
 

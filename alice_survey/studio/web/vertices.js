@@ -10,7 +10,7 @@ const APART_PX = 26;  /* between vertices whose middle gets a handle */
 const ARROWS = {ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowRight: [0, 1], ArrowLeft: [0, -1]};
 
 /* 1, 2 or 5 times a power of ten, not above a length. */
-export function roundStep(length) {
+function roundStep(length) {
   const power = 10 ** Math.floor(Math.log10(length));
   return [5, 2, 1].find((step) => step * power <= length * (1 + 1e-9)) * power;
 }
