@@ -6,7 +6,8 @@ import {Wall} from "./picture_views.js";
 import {canRedo, canUndo, current, record, redo, startHistory, undo} from "./undo.js";
 import {vertexHandles} from "./vertices.js";
 import {counted, csv, number, withSigma} from "./words.js";
-import {annotationsOn, isArea, targetOf} from "./annotate_map.js";
+import {annotationsOn} from "./annotate_map.js";
+import {isArea, targetOf} from "./annotate_shapes.js";
 import {drawingTool} from "./drawing.js";
 import {missing} from "./missing.js";
 

@@ -98,7 +98,9 @@ def test_a_polygon_is_drawn_edited_taken_back_and_exported(folder: Path) -> None
         page.get_by_role("button", name="Delete", exact=True).click()
         page.get_by_text("Nothing is annotated yet.").wait_for()
         page.get_by_label("Tool", exact=True).select_option("coco")
-        page.locator("#panel-annotate").get_by_label("File", exact=True).set_input_files(downloading.value.path())
+        page.locator("#panel-annotate").get_by_label("File", exact=True).set_input_files(
+            downloading.value.path()
+        )
         page.get_by_role("button", name="Import").click()
         page.get_by_text("1 annotations and 0 labels added").wait_for()
         np.testing.assert_allclose(
