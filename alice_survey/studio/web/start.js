@@ -125,6 +125,7 @@ function picturesForm(started, disk) {
   let rigFolders = {};
   let isRig = true;
   let asked = 0;
+  let listings = 0;
 
   const form = el("form", {hidden: true, onsubmit: save},
     el("h2", {}, "I have pictures"),
@@ -150,8 +151,10 @@ function picturesForm(started, disk) {
   form.enter = () => { if (!here) list(""); };
 
   async function list(folder, typed = false) {
+    const number = listings += 1;
+    const before = path.value;
     const seen = await attempt(() => send("/api/start/folders", {path: folder, typed}));
-    if (!seen) return;
+    if (!seen || number !== listings || path.value !== before) return;  /* something else is asked by now */
     here = seen.here;
     path.value = here.path;
     above.disabled = !seen.above;

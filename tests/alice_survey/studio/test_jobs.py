@@ -20,6 +20,7 @@ from alice_survey.studio.jobs import BusyError, JobRecord, Jobs
 
 PROGRAM = """
 import json, os, signal, subprocess, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background are deaf to it
 path = next(a.split("=", 1)[1] for a in sys.argv if a.startswith("--events="))
 def tell(**event):
     with open(path, "a") as file:
