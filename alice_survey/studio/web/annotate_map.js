@@ -43,11 +43,11 @@ class Sign extends leaflet.Layer {
 }
 
 /* A small sign with the letters of a label: colour is never alone. */
-function letters(label, at, chosen) {
+function letters(label, at) {
   return new Sign(el("span", {"aria-hidden": "true", style: {
     transform: "translate(-50%, -50%)", padding: "1px 5px", borderRadius: "4px", pointerEvents: "none",
     font: "700 12px/1.3 system-ui, sans-serif", color: WHITE, background: INK,
-    border: "2px solid " + (chosen ? WHITE : label.colour), whiteSpace: "nowrap",
+    border: "2px solid " + label.colour, whiteSpace: "nowrap",
   }}, label.code || "?"), at);
 }
 
@@ -83,9 +83,9 @@ export function annotationsOn(studio, choose) {
         if (map.getContainer().dataset.tool === undefined) choose(annotation.id);
       });
       group.addLayer(drawn);
-      if (marks.length <= LETTERED || chosen) {
+      if (marks.length <= LETTERED && !chosen) {  /* which has its handles there */
         const at = shape.kind === "point" ? leaflet.latLng(places[0][0]) : middleOf(rings);
-        group.addLayer(letters(label, at, chosen));
+        group.addLayer(letters(label, at));
       }
     });
   }
