@@ -174,8 +174,7 @@ export function tab(studio) {
     el("p", {class: "buttons"}, choose), about,
     looks,
     el("h2", {}, "Change"), el("p", {class: "buttons"}, find), progress, whichField, changes);
-  const {has} = studio.state;
-  const lack = missing(studio, content, () => (has.dem || has.mosaic ? null
+  const lack = missing(studio, content, () => (studio.state.has.dem || studio.state.has.mosaic ? null
     : ["There is no model of this survey to compare yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
   const panel = el("div", {}, lack.element, content);
 

@@ -44,8 +44,7 @@ export function tab(studio) {
     el("h2", {}, "Length"), lengthText, scaleBox,
     el("h2", {}, "Control"), controlBox, lastBox,
   );
-  const lack = missing(studio, content, () => (studio.state.has.sparse ? null : studio.state.has.pictures
-    ? ["These pictures are not in a model yet, which says where a spot is seen: reconstruct them in Run.", "run", "Open Run"]
+  const lack = missing(studio, content, () => (["pictures", "sparse", "dem"].some((name) => studio.state.has[name]) ? null
     : ["There are no pictures to pick in yet: fly the plan or import your own in Run, then reconstruct them.", "run", "Open Run"]));
   const panel = el("div", {class: "pictures"}, lack.element, content);
   find.addEventListener("input", () => attempt(listPictures));
