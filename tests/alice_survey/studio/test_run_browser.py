@@ -66,8 +66,8 @@ def test_a_survey_from_an_empty_folder_is_planned_and_flown(page: Any, tmp_path:
         page.get_by_label("Longitude, degrees").fill("5.92")
         page.get_by_label("Depth of the sea floor, m").fill("12")
         page.get_by_text("Size and camera").click()
-        page.get_by_label("Length, m").fill("1.3")
-        page.get_by_label("Width, m").fill("1.5")
+        page.get_by_label("Length, m", exact=True).fill("1.3")
+        page.get_by_label("Width, m", exact=True).fill("1.5")
         is_accessible(page)
         assert not (reef / "survey.toml").exists()
         with page.expect_navigation():
