@@ -1,12 +1,14 @@
-"""How long the studio takes to plan again, next to a whole `plan` in the same run.
+"""How long the studio takes to plan again and to make a tile, next to twins in the same run.
 
     .venv/bin/python -m benchmarks.studio [--quick] [--json FILE]
 
 A re-plan is what a page waits for when a setting changes: the draft of `survey.toml`, the plan, and
 its JSON; warm, of one core, the median of some with another setting each. The whole stage plans,
 certifies on the fine grid, and writes maps, page and missions for vehicles. Two areas: that of the
-template that the tutorial starts from, and a strip of 10,000 swaths. Ends with exit code 1 when a
-goal is missed.
+template that the tutorial starts from, and a strip of 10,000 swaths. Tiles are of a mosaic as the
+program writes it, cloud-optimised, from all of its levels, none asked for twice; the twin reads the
+same pixels with rasterio and encodes them alike, and does nothing else. Ends with exit code 1 when
+a goal is missed.
 """
 
 import argparse
@@ -18,11 +20,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 from pydantic_core import to_json
+from rasterio.shutil import copy
+from rasterio.transform import Affine
+from rasterio.windows import Window
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import collected_by
 from alice_survey.base.executor import SERIAL
+from alice_survey.report.colours import encoded
+from alice_survey.studio.layers import Layers
+from alice_survey.studio.paths import Workspace
 from alice_survey.survey import template_text
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
@@ -66,17 +75,107 @@ class Replan:
         ]  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True)
+class Tiles:
+    """How long tiles of a mosaic take."""
+
+    megapixels: float
+    tiles: int
+    cpu_ms: float
+    """Of a tile, mean over all levels."""
+    worst_ms: float
+    twin_ms: float
+    """Of reading and encoding its pixels alone."""
+
+    def figures(self) -> list[Figure]:
+        """Computing of a tile, next to its twin."""
+        return [
+            Figure(name="tile of a mosaic", value=self.cpu_ms, unit="ms", goal=Goal(most=60.0)),
+            Figure(
+                name="tile of a mosaic over reading and encoding it", value=self.cpu_ms, unit="ms",
+                peer="rasterio and OpenCV", peer_value=self.twin_ms,
+                goal=Goal(most=1.5, of="ratio"),
+            ),
+        ]  # fmt: skip
+
+
+def tiles_of(side_px: int, number: int = 60) -> Tiles:
+    """Ask for tiles of a mosaic of texture, spread over its levels and places."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mosaic" / "mosaic.tif"
+        path.parent.mkdir()
+        _write_mosaic(path, side_px)
+        layers = Layers(Workspace(Path(folder)))
+        (about,) = layers.picture_layers()
+        rng, times_ms, twins_ms = np.random.default_rng(5), [], []
+        asked: set[tuple[int, int, int]] = set()
+        while len(asked) < number:
+            level = int(rng.integers(about.levels))
+            columns, rows, _, _ = about.size(level)
+            x, y = (int(rng.integers(-(-n // about.tile_px))) for n in (columns, rows))
+            if (level, x, y) in asked:
+                number -= level < about.levels - 2  # few tiles at the coarse end
+                continue
+            asked.add((level, x, y))
+            began = time.process_time()
+            layers.tile("mosaic", level, x, y, None)
+            times_ms.append(1e3 * (time.process_time() - began))
+            began = time.process_time()
+            _twin(path, about.levels - 1 - level, x, y, about.tile_px)
+            twins_ms.append(1e3 * (time.process_time() - began))
+    return Tiles(
+        megapixels=side_px**2 / 1e6,
+        tiles=len(times_ms),
+        cpu_ms=float(np.mean(times_ms)),
+        worst_ms=float(np.max(times_ms)),
+        twin_ms=float(np.mean(twins_ms)),
+    )
+
+
+def _write_mosaic(path: Path, side_px: int) -> None:
+    rng = np.random.default_rng(6)
+    block = np.clip(rng.normal(120, 30, (4, 1024, 1024)), 0, 255).astype(np.uint8)
+    block[3] = 255
+    plain = path.with_name("plain.tif")
+    profile = {
+        "driver": "GTiff", "width": side_px, "height": side_px, "count": 4, "dtype": "uint8",
+        "tiled": True, "blockxsize": 512, "blockysize": 512, "photometric": "RGB", "alpha": "YES",
+        "transform": Affine(0.001, 0, 0, 0, -0.001, side_px / 1e3),
+    }  # fmt: skip
+    with rasterio.open(plain, "w", **profile) as raster:
+        for row in range(0, side_px, 1024):
+            for column in range(0, side_px, 1024):
+                raster.write(block, window=Window(column, row, 1024, 1024))
+    copy(plain, path, driver="COG", blocksize=512, compress="deflate", level=1)
+    plain.unlink()
+
+
+def _twin(path: Path, halvings: int, x: int, y: int, tile_px: int) -> bytes:
+    options = {} if halvings == 0 else {"overview_level": halvings - 1}
+    with rasterio.open(path, **options) as raster:
+        left, top = x * tile_px, y * tile_px
+        window = Window(left, top, min(tile_px, raster.width - left),
+                        min(tile_px, raster.height - top))  # fmt: skip
+        return encoded(np.moveaxis(raster.read(window=window), 0, -1))
+
+
 def main() -> None:
     """Measure, print, and say which goals are missed."""
     options = _options()
-    about = machine(("numpy", "numba", "shapely", "tomlkit"))
+    about = machine(("numpy", "numba", "shapely", "tomlkit", "rasterio"))
     print(heading(about), "\n", flush=True)
     swaths = 1_000 if options.quick else 10_000
     rows = [replanned("tutorial", {}, 2.5), replanned(f"{swaths:,} swaths", _strip(swaths), 1.0)]
     print(_table(rows), flush=True)
-    figures = tuple(figure for row in rows for figure in row.figures())
-    found = Findings(figures=figures)
-    sys.exit(hand_over(options, about, found, {"replans": [asdict(row) for row in rows]}))
+    tiles = tiles_of(4_096 if options.quick else 16_384)
+    print(
+        f"\n{tiles.tiles} tiles of a mosaic of {tiles.megapixels:,.0f} Mpx: {tiles.cpu_ms:.1f} ms "
+        f"each, {tiles.worst_ms:.1f} at most; reading and encoding alone {tiles.twin_ms:.1f} ms",
+        flush=True,
+    )
+    figures = tuple(figure for one in (*rows, tiles) for figure in one.figures())
+    values = {"replans": [asdict(row) for row in rows], "tiles": asdict(tiles)}
+    sys.exit(hand_over(options, about, Findings(figures=figures), values))
 
 
 def _strip(swaths: int) -> dict[str, dict[str, Any]]:

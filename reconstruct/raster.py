@@ -197,6 +197,44 @@ def opened_raster(path: Path) -> Iterator[Any]:
         ) from None
 
 
+def grid_of(path: Path) -> DemGrid:
+    """The cells of a raster."""
+    with opened_raster(path) as raster:
+        return DemGrid(
+            west=float(raster.transform.c), north=float(raster.transform.f),
+            cell=float(raster.transform.a), rows=raster.height, columns=raster.width,
+        )  # fmt: skip
+
+
+@small_cache()
+def read_cells(path: Path, row: int, column: int, rows: int, columns: int, every: int = 1) -> Array:
+    """Cells of a window of a raster's first band, (rows // every, columns // every).
+
+    Those beyond the raster are NaN.
+
+    Args:
+        path: of the raster.
+        row: first row, which may lie beyond the raster.
+        column: first column.
+        rows: of the window.
+        columns: of the window.
+        every: reads every so many-th cell only, the nearest to the middle of each square.
+    """
+    found = np.full((rows // every, columns // every), np.nan)
+    with opened_raster(path) as raster:
+        # squares of which all cells are within the raster
+        top, left = (-(-max(0, -first) // every) for first in (row, column))
+        bottom = min(rows, raster.height - row) // every
+        right = min(columns, raster.width - column) // every
+        if bottom > top and right > left:
+            shape = (bottom - top, right - left)
+            part = Window(
+                column + left * every, row + top * every, shape[1] * every, shape[0] * every
+            )
+            found[top:bottom, left:right] = raster.read(1, window=part, out_shape=shape)
+    return found
+
+
 def tiles_of(grid: DemGrid, size: int) -> list[Window]:
     """Windows of a grid, row by row; a multiple of `BLOCK` as size fits the blocks of files."""
     return tiles_of_shape(grid.rows, grid.columns, size)

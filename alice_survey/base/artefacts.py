@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from alice_survey.base.contents import shown
+from alice_survey.base.contents import first_fault, shown
 from alice_survey.base.errors import AliceError, NavigationError, WorkspaceError, why
 from alice_survey.base.run import progress
 from alice_survey.base.run.resources import Meter, Spent, processor, versions, watched
@@ -73,11 +73,9 @@ class JsonRecord(BaseModel):
         try:
             return cls.model_validate(read_json(path))
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(str(name) for name in first["loc"]) or "its content"
             raise WorkspaceError(
-                f"{path}: {where}: {first['msg']}: the file is damaged or was edited; remove the "
-                "folder and run the command that makes it again"
+                f"{path}: {first_fault(error, 'its content')}: the file is damaged or was edited; "
+                "remove the folder and run the command that makes it again"
             ) from None
 
     @classmethod

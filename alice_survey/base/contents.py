@@ -12,6 +12,7 @@ from alice_survey.base.errors import WorkspaceError, why
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from pydantic import ValidationError
 
 _SHOWN = 200
 
@@ -60,6 +61,19 @@ def read_arrays(
 def one_line(error: BaseException) -> str:
     """Message of an exception, on one printable line; its type where the message is empty."""
     return shown(str(error)) or type(error).__name__
+
+
+def first_fault(error: "ValidationError", whole: str = "") -> str:
+    """The first value that a model refuses, and why, on one line.
+
+    Args:
+        error: of pydantic.
+        whole: what the values are called together, where none of them is named.
+    """
+    first = error.errors(include_url=False)[0]
+    where = ".".join(map(str, first["loc"])) or whole
+    text = shown(first["msg"].removeprefix("Value error, "))
+    return f"{where}: {text}" if where else text
 
 
 def shown(text: str) -> str:

@@ -72,6 +72,12 @@ class Datum:
         lon, lat, height = self._ecef.transform(*ecef.T, direction="INVERSE")
         return np.stack([lat, lon, self.height_m - height], axis=1)
 
+    def lon_lat_from_en(self, places_en: Array) -> Array:
+        """Take (N, 2) metres east and north, at the datum's height, to longitude and latitude."""
+        ned = np.column_stack([places_en[:, ::-1], np.zeros(len(places_en))])
+        found: Array = self.geodetic_from_ned(ned)[:, 1::-1]
+        return found
+
     @property
     def utm_epsg(self) -> int:
         """EPSG code of the UTM zone (WGS 84) that holds the datum."""

@@ -35,10 +35,10 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
         if isinstance(layer, ShapeLayer):
             described.append(_shapes(layer))
         elif layer.address is not None:
-            described.append(_picture(layer) | {"address": layer.address})
+            described.append(picture_json(layer) | {"address": layer.address})
         else:
             found, text = _packed(layer.tiles)
-            described.append(_picture(layer) | {"block": f"tiles-{index}", "tiles": found})
+            described.append(picture_json(layer) | {"block": f"tiles-{index}", "tiles": found})
             tiles.append((f"tiles-{index}", text))
     data = {
         "unit": survey_map.unit,
@@ -101,7 +101,8 @@ def picture_kind(content: bytes) -> str:
     raise ValueError("a tile of the map is not a JPEG, PNG or WebP")
 
 
-def _picture(layer: PictureLayer) -> dict[str, Any]:
+def picture_json(layer: PictureLayer) -> dict[str, Any]:
+    """A raster as the map's script takes it."""
     return {
         "kind": "picture",
         "name": layer.name,

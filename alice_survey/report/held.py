@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -87,7 +87,7 @@ class Held:
     def frame(self) -> FrameRecord:
         """Frame of the model's coordinates; as planned before there is one."""
         return self.read(FrameRecord) or FrameRecord(
-            datum=None if self.plan is None else _place(self.plan)
+            datum=None if self.plan is None else PlaceRecord(**asdict(self.plan.datum))
         )
 
     @cached_property
@@ -111,13 +111,6 @@ class Held:
         """Comparisons with earlier surveys, by their names."""
         files = sorted((self.workspace / "against").glob("*/change.json"))
         return [(file.parent.name, ChangeRecord.read(file)) for file in files]
-
-
-def _place(plan: Plan) -> PlaceRecord:
-    datum = plan.datum
-    return PlaceRecord(
-        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
-    )
 
 
 def known_column(rows: Sequence[Mapping[str, str]], start: str) -> Array:

@@ -14,13 +14,14 @@ from starlette.responses import RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError, WorkspaceError, known_fault
 from alice_survey.studio.chart import CHART, server_of
 from alice_survey.studio.endpoints.base import (
     Call,
     Content,
     Endpoint,
-    StaleError,
+    KeptValue,
     Studio,
     json_text,
 )
@@ -28,15 +29,14 @@ from alice_survey.studio.endpoints.shell import all_endpoints
 from alice_survey.studio.files import PAGE, POLICY, REVALIDATE, content_type, opened
 from alice_survey.studio.guard import API, Guard, line
 from alice_survey.studio.jobs import BusyError
-from alice_survey.studio.layers import FILES, ChangedError
-from alice_survey.studio.page import MeshCopies, listing
-from alice_survey.studio.paths import RefusedError, names_of
+from alice_survey.studio.layers import FILES
+from alice_survey.studio.page import MESH, light_mesh, listing
+from alice_survey.studio.paths import RefusedError, names_of, worked_on
 
 _TILE = re.compile(
     rf"/tiles/({'|'.join((*FILES, CHART))})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
 )
 _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
-_CHANGED = "the survey was worked on meanwhile: load the page again"
 _KEEP = "private, max-age=86400, immutable"
 """Cache policy of requests that state a version."""
 _BODY_S = 30.0
@@ -99,8 +99,6 @@ def _answered(endpoint: Endpoint, call: Call, request: Request) -> Response:
         found = endpoint.answer(call)
     except RefusedError as fault:
         return _fault(400, str(fault))
-    except ChangedError:
-        return _fault(409, _CHANGED)
     except (StaleError, BusyError) as fault:
         return _fault(409, str(fault))
     except FileNotFoundError:
@@ -158,7 +156,7 @@ class _Answers:
 
     def __init__(self, studio: Studio) -> None:
         self._workspace, self._layers = studio.workspace, studio.layers
-        self._meshes = MeshCopies(studio.workspace)
+        self._mesh = KeptValue(lambda: light_mesh(studio.workspace.folder))
         web_map = "" if studio.background is None else f" {server_of(studio.background)}"
         self._policy = _STUDIO_POLICY.format(web_map)
 
@@ -168,8 +166,8 @@ class _Answers:
             return self._answer(request)
         except RefusedError as fault:
             return line(400, str(fault))
-        except ChangedError:
-            return line(409, _CHANGED)
+        except StaleError as fault:
+            return line(409, str(fault))
         except FileNotFoundError:
             return line(404, "nothing is here")
         except (
@@ -196,8 +194,10 @@ class _Answers:
             tag = f"{found}-{level}-{x}-{y}"
             return _versioned(request, content, tag, "image/webp", token)
         if path == "/mesh.glb":
-            content, found = self._meshes.read(token)
-            return _versioned(request, content, found, "model/gltf-binary", token)
+            now = self._workspace.token(MESH)
+            if token not in (None, now):
+                raise worked_on()
+            return _versioned(request, self._mesh.of(now), now, "model/gltf-binary", token)
         if path == "/files":
             return RedirectResponse("/files/", 301)
         if path.startswith("/files/"):

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field, ValidationError
 
 from alice_survey.base.config import Config
+from alice_survey.base.contents import first_fault
 from alice_survey.base.errors import ConfigError
 from alice_survey.stages import names
 
@@ -241,8 +242,5 @@ def words_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> list[s
     try:
         given = COMMANDS[name].arguments.model_validate(arguments)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or "arguments"
-        said = first["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"{name}: {where}: {said}") from None
+        raise ConfigError(f"{name}: {first_fault(error, 'arguments')}") from None
     return [*name.split(), *given.words(workspace.resolve())]

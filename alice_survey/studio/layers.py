@@ -42,7 +42,7 @@ from alice_survey.report.colours import (
 )
 from alice_survey.report.held import Held
 from alice_survey.studio.chart import CHART, CHART_TITLE, chart_crs, chart_numbers
-from alice_survey.studio.paths import Workspace, token_of
+from alice_survey.studio.paths import Workspace, token_of, worked_on
 
 _KEPT_TILES = 1000
 _KEPT_PYRAMIDS = 12
@@ -181,10 +181,6 @@ def _window(
     return window, (bottom - top, right - left)
 
 
-class ChangedError(Exception):
-    """The requested file was replaced meanwhile."""
-
-
 class Layers:
     """Layers of a map of a workspace; threads may share it."""
 
@@ -270,7 +266,7 @@ class Layers:
 
         Raises:
             FileNotFoundError: there is no such layer or no such tile.
-            ChangedError: there is another raster by now, or it is being written to.
+            StaleError: there is another raster by now, or it is being written to.
             WorkspaceError: it is damaged.
         """
         with self._unchanged(name, token) as now:
@@ -285,19 +281,19 @@ class Layers:
     def _unchanged(self, name: str, token: str | None) -> Iterator[str]:
         """The token of a layer's file, which is read within this block."""
         now = token_of(self._path(name).stat())
+        if token not in (None, now):
+            raise worked_on()
         try:
-            if token not in (None, now):
-                raise ChangedError
             yield now
         except _DAMAGES as error:
             path = self._path(name)
             if token_of(path.stat()) != now:
-                raise ChangedError from None
+                raise worked_on() from None
             raise WorkspaceError(
                 f"{path}: is damaged ({one_line(error)}): delete it and run again"
             ) from error
         if token_of(self._path(name).stat()) != now:
-            raise ChangedError
+            raise worked_on()
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
         if name == CHART:

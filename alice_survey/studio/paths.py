@@ -2,12 +2,17 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
+from rasterio.errors import RasterioError
+
 from alice_survey.base.artefacts import STAGE_FILE
+from alice_survey.base.edited_files import StaleError
+from alice_survey.base.errors import AliceError
 from alice_survey.stages import LOOSE_FOLDERS, STAGES
 
 PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check", "revisit")
@@ -60,6 +65,11 @@ def names_of(path: str) -> tuple[str, ...]:
     if names and names[0] not in PRODUCTS and names != _LOOSE_FILES:
         raise RefusedError("not a product of a survey")
     return names
+
+
+def worked_on() -> StaleError:
+    """What a page hears whose files are others by now."""
+    return StaleError("the survey was worked on meanwhile: load the page again")
 
 
 def token_of(status: os.stat_result) -> str:
@@ -130,6 +140,23 @@ class Workspace:
         """Tokens of all finished stages and of some files, empty where there is none."""
         files = (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths)
         return tuple(self.token(path) if self.has(path) else "" for path in files)
+
+    @contextmanager
+    def unchanged(self, paths: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
+        """The state of finished stages and of some files, which are read within this block.
+
+        Raises:
+            StaleError: they are others by now; what reading them raised gives way to that.
+        """
+        before = self.state(paths)
+        try:
+            yield before
+        except (AliceError, OSError, RasterioError):
+            if self.state(paths) != before:
+                raise worked_on() from None
+            raise
+        if self.state(paths) != before:
+            raise worked_on()
 
     def _unlinked(self, names: Sequence[str]) -> Path:
         path = self.folder.joinpath(*names)

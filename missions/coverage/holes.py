@@ -124,8 +124,7 @@ def geodetic(geometry: shapely.Geometry, datum: Datum) -> MultiPolygon:
     """A geometry of north and east as longitude and latitude, with outer rings to the left."""
 
     def convert(points_ne: Array) -> Array:
-        ned = np.column_stack([points_ne, np.zeros(len(points_ne))])
-        return np.round(datum.geodetic_from_ned(ned)[:, [1, 0]], 9)
+        return np.round(datum.lon_lat_from_en(points_ne[:, ::-1]), 9)
 
     turned = shapely.transform(geometry, convert)
     parts = [shapely.geometry.polygon.orient(part) for part in multipolygon(turned).geoms]

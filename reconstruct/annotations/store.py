@@ -1,16 +1,17 @@
 """`annotations.json` of a workspace: read, changed by one writer at a time, seen by a GIS."""
 
-import hashlib
-import json
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from filelock import FileLock, Timeout
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from alice_survey.base.artefacts import JsonRecord, json_values
+from alice_survey.base.contents import first_fault
+from alice_survey.base.edited_files import check_token, content_of, content_token
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PlaceRecord
@@ -20,10 +21,6 @@ from reconstruct.views.model import WorldFrame, datum_of
 FILE = "annotations.json"
 _WAIT_S = 10.0
 _SAME_DEG = 1e-9
-
-
-class OtherVersionError(WorkspaceError):
-    """The file was changed by another writer since it was read."""
 
 
 class AnnotationsRecord(JsonRecord):
@@ -46,11 +43,7 @@ class AnnotationsRecord(JsonRecord):
 
 def token_of(workspace: Path) -> str:
     """A token of what the file holds; empty where there is none."""
-    try:
-        content = (workspace / FILE).read_bytes()
-    except FileNotFoundError:
-        return ""
-    return hashlib.blake2b(content, digest_size=12).hexdigest()
+    return content_token(content_of(workspace / FILE))
 
 
 def read_annotations(workspace: Path, frame: WorldFrame | None = None) -> AnnotationSet:
@@ -70,8 +63,8 @@ def read_annotations(workspace: Path, frame: WorldFrame | None = None) -> Annota
         _check_frame(workspace / FILE, record, frame)
     try:
         return record.values
-    except ValueError as error:
-        raise WorkspaceError(f"{workspace / FILE}: {_first_line(error)}") from None
+    except ValidationError as error:
+        raise WorkspaceError(f"{workspace / FILE}: {first_fault(error)}") from None
 
 
 def change_annotations(
@@ -92,19 +85,17 @@ def change_annotations(
         The token of what was written.
 
     Raises:
-        OtherVersionError: another writer came first.
+        StaleError: another writer came first.
         WorkspaceError: the file is damaged, cannot be written, or is being written too long.
     """
     try:
         with FileLock(workspace / f".{FILE}.lock", timeout=_WAIT_S):
-            if token is not None and token != token_of(workspace):
-                raise OtherVersionError(
-                    f"{FILE} was changed by another writer meanwhile: load the page again"
-                )
+            check_token(FILE, content_of(workspace / FILE), token)
             values = change(read_annotations(workspace, frame))
+            datum = None if frame is None else frame.datum
             AnnotationsRecord(
                 frame="ned" if frame is None else frame.name,
-                datum=_place(frame),
+                datum=None if datum is None else PlaceRecord(**asdict(datum)),
                 labels=values.labels,
                 annotations=values.annotations,
             ).write(workspace / FILE)
@@ -153,20 +144,8 @@ def geojson(values: AnnotationSet, datum: Datum | None) -> dict[str, Any]:
 
 
 def _lon_lat(places: Array, datum: Datum | None) -> list[list[float]]:
-    if datum is None:
-        return [[float(east), float(north)] for east, north in places]
-    ned = np.column_stack([places[:, 1], places[:, 0], np.zeros(len(places))])
-    return [[round(float(lon), 10), round(float(lat), 10)]
-            for lat, lon, _ in datum.geodetic_from_ned(ned)]  # fmt: skip
-
-
-def _place(frame: WorldFrame | None) -> PlaceRecord | None:
-    if frame is None or frame.datum is None:
-        return None
-    datum = frame.datum
-    return PlaceRecord(
-        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
-    )
+    found = places if datum is None else np.round(datum.lon_lat_from_en(places), 10)
+    return [[float(x), float(y)] for x, y in found]
 
 
 def _check_frame(path: Path, record: AnnotationsRecord, frame: WorldFrame) -> None:
@@ -183,14 +162,3 @@ def _check_frame(path: Path, record: AnnotationsRecord, frame: WorldFrame) -> No
             f"{path}: its places are of the frame {record.frame!r} with another datum than the "
             f"model now has ({frame.name!r}): move the file away, or give the survey the datum back"
         )
-
-
-def _first_line(error: ValueError) -> str:
-    lines = [line.strip() for line in str(error).splitlines()]
-    line = next((line for line in lines if line.startswith("Value error")), lines[0])
-    return line.removeprefix("Value error, ").partition(" [type")[0]
-
-
-def dumped(values: AnnotationSet) -> str:
-    """As JSON text, for a page."""
-    return json.dumps(values.model_dump(mode="json"), allow_nan=False)

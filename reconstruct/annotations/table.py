@@ -40,7 +40,7 @@ HEADER = (
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Measured:
+class MeasuredMark:
     """An annotation on the mosaic."""
 
     annotation: Annotation
@@ -71,7 +71,7 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quadrat:
+class LabelledQuadrat:
     """A square, or all of the mosaic, and what is in it."""
 
     name: str
@@ -140,7 +140,7 @@ def measured(
     pixel: float,
     projector: Callable[[], Projector],
     sigma_px: float = PIXEL_SIGMA_PX,
-) -> tuple[list[Measured], list[str]]:
+) -> tuple[list[MeasuredMark], list[str]]:
     """Annotations on the mosaic with their areas, and why others are not.
 
     Args:
@@ -165,7 +165,9 @@ def measured(
             area, sigma = shape.area, sigma_of_area(one.shape, rings)
         elif shape.kind == "polyline":
             length = float(shape.geometry.length)
-        found.append(Measured(annotation=one, shape=shape, area=area, sigma=sigma, length=length))
+        found.append(
+            MeasuredMark(annotation=one, shape=shape, area=area, sigma=sigma, length=length)
+        )
     return found, lost
 
 
@@ -199,8 +201,11 @@ def _slopes(ring: Array) -> Array:
 
 
 def quadrats(
-    values: AnnotationSet, marks: Sequence[Measured], ground: KnownGround, side: float | None = None
-) -> list[Quadrat]:
+    values: AnnotationSet,
+    marks: Sequence[MeasuredMark],
+    ground: KnownGround,
+    side: float | None = None,
+) -> list[LabelledQuadrat]:
     """What each label has on the mosaic, or in each square of known ground.
 
     Squares lie at whole multiples of their side, so that those of two surveys of a site are the
@@ -219,7 +224,9 @@ def quadrats(
         west, south, _, _ = ground.bounds
         rows = _rows(values, marks, None, ground.area)
         return [
-            Quadrat(name="all", west=west, south=south, side=None, known=ground.area, rows=rows)
+            LabelledQuadrat(
+                name="all", west=west, south=south, side=None, known=ground.area, rows=rows
+            )
         ]
     west, south, east, north = ground.bounds
     if not side > 0 or (east - west) * (north - south) / side**2 > _MOST_QUADRATS:
@@ -233,7 +240,7 @@ def quadrats(
         box = shapely.box(column * side, row * side, (column + 1) * side, (row + 1) * side)
         near = [marks[n] for n in sorted(tree.query(box).tolist())] if marks else []
         found.append(
-            Quadrat(
+            LabelledQuadrat(
                 name=f"{column},{row}", west=column * side, south=row * side, side=side,
                 known=known, rows=_rows(values, near, box, known),
             )
@@ -242,7 +249,7 @@ def quadrats(
 
 
 def _rows(
-    values: AnnotationSet, marks: Sequence[Measured], box: BaseGeometry | None, known: float
+    values: AnnotationSet, marks: Sequence[MeasuredMark], box: BaseGeometry | None, known: float
 ) -> tuple[Row, ...]:
     rows = []
     for label in values.labels:
@@ -323,7 +330,7 @@ def table(
     return "\n".join(lines), data
 
 
-def cells(quadrat: Quadrat, row: Row, unit: str) -> tuple[Any, ...]:
+def cells(quadrat: LabelledQuadrat, row: Row, unit: str) -> tuple[Any, ...]:
     """A row of the table, in the columns of `HEADER`."""
     return (
         quadrat.name, round(quadrat.west, 6), round(quadrat.south, 6), quadrat.side,

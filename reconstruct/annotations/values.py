@@ -9,8 +9,6 @@ from typing import Annotated, Literal
 import numpy as np
 import shapely
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     field_validator,
@@ -19,6 +17,7 @@ from pydantic import (
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from alice_survey.base.config import Config
 from alice_survey.base.frames import Array
 
 Kind = Literal["point", "polyline", "polygon", "rectangle", "circle"]
@@ -43,11 +42,7 @@ _SAME = 1e-3
 """Pixels within which vertices are the same."""
 
 
-class _Value(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Label(_Value):
+class Label(Config):
     """What an annotation is of: a species, a substrate, a damage."""
 
     id: Name
@@ -82,7 +77,7 @@ def clean_id(text: str) -> str:
     return SEPARATOR.join(name for part in plain.split(SEPARATOR) if (name := part.strip()))
 
 
-class DrawnShape(_Value):
+class DrawnShape(Config):
     """Vertices in the plane of the mosaic, or in a picture as taken.
 
     Pixels count from the outer corner of the first, x to the right and y down.
@@ -193,7 +188,7 @@ def area_only(geometry: BaseGeometry) -> BaseGeometry:
     return polygons[0] if len(polygons) == 1 else MultiPolygon(polygons)
 
 
-class Affine(_Value):
+class Affine(Config):
     """A change of coordinates: a scale, a flip of the second axis, a shift."""
 
     scale: float = Field(gt=0)
@@ -217,7 +212,7 @@ class Affine(_Value):
         )  # fmt: skip
 
 
-class Annotation(_Value):
+class Annotation(Config):
     """One thing that somebody marked."""
 
     id: str = Field(default_factory=lambda: secrets.token_hex(6), pattern=r"^[0-9a-zA-Z_-]{1,64}$")
@@ -265,7 +260,7 @@ def _is_same(a: DrawnShape, b: DrawnShape, step: float) -> bool:
     return bool(far < step and around < step and holes <= 4.0 * step * reach)
 
 
-class AnnotationSet(_Value):
+class AnnotationSet(Config):
     """Labels and what carries them."""
 
     labels: tuple[Label, ...] = ()

@@ -70,12 +70,12 @@ class SharedErrors:
         return int(self.motions.shape[0] * self.motions.shape[1])
 
     def around(self, places: Array) -> tuple[NDArray[np.int64], Array]:
-        """Numbers (N, 4) of the nodes around (N, 2) places, and their bilinear weights."""
+        """Numbers (N, 4) of the nodes around (N, 2) places, and their bilinear weights or NaN."""
         rows, columns = self.motions.shape[:2]
         x = np.clip((places[:, 0] - self.west) / self.pitch, 0.0, columns - 1.0)
         y = np.clip((places[:, 1] - self.south) / self.pitch, 0.0, rows - 1.0)
-        left = np.minimum(x.astype(np.int64), max(columns - 2, 0))
-        low = np.minimum(y.astype(np.int64), max(rows - 2, 0))
+        left = np.minimum(np.nan_to_num(x).astype(np.int64), max(columns - 2, 0))
+        low = np.minimum(np.nan_to_num(y).astype(np.int64), max(rows - 2, 0))
         right, high = np.minimum(left + 1, columns - 1), np.minimum(low + 1, rows - 1)
         x, y = x - left, y - low
         nodes = np.stack([low * columns + left, low * columns + right,
@@ -93,6 +93,24 @@ class SharedErrors:
         """Variances (N,) of the heights of (N, 2) places by what they share."""
         nodes, weights = self.around(places)
         return np.asarray((weights * self._of_heights[nodes]).sum(axis=1))
+
+    def own_sigma(self, places: Array, sigma: Array) -> Array:
+        """What a sigma (N,) of heights leaves to each of (N, 2) places alone."""
+        return np.sqrt(np.maximum(sigma**2 - self.variance_of_heights(places), 0.0))
+
+    def together(self, places: Array) -> Array:
+        """How (N, 2) close places move with K independent errors of sigma 1, (N, 3, K).
+
+        What places around a node share with no others they share all, as one node's.
+        """
+        values, axes = np.linalg.eigh(self.covariance)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        known = places[np.isfinite(places).all(axis=1)]
+        nodes, weights = self.around(known.sum(axis=0, keepdims=True) / max(1, len(known)))
+        values, axes = np.linalg.eigh(self.rest.reshape(-1, 3, 3)[nodes[0, weights[0].argmax()]])
+        rest = axes * np.sqrt(np.maximum(values, 0.0))
+        alike = np.broadcast_to(rest, (len(places), 3, 3))
+        return np.concatenate([self.motions_at(places) @ root, alike], axis=2)
 
     @cached_property
     def _of_heights(self) -> Array:

@@ -60,7 +60,7 @@ def as_geojson(measurements: Sequence[Measurement], datum: Datum | None, unit: s
     for one in measurements:
         places = np.asarray(one.places, dtype=np.float64)[:, :2]
         if datum is not None:
-            places = _longitude_latitude(datum, places)
+            places = np.round(datum.lon_lat_from_en(places), 9)
         if one.kind == "polygon":
             places = _counter_clockwise(places)
             coordinates: Any = [[*places.tolist(), places[0].tolist()]]
@@ -85,11 +85,6 @@ def as_geojson(measurements: Sequence[Measurement], datum: Datum | None, unit: s
     if datum is None:
         whole["coordinates"] = f"of the model or its plane, in {unit}, not longitude and latitude"
     return json.dumps(whole, indent=1, allow_nan=False) + "\n"
-
-
-def _longitude_latitude(datum: Datum, places: Array) -> Array:
-    ned = np.column_stack([places[:, 1], places[:, 0], np.zeros(len(places))])
-    return np.asarray(np.round(datum.geodetic_from_ned(ned)[:, 1::-1], 9))
 
 
 def _counter_clockwise(places: Array) -> Array:

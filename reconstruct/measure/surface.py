@@ -17,7 +17,7 @@ from alice_survey.kit.document import OWN_AXES
 from reconstruct.measure.errors import REACH_CELLS, SharedErrors, own_correlation, shared_errors
 from reconstruct.measure.sight import sight_lines
 from reconstruct.planes import Plane, read_plane
-from reconstruct.raster import DemGrid, opened_raster, small_cache
+from reconstruct.raster import DemGrid, grid_of, opened_raster, read_cells, small_cache
 from reconstruct.views.model import WorldFrame, read_frame
 
 MOSAIC = "mosaic/mosaic.tif"
@@ -131,24 +131,14 @@ class MeasuredSurface:
 
     def window(self, row: int, column: int, rows: int, columns: int) -> tuple[Array, Array]:
         """Heights and sigmas of own errors (rows, columns) of a window; NaN beyond the grid."""
-        found = tuple(np.full((rows, columns), np.nan) for _ in range(2))
-        top, left = max(row, 0), max(column, 0)
-        bottom = min(row + rows, self.grid.rows)
-        right = min(column + columns, self.grid.columns)
-        if bottom <= top or right <= left:
-            return found[0], found[1]
-        part = Window(left, top, right - left, bottom - top)
-        inner = np.s_[top - row : bottom - row, left - column : right - column]
-        for array, path in zip(found, (self.dem, self.sigma), strict=True):
-            with small_cache(), opened_raster(path) as raster:
-                array[inner] = raster.read(1, window=part)
-        height, sigma = found
+        height, sigma = (
+            read_cells(path, row, column, rows, columns) for path in (self.dem, self.sigma)
+        )
         known = np.isfinite(height)
         places = self.places_of(*(np.flatnonzero(known.ravel()) // columns + row,
                                   np.flatnonzero(known.ravel()) % columns + column))  # fmt: skip
-        shared = self.errors.variance_of_heights(places)
         sigma[~known] = np.nan
-        sigma[known] = np.sqrt(np.maximum(sigma[known] ** 2 - shared, 0.0))
+        sigma[known] = self.errors.own_sigma(places, sigma[known])
         return height, sigma
 
     def places_of(self, rows: NDArray[Any], columns: NDArray[Any]) -> Array:
@@ -204,15 +194,6 @@ class MeasuredSurface:
                 "place on the surface"
             )
         return found
-
-
-def grid_of(path: Path) -> DemGrid:
-    """The cells of a raster."""
-    with opened_raster(path) as raster:
-        return DemGrid(
-            west=float(raster.transform.c), north=float(raster.transform.f),
-            cell=float(raster.transform.a), rows=raster.height, columns=raster.width,
-        )  # fmt: skip
 
 
 def _runs(cells: NDArray[np.int64]) -> Iterator[slice]:

@@ -85,7 +85,7 @@ class Length:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Block:
+class StationBlock:
     """Neighbouring stations as their keypoints determine them."""
 
     numbers: Indices
@@ -98,7 +98,9 @@ class Block:
     gauge: Gauge
 
     @classmethod
-    def around(cls, workspace: Path, pictures: RegisteredPictures, stations: Indices) -> "Block":
+    def around(
+        cls, workspace: Path, pictures: RegisteredPictures, stations: Indices
+    ) -> "StationBlock":
         """The block of some stations.
 
         Args:
@@ -195,7 +197,7 @@ class Lengths:
     def __init__(self, workspace: Path, pictures: RegisteredPictures) -> None:
         """Take a workspace with a finished `sparse/`."""
         self._workspace, self._pictures = workspace, pictures
-        self._kept: tuple[bytes, Block] | None = None
+        self._kept: tuple[bytes, StationBlock] | None = None
         numbers, first = np.unique(pictures.station, return_index=True)
         self._numbers, self._places = numbers, pictures.centres[first]
 
@@ -242,7 +244,7 @@ class Lengths:
             raise ReconstructionError(f"the spot is not found: {lost.get('spot', 'no picks')}")
         return found["spot"]
 
-    def _block(self, picks: Sequence[Pick]) -> Block:
+    def _block(self, picks: Sequence[Pick]) -> StationBlock:
         rows = [self._pictures.row(p.image) for p in picks if p.image in self._pictures]
         needed = np.unique(self._pictures.station[rows])
         places = self._pictures.centres[rows]
@@ -252,7 +254,10 @@ class Lengths:
         away[np.isin(self._numbers, needed)] = -1.0
         chosen = np.sort(self._numbers[np.argsort(away, kind="stable")[:MOST_STATIONS]])
         if self._kept is None or self._kept[0] != chosen.tobytes():
-            self._kept = chosen.tobytes(), Block.around(self._workspace, self._pictures, chosen)
+            self._kept = (
+                chosen.tobytes(),
+                StationBlock.around(self._workspace, self._pictures, chosen),
+            )
         return self._kept[1]
 
 

@@ -90,7 +90,7 @@ class Matcher:
         starts, ways = picture.ray(pixel + grid)
         away = ((place.point - starts) @ place.normal) / (ways @ place.normal)
         self._points = starts + away[:, None] * ways
-        self._own = _Part.around(grey, pixel, HALF_PX + 1)
+        self._own = _PicturePart.around(grey, pixel, HALF_PX + 1)
         self._shown = self._own.at(pixel + grid)[0]
 
     def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Match | NoMatch:
@@ -111,7 +111,7 @@ class Matcher:
         spread = float(np.hypot(np.linalg.norm(raised - middle), _POSE_SIGMA_PX))
         reach = int(np.clip(np.ceil(_REACH_SIGMAS * spread), _LEAST_REACH_PX, _MOST_REACH_PX))
         extent = int(np.ceil(np.abs(expected - middle).max())) + reach + 2
-        part = _Part.around(grey, middle, extent)
+        part = _PicturePart.around(grey, middle, extent)
         shift, likeness, rival = self._search(part, expected, reach)
         if likeness < _LEAST_CORRELATION:
             return NoMatch(
@@ -137,7 +137,9 @@ class Matcher:
             moved_px=float(np.linalg.norm(found - middle)),
         )  # fmt: skip
 
-    def _search(self, part: "_Part", expected: Array, reach: int) -> tuple[Array, float, float]:
+    def _search(
+        self, part: "_PicturePart", expected: Array, reach: int
+    ) -> tuple[Array, float, float]:
         """Best whole-pixel shift (2,), its correlation, and the best one of places apart."""
         steps = np.arange(-reach, reach + 1.0)
         shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -152,7 +154,7 @@ class Matcher:
         return shifts[best], float(likeness[best]), float(others.max(initial=-1.0))
 
 
-class _Part:
+class _PicturePart:
     """A part of a picture as a quintic spline, with its slopes."""
 
     def __init__(self, grey: Grey, left: int, top: int) -> None:
@@ -166,7 +168,7 @@ class _Part:
         )
 
     @classmethod
-    def around(cls, grey: Grey, pixel: Array, extent: int) -> "_Part":
+    def around(cls, grey: Grey, pixel: Array, extent: int) -> "_PicturePart":
         """Pixels up to an extent around a pixel."""
         reach, size = extent + _SPARE_PX, np.array(grey.shape[::-1])
         low = np.clip(np.floor(pixel).astype(int) - reach, 0, size)
@@ -210,7 +212,7 @@ def _correlations(first: Array, others: Array, weight: Array) -> Array:
 
 
 def _fit(
-    part: _Part, start: Array, grid: Array, shown: Array, weight: Array
+    part: _PicturePart, start: Array, grid: Array, shown: Array, weight: Array
 ) -> tuple[Array, float, float] | None:
     """Shift (2,) from a start (P, 2), its sigma and the correlation there; None without an end."""
     change = np.zeros(6)  # shift, then what the grid's x and y add to it

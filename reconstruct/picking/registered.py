@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -99,13 +100,9 @@ class RegisteredPictures:
             )
         return self._rows[image]
 
-    @property
+    @cached_property
     def _rows(self) -> Mapping[str, int]:
-        found: dict[str, int] | None = self.__dict__.get("_known")
-        if found is None:
-            found = {name: n for n, name in enumerate(self.names)}
-            object.__setattr__(self, "_known", found)
-        return found
+        return {name: n for n, name in enumerate(self.names)}
 
     def warp(self, image: str) -> PinholeWarp:
         """The camera that took a picture."""

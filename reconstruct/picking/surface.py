@@ -4,38 +4,27 @@ Of a DEM only the cells around are read. Where there is none yet, the nearest po
 model determine a plane, and nothing hides anything.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
-from rasterio.windows import Window
 from scipy.spatial import KDTree
 
 from alice_survey.base.artefacts import read_stage
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
-from reconstruct.evaluate.elevation import Elevation
+from reconstruct.evaluate.elevation import LEVEL, Elevation, StoredElevation
+from reconstruct.placing.picked_points import RegisteredPicture
 from reconstruct.planes import read_plane
-from reconstruct.raster import opened_raster
 from reconstruct.views.model_files import all_points
 
-_SLOPE_CELLS = 3
+_SLOPE_CELLS = 7
 """The normal is that of a plane through the cells this far around."""
-_MOST_CELLS = 1024
-"""Cells a side that are read at once; of more, averages."""
-_STEPS = 256
-"""Steps of a ray over the window."""
 _CLEAR_CELLS, _CLEAR_SIGMAS = 2.0, 4.0
 """The surface must stand this much above a way to hide what is at its end."""
 _NEIGHBOURS = 15
-_LEVEL = 1e-3
-"""A ray that descends less meets no surface."""
 _ROUNDS, _SETTLED = 50, 1e-6
-_COARSE = 256
 _FARTHEST = 3.0
 """Times the usual distance of neighbours within which points of a sparse model make a surface."""
 
@@ -52,21 +41,76 @@ class SurfacePlace:
     """Of its height."""
 
 
-class Surface:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownPlaces:
+    """Places of a DEM that a picture shows at pixels, and what moves them."""
+
+    points: Array
+    """(N, 3) in the world; a row is NaN where a ray meets no known surface."""
+    sigma: Array
+    """(N,) of the surface's height there."""
+    by_height: Array
+    """(N, 3) how a place moves where the surface is higher by 1."""
+    by_pixel: Array
+    """(N, 3, 2) how it moves with the pixel."""
+
+
+def shown_places(dem: StoredElevation, picture: RegisteredPicture, pixels: Array) -> ShownPlaces:
+    """Places of a DEM that a picture shows at pixels (N, 2) as taken."""
+    starts, ways = picture.ray(pixels)
+    surface, points = dem.met_by(starts, ways)
+    places = points[:, [1, 0]]
+    square = _square(surface, places)
+    aside = []
+    for step in np.eye(2):
+        other, there = picture.ray(pixels + step)
+        reach = _dot(points - other, square) / _dot(there, square)
+        aside.append(other + reach[:, None] * there - points)
+    return ShownPlaces(
+        points=points, sigma=surface.at(surface.sigma, places),
+        by_height=-ways / _dot(ways, square)[:, None], by_pixel=np.stack(aside, axis=2),
+    )  # fmt: skip
+
+
+def hidden(dem: StoredElevation, points: Array, sigma: Array, centres: Array) -> NDArray[np.bool_]:
+    """Whether a DEM stands between places (N, 3) of it, of sigmas (N,), and cameras at (N, 3)."""
+    surface = dem.around(np.concatenate([points, centres])[:, [1, 0]])
+    clear = _CLEAR_CELLS * surface.cell + _CLEAR_SIGMAS * np.nan_to_num(sigma)
+    return surface.hides(points, clear, centres)
+
+
+def _square(surface: Elevation, places: Array) -> Array:
+    """(N, 3) of depth plus height by north, east, down: square to the surface."""
+    slopes = []
+    for axis in ([0.0, 1.0], [1.0, 0.0]):
+        step = surface.cell * np.array(axis)
+        ends = (surface.at(surface.height, places + sign * step) for sign in (1.0, -1.0))
+        slope = np.subtract(*ends) / (2 * surface.cell)
+        slopes.append(np.where(np.isfinite(slope), slope, 0.0))  # at an edge of what is known
+    return np.column_stack([*slopes, np.ones(len(places))])
+
+
+def _dot(a: Array, b: Array) -> Array:
+    found: Array = np.einsum("ni,ni->n", a, b)
+    return found
+
+
+class ModelSurface:
     """The surface of a reconstructed workspace."""
 
     def __init__(self, workspace: Path) -> None:
         """Take a workspace whose `sparse/` is finished."""
         dense = workspace / "dense"
         made = read_stage(dense) is not None and (dense / "dem.tif").is_file()
-        self._dense = dense if made and read_plane(dense).is_level else None
-        self._points = None if self._dense else all_points(workspace / "sparse" / "model")[1]
+        level = made and read_plane(dense).is_level
+        self._dem = StoredElevation.of(dense) if level else None
+        self._points = None if level else all_points(workspace / "sparse" / "model")[1]
         self._tree = None if self._points is None else KDTree(self._points[:, :2])
 
     @property
     def is_dense(self) -> bool:
         """Whether it is a DEM's."""
-        return self._dense is not None
+        return self._dem is not None
 
     def below(self, north: float, east: float) -> SurfacePlace:
         """The surface at a place of the map.
@@ -74,14 +118,13 @@ class Surface:
         Raises:
             ReconstructionError: none is known there.
         """
-        if self._dense is None:
+        if self._dem is None:
             return self._by_points(np.array([north, east]))
         at = np.array([[east, north]])
-        with opened_raster(self._dense / "dem.tif") as source:
-            reach = (_SLOPE_CELLS + 2) * abs(source.transform.a)
-        dem = self._window(self._dense, np.concatenate([at[0] - reach, at[0] + reach]))
+        dem = self._dem.around(at)
         height = float(dem.at(dem.height, at)[0])
         around = dem.points()
+        around = around[(np.abs(around[:, :2] - at) <= _SLOPE_CELLS * dem.cell).all(axis=1)]
         if not np.isfinite(height) or len(around) < 3:
             raise ReconstructionError(
                 f"no surface of the model is at {north:.3f} north, {east:.3f} east"
@@ -107,23 +150,18 @@ class Surface:
         Raises:
             ReconstructionError: it meets none that is known.
         """
-        low, high = self._heights
-        if direction[2] > _LEVEL:
-            ends = start + np.outer((-np.array([high, low]) - start[2]) / direction[2], direction)
-            if self._dense is not None:
-                box = ends[:, [1, 0]]
-                dem = self._window(self._dense, np.concatenate([box.min(axis=0), box.max(axis=0)]))
-                met = dem.hit(start, direction)
-                if met is not None:
-                    return self.below(met[0], met[1])
-            else:
-                here = self._by_points(ends.mean(axis=0)[:2])
-                for _ in range(_ROUNDS):
-                    reach = (here.point - start) @ here.normal / (direction @ here.normal)
-                    met = start + reach * direction
-                    here = self._by_points(met[:2])
-                    if abs(here.point[2] - met[2]) < _SETTLED * reach:
-                        return here
+        if self._dem is not None:
+            north, east, _ = self._dem.met_by(start[None], direction[None])[1][0]
+            if np.isfinite(north):
+                return self.below(north, east)
+        elif direction[2] > LEVEL:
+            here = self._by_points(start[:2] + self._reach(start) * direction[:2] / direction[2])
+            for _ in range(_ROUNDS):
+                reach = (here.point - start) @ here.normal / (direction @ here.normal)
+                met = start + reach * direction
+                here = self._by_points(met[:2])
+                if abs(here.point[2] - met[2]) < _SETTLED * reach:
+                    return here
         raise ReconstructionError(
             "the ray of this pixel meets no known surface of the model: pick the spot in a second "
             "picture by hand"
@@ -131,36 +169,17 @@ class Surface:
 
     def hidden(self, place: SurfacePlace, centres: Array) -> NDArray[np.bool_]:
         """(N,) whether the surface stands between a place and cameras at (N, 3)."""
-        if self._dense is None or not len(centres):
-            return np.zeros(len(centres), np.bool_)
-        ways = centres - place.point
-        ends = np.concatenate([place.point[None], centres])[:, [1, 0]]
-        dem = self._window(self._dense, np.concatenate([ends.min(axis=0), ends.max(axis=0)]))
-        clear = _CLEAR_CELLS * dem.cell + _CLEAR_SIGMAS * place.sigma
-        highest = float(np.nanmax(dem.height)) if dem.known.any() else -np.inf
-        lift = highest + place.point[2]  # the surface near stands at most this far above it
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.clip(np.where(ways[:, 2] < 0, -lift / ways[:, 2], 1.0), 0.0, 1.0)
-        steps = np.linspace(0.0, 1.0, _STEPS)[1:]
-        over = place.point + (share[:, None] * steps)[..., None] * ways[:, None]
-        floor = dem.at(dem.height, over.reshape(-1, 3)[:, [1, 0]]).reshape(over.shape[:2])
-        with np.errstate(invalid="ignore"):
-            return np.asarray((floor + over[..., 2] > clear).any(axis=1))
+        count = len(centres)
+        if self._dem is None or not count:
+            return np.zeros(count, np.bool_)
+        points = np.broadcast_to(place.point, (count, 3))
+        return hidden(self._dem, points, np.full(count, place.sigma), centres)
 
-    @cached_property
-    def _heights(self) -> tuple[float, float]:
-        """Heights below and above all of the surface, by a coarse look at it."""
-        if self._dense is None:
-            known = np.zeros(1) if self._points is None else -self._points[:, 2]
-        else:
-            with opened_raster(self._dense / "dem.tif") as source:
-                shape = min(_COARSE, source.height), min(_COARSE, source.width)
-                coarse = source.read(1, out_shape=shape, resampling=Resampling.nearest)
-                known = coarse[np.isfinite(coarse)].astype(np.float64)
-        if not len(known):
+    def _reach(self, start: Array) -> float:
+        """How far below a camera the middle of all heights is."""
+        if self._points is None or not len(self._points):
             raise ReconstructionError("the model has no surface yet")
-        spare = 0.5 * float(np.ptp(known)) + 1e-3 * float(np.abs(known).max())
-        return float(known.min()) - spare, float(known.max()) + spare
+        return float(self._points[:, 2].min() + self._points[:, 2].max()) / 2 - float(start[2])
 
     def _by_points(self, at: Array) -> SurfacePlace:
         if self._points is None or self._tree is None or len(self._points) < _NEIGHBOURS:
@@ -183,36 +202,4 @@ class Surface:
             point=np.array([*at, plane[2]]),
             normal=normal / np.linalg.norm(normal),
             sigma=1.4826 * float(np.median(miss)),
-        )
-
-    @staticmethod
-    def _window(dense: Path, bounds: Sequence[float] | Array) -> Elevation:
-        """Cells around a box of west, south, east, north."""
-        with opened_raster(dense / "dem.tif") as source:
-            cell = float(source.transform.a)
-            west, south, east, north = (float(one) for one in bounds)
-            edge = source.transform
-            first = np.floor([(west - edge.c) / cell, (edge.f - north) / cell]) - 2
-            end = np.ceil([(east - edge.c) / cell, (edge.f - south) / cell]) + 2
-            column, row = np.maximum(first, 0).astype(int).tolist()
-            size = np.minimum(end, [source.width, source.height]).astype(int)
-            columns, rows = (size - [column, row]).tolist()
-            if columns < 2 or rows < 2:
-                raise ReconstructionError("no surface of the model is there")
-            window = Window(column, row, columns, rows)
-            by = max(1, -(-max(rows, columns) // _MOST_CELLS))
-            shape = (max(1, rows // by), max(1, columns // by))
-            height = source.read(
-                1, window=window, out_shape=shape, resampling=Resampling.nearest
-            ).astype(np.float64)
-        with opened_raster(dense / "sigma.tif") as source:
-            sigma = source.read(
-                1, window=window, out_shape=shape, resampling=Resampling.nearest
-            ).astype(np.float64)
-        return Elevation(
-            height=height,
-            sigma=np.where(sigma > 0, sigma, np.nan),
-            west=float(edge.c + column * cell),
-            north=float(edge.f - row * cell),
-            cell=by * cell,
         )

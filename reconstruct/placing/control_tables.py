@@ -6,14 +6,13 @@ told; a change that would leave a file that cannot be read is refused.
 """
 
 import csv
-import hashlib
 import io
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.edited_files import check_token, content_of, content_token, replaced
 from alice_survey.base.errors import WorkspaceError, why
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 
@@ -26,13 +25,9 @@ _LONGEST = 64 << 20
 """Bytes of a table that is read whole."""
 
 
-class ChangedTableError(WorkspaceError):
-    """The table is no longer what the change was made to."""
-
-
 def table_token(path: Path) -> str:
     """Token of a table's content; empty where there is no file."""
-    return hashlib.blake2b(_content(path), digest_size=12).hexdigest() if path.exists() else ""
+    return content_token(content_of(path, _LONGEST))
 
 
 def save_picks(path: Path, token: str, picks: Sequence[Pick], points: Collection[str]) -> str:
@@ -48,7 +43,7 @@ def save_picks(path: Path, token: str, picks: Sequence[Pick], points: Collection
         Token of the new content.
 
     Raises:
-        ChangedTableError: the file has changed.
+        StaleError: the file has changed.
         WorkspaceError: it cannot be read or written, or a pick is not one.
     """
     twice = {(p.image, p.point) for p in picks if p.point not in points}
@@ -84,7 +79,7 @@ def save_control(
         Token of the new content.
 
     Raises:
-        ChangedTableError: the file has changed.
+        StaleError: the file has changed.
         WorkspaceError: it cannot be read or written, or a row is wrong.
     """
     keyed = {(row.get("kind", ""), row.get("name", "")): row for row in rows}
@@ -98,7 +93,7 @@ def save_control(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Record:
+class _TableRow:
     text: str
     """As it stands in the file, with the end of its line."""
     cells: list[str]
@@ -113,12 +108,9 @@ def _save(
     meant: Callable[[Mapping[str, str]], bool],
     read: Callable[[Path], Any],
 ) -> str:
-    before = _content(path) if path.exists() else b""
-    if token != (hashlib.blake2b(before, digest_size=12).hexdigest() if path.exists() else ""):
-        raise ChangedTableError(
-            f"{path.name} was changed meanwhile, by a command, an editor or another page: load it "
-            "again"
-        )
+    now = content_of(path, _LONGEST)
+    check_token(path.name, now, token)
+    before = now or b""
     if before:
         read(path)  # a file that is wrong is the user's to mend, with the line named
     mark, records, end = _records(path, before)
@@ -134,7 +126,7 @@ def _save(
     names = [*names, *more]
     for record in records[1:]:
         if not record.text.endswith(("\n", "\r")):
-            record = _Record(text=record.text + end, cells=record.cells)
+            record = _TableRow(text=record.text + end, cells=record.cells)
         cells = dict(zip(names, (cell.strip() for cell in record.cells), strict=False))
         new = left.pop((cells.get(key[0], ""), cells.get(key[1], "")), None)
         if new is not None:
@@ -142,14 +134,7 @@ def _save(
         elif not meant(cells):
             lines.append(record.text)
     lines += [_line(row, names, end) for row in left.values()]
-    content = "".join(lines).encode("utf-8")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-        try:
-            read(temporary)
-        except WorkspaceError as error:
-            raise WorkspaceError(str(error).replace(str(temporary), path.name)) from None
-    return hashlib.blake2b(content, digest_size=12).hexdigest()
+    return replaced(path, "".join(lines).encode("utf-8"), read)
 
 
 def _line(cells: Mapping[str, str], names: Sequence[str], end: str) -> str:
@@ -161,7 +146,7 @@ def _line(cells: Mapping[str, str], names: Sequence[str], end: str) -> str:
     return text.getvalue() + end
 
 
-def _records(path: Path, content: bytes) -> tuple[str, list[_Record], str]:
+def _records(path: Path, content: bytes) -> tuple[str, list[_TableRow], str]:
     """The byte order mark, the records with the header first, and how lines end."""
     try:
         text = content.decode("utf-8")
@@ -169,17 +154,8 @@ def _records(path: Path, content: bytes) -> tuple[str, list[_Record], str]:
         lines = io.StringIO(text.removeprefix(mark), newline="").readlines()
         reader, records, at = csv.reader(lines, skipinitialspace=True), [], 0
         for cells in reader:
-            records.append(_Record(text="".join(lines[at : reader.line_num]), cells=cells))
+            records.append(_TableRow(text="".join(lines[at : reader.line_num]), cells=cells))
             at = reader.line_num
     except (UnicodeDecodeError, csv.Error) as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     return mark, records, "\r\n" if records and records[0].text.endswith("\r\n") else "\n"
-
-
-def _content(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > _LONGEST:
-            raise WorkspaceError(f"{path}: is larger than {_LONGEST >> 20} MiB")
-        return path.read_bytes()
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None

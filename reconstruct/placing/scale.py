@@ -5,6 +5,7 @@
 
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,15 @@ from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRecord
 from alice_survey.stages import SCALE_FILE
-from camera_calib.triangulate import nearest_to_rays
-from reconstruct.pictures.undistorted import Pictures
-from reconstruct.views.model import SparseModel, View, read_frame, read_model
+from camera_calib.approximation.pinhole_warp import PinholeWarp
+from reconstruct.placing.control_file import Pick
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.views.model import SparseModel, View, read_frame, read_model, read_warps
 
 _NEIGHBOURS = 15
 """Model points from which the surface at a pixel is taken."""
-_LARGEST_MISS_PX = 5.0
-"""Picks of one spot in several pictures must agree this well."""
+_MARK_SIGMA_PX = 1.0
+"""Marks of one spot in several pictures must agree to five of these."""
 
 
 def scale_model(workspace: Path, points: str, length_m: float) -> str:
@@ -51,9 +53,8 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
             f"--points needs two points separated by a space, got {len(tokens)}: {points!r}"
         )
     sparse = need_stage(workspace, "sparse", "reconstruct")
-    model = read_model(sparse)
-    pictures = Pictures.open(workspace)
-    first, second = (find_point(token, model, pictures) for token in tokens)
+    model, warps = read_model(sparse), read_warps(sparse / "cameras.json")
+    first, second = (find_point(token, model, warps) for token in tokens)
     return note_scale(workspace, (tokens[0], tokens[1]), first, second, length_m)
 
 
@@ -103,7 +104,7 @@ def note_scale(
     )
 
 
-def find_point(token: str, model: SparseModel, pictures: Pictures) -> Array:
+def find_point(token: str, model: SparseModel, warps: Mapping[str, PinholeWarp]) -> Array:
     """A point in world coordinates, (3,), as `scale_model` describes it.
 
     Raises:
@@ -118,14 +119,25 @@ def find_point(token: str, model: SparseModel, pictures: Pictures) -> Array:
         if point.shape != (3,) or not np.isfinite(point).all():
             raise ReconstructionError(f"{token!r} is not a point x,y,z")
         return point
-    picks = [_read_pick(pick, model, pictures) for pick in token.split("+")]
+    views = {view.image: view for view in model.views}
+    picks = [_read_pick(text, views, warps) for text in token.split("+")]
     if len(picks) == 1:
-        return _on_surface(token, *picks[0], model)
-    return _triangulate(token, picks)
+        view = views[picks[0].image]
+        pixel = np.array([[picks[0].x_px, picks[0].y_px]])
+        return _on_surface(token, view, warps[view.camera].to_pinhole(pixel)[0], model)
+    cameras = {
+        image: RegisteredPicture(warp=warps[view.camera], model_from_pinhole=view.world_from_cam)
+        for image, view in views.items()
+        if image in {pick.image for pick in picks}
+    }
+    found, lost = find_spots(picks, cameras)
+    if not found:
+        raise ReconstructionError(f"{token!r}: {lost['spot']}; mark it again")
+    return found["spot"].model
 
 
-def _read_pick(text: str, model: SparseModel, pictures: Pictures) -> tuple[View, Array]:
-    """The view and the pinhole's pixel, (2,), of `IMAGE:x,y`."""
+def _read_pick(text: str, views: Mapping[str, View], warps: Mapping[str, PinholeWarp]) -> Pick:
+    """The pick that `IMAGE:x,y` says."""
     match = re.fullmatch(r"(.+):([-+.\deE]+),([-+.\deE]+)", text)
     try:
         name, pixel = (
@@ -135,21 +147,16 @@ def _read_pick(text: str, model: SparseModel, pictures: Pictures) -> tuple[View,
         pixel = None
     if pixel is None:
         raise ReconstructionError(f"{text!r} is not a spot IMAGE:x,y")
-    view = next((v for v in model.views if v.image == name), None)
-    if view is None:
+    if name not in views:
         raise ReconstructionError(f"{text!r}: no picture {name} is in the model")
-    width, height = pictures.warp(name).size_px
+    warp = warps[views[name].camera]
+    width, height = warp.size_px
     if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
         raise ReconstructionError(f"{text!r} is outside of the picture, {width} x {height} pixels")
-    ideal = pictures.warp(name).to_pinhole(pixel[None] + 0.5)[0]
-    if not np.isfinite(ideal).all():
+    if not np.isfinite(warp.to_pinhole(pixel[None] + 0.5)).all():
         raise ReconstructionError(f"{text!r} is beyond the reach of the lens model")
-    return view, ideal
-
-
-def _slope(view: View, pixel: Array) -> Array:
-    """The ray of a pixel in the camera's frame, (3,), third component one."""
-    return np.append(view.pinhole.slopes(pixel), 1.0)
+    x, y = (pixel + 0.5).tolist()
+    return Pick(image=name, point="spot", x_px=x, y_px=y, sigma_px=_MARK_SIGMA_PX)
 
 
 def _on_surface(token: str, view: View, pixel: Array, model: SparseModel) -> Array:
@@ -160,7 +167,7 @@ def _on_surface(token: str, view: View, pixel: Array, model: SparseModel) -> Arr
     points = cam_from_world.apply(model.points_world[seen]).reshape(-1, 3)
     points = points[points[:, 2] > 0]
     slopes = points / points[:, 2:]
-    ray = _slope(view, pixel)
+    ray = np.append(view.pinhole.slopes(pixel), 1.0)
     nearest = np.argsort(np.linalg.norm(slopes - ray, axis=1), kind="stable")[:_NEIGHBOURS]
     if len(nearest) < 3:
         raise ReconstructionError(f"{token!r}: the model has {len(nearest)} points in that picture")
@@ -178,21 +185,3 @@ def _on_surface(token: str, view: View, pixel: Array, model: SparseModel) -> Arr
         raise ReconstructionError(f"{token!r}: no surface of the model is there")
     found: Array = view.world_from_cam.apply(depth * ray)
     return found
-
-
-def _triangulate(token: str, picks: list[tuple[View, Array]]) -> Array:
-    """The point nearest to all rays, (3,)."""
-    rotation = [view.world_from_cam.rotation for view, _ in picks]
-    starts = np.stack([view.world_from_cam.translation for view, _ in picks])
-    rays = np.stack([r.apply(_slope(v, p)) for r, (v, p) in zip(rotation, picks, strict=True)])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    point: Array = nearest_to_rays(starts[:, None], rays[:, None])[0]
-    if not np.isfinite(point).all():
-        raise ReconstructionError(f"{token!r}: the pictures see the spot from one direction only")
-    misses = [np.linalg.norm(v.project(point[None])[0] - p) for v, p in picks]
-    worst = float(np.max(misses))
-    if not worst <= _LARGEST_MISS_PX:
-        raise ReconstructionError(
-            f"{token!r}: the marks are {worst:.1f} px off one common spot; mark it again"
-        )
-    return point

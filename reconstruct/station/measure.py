@@ -7,7 +7,7 @@ triangulation, so that an error of the baseline scales a length and leaves its p
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,17 +22,19 @@ from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.rig import Rig, read_rig
-from camera_calib.triangulate import nearest_to_rays
-from reconstruct.evaluate.elevation import Elevation, read_elevation
+from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.measure.errors import SharedErrors, shared_errors
 from reconstruct.measure.figures import polygon_area, polyline, slopes_of
-from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.picked_points import RegisteredPicture
+from reconstruct.picking.registered import RegisteredPictures
+from reconstruct.picking.surface import ShownPlaces, shown_places
+from reconstruct.placing.control_file import Pick
+from reconstruct.placing.picked_points import RegisteredPicture, find_spots
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
 from reconstruct.station.solve import PairOptics, calibration_slopes, stereo_rig
-from reconstruct.views.model import View, read_model, scaled_view
+from reconstruct.views.model import scaled_view
+from reconstruct.views.model_files import all_points
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")
@@ -266,34 +268,34 @@ def _check_inside(taken: Array, warp: PinholeWarp, name: str) -> None:
 def _in_workspace(
     workspace: Path, picks: list[tuple[PickedPixel, ...]], pick_sigma_px: float
 ) -> Located:
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    model = read_model(sparse)
-    if not model.frame.scaled:
+    pictures = RegisteredPictures.read(workspace)
+    if not pictures.frame.scaled:
         raise ReconstructionError("the model has no scale: lengths in it are not metres")
-    pictures = Pictures.open(workspace)
-    views = {view.image: view for view in model.views}
-    known = model.points_world[:, [1, 0]]
+    known = all_points(workspace / "sparse" / "model")[1][:, [1, 0]]
     low, high = np.percentile(known, 2.0, axis=0), np.percentile(known, 98.0, axis=0)
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    errors = shared_errors(workspace, LEVEL_PLANE, model.frame, bounds)
+    errors = shared_errors(workspace, LEVEL_PLANE, pictures.frame, bounds)
     points, own = [], []
-    surface = None
-    for pick in picks:
-        rays = []
-        for spot in pick:
-            if spot.image is None or spot.image not in views:
-                raise ReconstructionError(
-                    f"{spot.image!r} is no registered picture: name one of {len(views)}, such as "
-                    f"{next(iter(views))}:100,100"
-                )
-            warp = pictures.warp(spot.image)
-            _check_inside(np.array([[spot.x, spot.y]]), warp, spot.image)
-            rays.append((views[spot.image], warp, np.array([spot.x, spot.y])))
-        if len(rays) == 2:
-            point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
+    for spots in picks:
+        cameras = {spot.image: pictures.picture(spot.image) for spot in spots if spot.image}
+        if None in {spot.image for spot in spots}:
+            raise ReconstructionError("points of a workspace are IMAGE:x,y: name the picture")
+        marks = [
+            Pick(
+                image=spot.image or "", point="spot", x_px=spot.x, y_px=spot.y,
+                sigma_px=pick_sigma_px or _TWO_PICTURES_SIGMA_PX,
+            )
+            for spot in spots
+        ]  # fmt: skip
+        for mark in marks:
+            place = np.array([[mark.x_px, mark.y_px]])
+            _check_inside(place, cameras[mark.image].warp, mark.image)
+        if len(marks) == 2:
+            point, covariance = _crossed(marks, cameras)
         else:
-            surface = surface or read_elevation(workspace)[0]
-            point, covariance = _on_surface(surface, errors, *rays[0], pick_sigma_px)
+            dem = StoredElevation.of(need_stage(workspace, "dense", "reconstruct"))
+            shown = shown_places(dem, cameras[marks[0].image], place)
+            point, covariance = _on_surface(marks[0], shown, errors, pick_sigma_px)
         points.append(point)
         own.append(covariance)
     turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -310,62 +312,31 @@ def _in_workspace(
     )
 
 
-def _ray(view: View, warp: PinholeWarp, taken: Array) -> tuple[Array, Array]:
-    """A point and the unit direction of the straight ray in water of one pixel as taken."""
-    return RegisteredPicture(warp=warp, model_from_pinhole=view.world_from_cam).ray(taken)
-
-
-def _crossed(rays: list[tuple[View, PinholeWarp, Array]], sigma_px: float) -> tuple[Array, Array]:
-    """The point nearest to two rays, and its covariance."""
-
-    def solve(taken: list[Array]) -> Array:
-        ends = [_ray(v, warp, t) for (v, warp, _), t in zip(rays, taken, strict=True)]
-        start, direction = (np.stack([e[k] for e in ends])[:, None] for k in range(2))
-        solved: Array = nearest_to_rays(start, direction)[0]
-        return solved
-
-    taken = [ray[2] for ray in rays]
-    point = solve(taken)
-    if not np.isfinite(point).all():
-        raise ReconstructionError("the rays of a spot in two pictures are parallel: pick again")
-    covariance = np.zeros((3, 3))
-    for ray in range(2):
-        for axis in range(2):
-            moved = [t.copy() for t in taken]
-            moved[ray][axis] += 0.5
-            slope = (solve(moved) - point) / 0.5 * sigma_px
-            covariance += np.outer(slope, slope)
-    for view, _, spot in rays:
-        if view.world_from_cam.inv().apply(point)[2] <= 0:
-            raise ReconstructionError(
-                f"{view.image}:{spot[0]:g},{spot[1]:g}: the two rays meet behind the camera"
-            )
-    return point, covariance
+def _crossed(
+    picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
+) -> tuple[Array, Array]:
+    """The point that two pictures show, and its covariance."""
+    found, lost = find_spots(picks, cameras)
+    if not found:
+        raise ReconstructionError(
+            f"{' and '.join(map(_named, picks))} show no common spot: {lost['spot']}: pick again"
+        )
+    return found["spot"].model, found["spot"].covariance
 
 
 def _on_surface(
-    surface: Elevation,
-    errors: SharedErrors,
-    view: View,
-    warp: PinholeWarp,
-    taken: Array,
-    sigma_px: float,
+    pick: Pick, shown: ShownPlaces, errors: SharedErrors, sigma_px: float
 ) -> tuple[Array, Array]:
-    start, direction = _ray(view, warp, taken)
-    point = surface.hit(start, direction)
-    if point is None:
+    """The place that one picture shows, and its covariance."""
+    if not np.isfinite(shown.points).all():
         raise ReconstructionError(
-            f"{view.image}:{taken[0] - 0.5:g},{taken[1] - 0.5:g}: its ray meets no known "
-            "surface; pick another pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
+            f"{_named(pick)}: its ray meets no known surface; pick another pixel, or the spot in "
+            "two pictures as IMAGE:x,y=IMAGE:x,y"
         )
-    place = point[None, [1, 0]]
-    stated, shared = surface.at(surface.sigma, place), errors.variance_of_heights(place)
-    sigma = float(np.sqrt(np.maximum(stated**2 - shared, 0.0))[0])
-    raised = surface.hit(start, direction, lift=sigma)
-    moves = [raised - point if raised is not None else sigma * direction]
-    for axis in range(2):
-        aside_point = surface.hit(*_ray(view, warp, taken + np.eye(2)[axis]))
-        if aside_point is not None:
-            moves.append((aside_point - point) * sigma_px)
-    covariance = sum((np.outer(m, m) for m in moves), np.zeros((3, 3)))
-    return point, covariance
+    sigma = errors.own_sigma(shown.points[:, [1, 0]], shown.sigma)
+    moves = np.column_stack([sigma * shown.by_height[0], sigma_px * shown.by_pixel[0]])
+    return shown.points[0], moves @ moves.T
+
+
+def _named(pick: Pick) -> str:
+    return f"{pick.image}:{pick.x_px - 0.5:g},{pick.y_px - 0.5:g}"

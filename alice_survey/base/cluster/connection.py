@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field, ValidationError
 
 from alice_survey.base.config import Config
+from alice_survey.base.contents import first_fault
 from alice_survey.base.errors import ConfigError, WorkspaceError, why
 
 if TYPE_CHECKING:
@@ -151,9 +152,7 @@ def read_cluster_file(path: Path) -> ClusterConfig:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {why(error)}") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"{path}: {name}: {first['msg']}") from None
+        raise ConfigError(f"{path}: {first_fault(error)}") from None
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
     given = [config.address, config.scheduler_file, config.start]

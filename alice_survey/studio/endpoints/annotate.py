@@ -1,25 +1,21 @@
 """The Annotate tab: labels and annotations, their areas, other tools' files, and pictures."""
 
-import io
-import threading
-import zipfile
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, ValidationError
 
+from alice_survey.base.config import Config
+from alice_survey.base.contents import first_fault
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Array
 from alice_survey.report.colours import MOSAIC_FILE
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio, zipped
 from reconstruct.annotations.backdrops import backdrops_of
 from reconstruct.annotations.formats.registry import FORMATS
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, InPicture, OnPlane, Projector
 from reconstruct.annotations.store import (
-    OtherVersionError,
     change_annotations,
     read_annotations,
     token_of,
@@ -27,7 +23,7 @@ from reconstruct.annotations.store import (
 from reconstruct.annotations.table import HEADER as COLUMNS
 from reconstruct.annotations.table import (
     KnownGround,
-    Measured,
+    MeasuredMark,
     cells,
     ground_of,
     measured,
@@ -35,7 +31,6 @@ from reconstruct.annotations.table import (
 )
 from reconstruct.annotations.transfer import GEOJSON, exported, frame_of, import_data
 from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, Label, with_labels
-from reconstruct.pictures.undistorted import Pictures
 
 _MOST_BYTES = 64 << 20
 _MOST_PICTURES = 8
@@ -44,13 +39,10 @@ _CROP_PX = 420
 _AROUND = 0.6
 """Of an outline's extent that is shown around it."""
 _LEAST_AROUND_PX = 40
-_KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8",
-          ".zip": "application/zip"}  # fmt: skip
+_KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8"}
 
 
-class _Edit(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Edit(Config):
     token: str
     put: list[Annotation] = Field(default_factory=list)
     """Annotations that are new, or take the place of others of their ids."""
@@ -62,21 +54,18 @@ class _Edit(BaseModel):
 class _Annotate:
     def __init__(self, studio: Studio) -> None:
         self._studio, self._folder = studio, studio.workspace.folder
-        self._lock = threading.Lock()
-        self._projector = lru_cache(1)(lambda tokens: Projector(self._folder))
-        self._ground = lru_cache(1)(lambda token: ground_of(self._folder))
+        self._projector = KeptValue(lambda: Projector(self._folder))
+        self._ground = KeptValue(lambda: ground_of(self._folder))
 
     def projector(self) -> Projector:
         """The model as it is now."""
-        with self._lock:
-            return self._projector(self._studio.workspace.state(()))
+        return self._projector.of(self._studio.workspace.state(()))
 
     def ground(self) -> KnownGround:
         """The known ground of the mosaic as it is now."""
         if not self._studio.workspace.has(MOSAIC_FILE):
             raise AliceError("there is no mosaic yet: run 'alice-survey reconstruct' first")
-        with self._lock:
-            return self._ground(self._studio.workspace.token(MOSAIC_FILE))
+        return self._ground.of(self._studio.workspace.token(MOSAIC_FILE))
 
     def _values(self) -> AnnotationSet:
         return read_annotations(self._folder, frame_of(self._folder))
@@ -107,11 +96,11 @@ class _Annotate:
                 raise AliceError("the change: a label stands twice in the list")
             try:
                 return AnnotationSet(labels=labels, annotations=(*kept, *new))
-            except ValueError as error:
-                raise AliceError(f"the change: {_reason(error)}") from None
+            except ValidationError as error:
+                raise AliceError(f"the change: {first_fault(error)}") from None
 
         return self._changed(
-            lambda: (change_annotations(self._folder, frame_of(self._folder), made, wanted.token),)
+            change_annotations(self._folder, frame_of(self._folder), made, wanted.token)
         )
 
     def take(self, call: Call) -> dict[str, Any]:
@@ -119,16 +108,12 @@ class _Annotate:
         format_name, token = call.query.get("format", ""), call.query.get("token", "")
         backdrops = backdrops_of(self._folder)
         return self._changed(
-            lambda: import_data(self._folder, call.body, format_name, backdrops, token)
+            *import_data(self._folder, call.body, format_name, backdrops, token)[:2]
         )
 
-    def _changed(self, work: Any) -> dict[str, Any]:
-        try:
-            token, *more = work()
-        except OtherVersionError as error:
-            raise StaleError(str(error)) from None
+    def _changed(self, token: str, text: str = "") -> dict[str, Any]:
         self._studio.publish("annotations", {"token": token})
-        return {"token": token, "text": more[0] if more else ""}
+        return {"token": token, "text": text}
 
     def give(self, call: Call) -> Content:
         """The annotations as a file of a tool; several files as a ZIP."""
@@ -140,11 +125,7 @@ class _Annotate:
             reasons = "".join(f"; {line}" for line in files.left_out)
             raise AliceError(f"there are no annotations to write{reasons}")
         if len(texts) > 1:
-            packed = io.BytesIO()
-            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-                for file, data in texts.items():
-                    archive.writestr(zipfile.ZipInfo(file), data)
-            texts, suffix = {f"{name}.zip": packed.getvalue()}, ".zip"
+            return zipped(f"{name}.zip", texts)
         ((file, data),) = texts.items()
         return Content(data=data, kind=_KINDS[suffix], name=file)
 
@@ -192,23 +173,14 @@ class _Annotate:
 
     def crop(self, call: Call) -> Content:
         """A part of a picture as taken."""
-        image = call.query.get("image", "")
+        name, taken = call.query.get("image", ""), self._studio.taken
         left, top, width, height = (int(call.number(n)) for n in ("x", "y", "width", "height"))
-        token = self._studio.workspace.token(f"images/{image}")
-        pictures = Pictures.open(self._folder)
-        wide, high = pictures.warp(image).size_px
-        if not (0 <= left < left + width <= wide and 0 <= top < top + height <= high):
-            raise AliceError(f"a part of {image} beyond its {wide} x {high} pixels")
-        part = pictures.taken(image)[top : top + height, left : left + width]
-        shrink = min(1.0, _CROP_PX / max(width, height))
-        if shrink < 1.0:
-            size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-            part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA))
-        data = cv2.imencode(".webp", part, [cv2.IMWRITE_WEBP_QUALITY, 90])[1].tobytes()
-        return Content(data=data, kind="image/webp", tag=f"{token}-{left}-{top}-{width}-{height}")
+        tag = f"{taken.token(name)}-{left}-{top}-{width}-{height}"
+        data = taken.part(name, (left, top, width, height), _CROP_PX)
+        return Content(data=data, kind="image/webp", tag=tag)
 
 
-def _mark(mark: Measured) -> dict[str, Any]:
+def _mark(mark: MeasuredMark) -> dict[str, Any]:
     middle = mark.geometry.centroid
     shape = mark.shape.model_dump(mode="json") if mark.annotation.image is not None else None
     return {
@@ -242,12 +214,6 @@ def _check(spots: OnPlane, one: Annotation) -> None:
             f"none of the {lost} vertices of {one.label!r} meets a known surface: no picture can "
             "be shown"
         )
-
-
-def _reason(error: ValueError) -> str:
-    lines = str(error).splitlines()
-    text = next((line for line in lines if "Value error" in line), lines[0]).strip()
-    return text.removeprefix("Value error, ").partition(" [type")[0]
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

@@ -3,30 +3,33 @@
 import asyncio
 import contextlib
 import functools
+import io
 import json
 import math
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+import zipfile
+from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from alice_survey.base.contents import shown
+from alice_survey.base.contents import first_fault
 from alice_survey.base.errors import AliceError
+from alice_survey.kit.document import PictureLayer
 from alice_survey.studio.jobs import Jobs
 from alice_survey.studio.layers import Layers
 from alice_survey.studio.paths import Workspace
+from alice_survey.studio.taken_pictures import TakenPictures
 
 M = TypeVar("M", bound=BaseModel)
+T = TypeVar("T")
 _ALIVE_S = 5.0
 """Time after which a silent stream of events says that it is there."""
 _MOST_WAITING = 1000
 """Events that a page may be behind; a slower one misses the oldest."""
-
-
-class StaleError(AliceError):
-    """What a page wants to change is no longer what it has seen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,35 @@ class Content:
     """Token of what it is of; empty for an answer that is not to be kept."""
     name: str = ""
     """File name to save it by; empty for one to be shown."""
+
+
+def zipped(name: str, files: Mapping[str, bytes | Path]) -> Content:
+    """Files by their names in a ZIP."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file, content in files.items():
+            data = content if isinstance(content, bytes) else content.read_bytes()
+            archive.writestr(zipfile.ZipInfo(file), data, zipfile.ZIP_DEFLATED)
+    return Content(data=packed.getvalue(), kind="application/zip", name=name)
+
+
+def scale_json(layer: PictureLayer) -> dict[str, Any] | None:
+    """What the colours of a raster mean; None where they are what was seen."""
+    return None if layer.scale is None else {**vars(layer.scale)}
+
+
+class KeptValue(Generic[T]):
+    """A value that is made again when what it is of has changed; threads may share it."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        """Take what makes it."""
+        self._lock = threading.Lock()
+        self._made = lru_cache(1)(lambda _: make())
+
+    def of(self, state: Hashable) -> T:
+        """The value of a state."""
+        with self._lock:
+            return self._made(state)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,9 +92,7 @@ class Call:
         try:
             return kind.model_validate_json(self.body)
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
-            raise AliceError(f"the request: {place or 'its body'}: {shown(first['msg'])}") from None
+            raise AliceError(f"the request: {first_fault(error, 'its body')}") from None
 
     def number(self, name: str) -> float:
         """A finite number of the query.
@@ -75,6 +105,17 @@ class Call:
             if math.isfinite(value):
                 return value
         raise AliceError(f"the request needs a number as {name}")
+
+    def whole(self, name: str) -> int:
+        """A whole number of the path, not negative.
+
+        Raises:
+            FileNotFoundError: it is none.
+        """
+        text = self.path[name]
+        if not (text.isascii() and text.isdigit() and len(text) < 7):
+            raise FileNotFoundError(text)
+        return int(text)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +161,11 @@ class Studio:
     def jobs(self) -> Jobs:
         """The commands that run in the workspace."""
         return Jobs(self.workspace.folder, self.publish)
+
+    @functools.cached_property
+    def taken(self) -> TakenPictures:
+        """The pictures of the workspace as taken."""
+        return TakenPictures(self.workspace)
 
     @contextlib.contextmanager
     def only_writer(self) -> Iterator[None]:

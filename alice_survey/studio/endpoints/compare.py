@@ -17,18 +17,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 import alice_survey
+from alice_survey.base.config import Config
 from alice_survey.base.contents import shown
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Datum
 from alice_survey.base.run.interrupts import for_other_programs
 from alice_survey.kit.document import PictureLayer
+from alice_survey.kit.map import picture_json
 from alice_survey.report.colours import change_rasters
 from alice_survey.report.held import Held
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
-from alice_survey.studio.layers import ChangedError, Layers
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio, scale_json
+from alice_survey.studio.layers import Layers
 from alice_survey.studio.paths import Workspace
 from reconstruct.evaluate.elevation import enu_from_enu
 from reconstruct.views.model import datum_of
@@ -41,9 +44,7 @@ _ROOT = Path(alice_survey.__file__).parents[1]
 _CHANGED = "the survey was worked on meanwhile: choose it again"
 
 
-class _Named(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Named(Config):
     path: str = Field(min_length=1, max_length=4000)
 
 
@@ -218,34 +219,20 @@ def _shift(here: Held, there: Held) -> tuple[tuple[float, float], str]:
 
 def _picture(layer: PictureLayer, shift: tuple[float, float]) -> dict[str, Any]:
     """A raster as the map's script takes it."""
-    scale = layer.scale
     return {
-        "kind": "picture", "name": layer.name, "title": layer.title, "about": layer.about,
+        **picture_json(layer), "title": layer.title, "about": layer.about,
         "west": layer.west_m + shift[0], "north": layer.north_m + shift[1],
-        "pixel": layer.pixel_m, "width": layer.width_px, "height": layer.height_px,
-        "tile": layer.tile_px, "levels": layer.levels, "sizes": layer.sizes,
-        "address": layer.address, "base": layer.base,
-        "scale": None if scale is None else {
-            "label": scale.label, "low": scale.low, "high": scale.high,
-            "colours": list(scale.colours),
-        },
+        "address": layer.address, "scale": scale_json(layer),
     }  # fmt: skip
 
 
 def _tile(layers: Layers, call: Call) -> Content:
-    level, x, y = (_whole(call.path[part]) for part in ("level", "x", "y"))
+    level, x, y = (call.whole(part) for part in ("level", "x", "y"))
     try:
         data, token = layers.tile(call.path["layer"], level, x, y, call.query.get("v"))
-    except ChangedError:
+    except StaleError:
         raise StaleError(_CHANGED) from None
     return Content(data=data, kind="image/webp", tag=f"{token}-{level}-{x}-{y}")
-
-
-def _whole(text: str) -> int:
-    digits = text.removesuffix(".webp")
-    if not (digits.isascii() and digits.isdigit() and len(digits) < 7):
-        raise FileNotFoundError(text)
-    return int(digits)
 
 
 def _regions(change: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -270,9 +257,9 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/compare/open", answer=tab.open, **post),
         Endpoint(path="/api/compare/results", answer=tab.results),
         Endpoint(
-            path="/api/compare/results/{name}/tiles/{layer}/{level}/{x}/{y}",
+            path="/api/compare/results/{name}/tiles/{layer}/{level}/{x}/{y}.webp",
             answer=tab.change_tile,
         ),
-        Endpoint(path="/api/compare/{id}/tiles/{layer}/{level}/{x}/{y}", answer=tab.tile),
+        Endpoint(path="/api/compare/{id}/tiles/{layer}/{level}/{x}/{y}.webp", answer=tab.tile),
         Endpoint(path="/api/compare/{id}/evaluate", answer=tab.evaluate, **post),
     )

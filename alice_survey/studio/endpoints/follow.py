@@ -1,21 +1,21 @@
 """The tab that follows a dive: its state, coverage, track, holes, and lines that close these."""
 
-import io
 import math
 import tempfile
 import threading
 import time
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from alice_survey.base.config import Config
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError, NavigationError
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio, zipped
 from missions.exports.options import options_of
 from missions.exports.registry import format_names
 from missions.exports.write import write_exports
@@ -41,23 +41,17 @@ for _bits in range(1, 8):
     )  # fmt: skip
 
 
-class _Ask(BaseModel):
-    """A request of the page; an unknown field is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class _Open(_Ask):
+class _Open(Config):
     log: str
     replay: float | None = Field(None, gt=0, le=1000)
     dive: int | None = Field(None, ge=1)
 
 
-class _Minutes(_Ask):
+class _Minutes(Config):
     minutes: float | None = Field(None, gt=0, le=6000)
 
 
-class _Number(_Ask):
+class _Number(Config):
     number: int
 
 
@@ -239,10 +233,7 @@ class FollowTab:
     def block(self, call: Call) -> Content:
         """A block of the coverage as a picture."""
         session = self._needed()
-        try:
-            block = int(call.path["row"]), int(call.path["column"])
-        except ValueError:
-            raise FileNotFoundError(f"block {call.path}") from None
+        block = call.whole("row"), call.whole("column")
         with session.lock:
             classes = session.blocks.classes(block)
         bgra = cv2.cvtColor(_COLOURS[classes], cv2.COLOR_RGBA2BGRA)
@@ -304,14 +295,8 @@ class FollowTab:
                 Path(folder), proposal.plan, session.rig,
                 formats=[wanted] if wanted else None, options=options,
             )  # fmt: skip
-            held = io.BytesIO()
-            with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
-                for path in files:
-                    archive.write(path, path.name)
-        return Content(
-            data=held.getvalue(), kind="application/zip",
-            name=f"holes{f'_{wanted}' if wanted else ''}.zip",
-        )  # fmt: skip
+            name = f"holes{f'_{wanted}' if wanted else ''}.zip"
+            return zipped(name, {path.name: path for path in files})
 
 
 def _is_log(path: Path) -> bool:

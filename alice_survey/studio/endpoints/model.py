@@ -2,20 +2,18 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-import rasterio
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from alice_survey.base.config import Config
 from alice_survey.base.errors import AliceError
 from alice_survey.base.records import MeshRecord
 from alice_survey.report.colours import number_rasters
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_about
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
-from alice_survey.studio.layers import ChangedError
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
 from reconstruct.measure.errors import SharedErrors
 from reconstruct.measure.export import Measurement, as_csv, as_geojson
 from reconstruct.measure.figures import Measured
@@ -40,17 +38,13 @@ _OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", 
 Place = tuple[float, float]
 
 
-class _Asked(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class AskedProfile(_Asked):
+class AskedProfile(Config):
     """A line on the surface."""
 
     places: list[Place] = Field(min_length=2, max_length=_MOST_PLACES)
 
 
-class AskedMeasure(_Asked):
+class AskedMeasure(Config):
     """A line, points in space, or a polygon."""
 
     kind: Literal["line", "points", "polygon"]
@@ -61,7 +55,7 @@ class AskedMeasure(_Asked):
     """Side of quadrats within a polygon."""
 
 
-class ExportedFigure(_Asked):
+class ExportedFigure(Config):
     """A figure as it was measured."""
 
     name: str
@@ -73,7 +67,7 @@ class ExportedFigure(_Asked):
     unit: str
 
 
-class ExportedMeasure(_Asked):
+class ExportedMeasure(Config):
     """A measurement as the page keeps it."""
 
     name: str = Field(max_length=200)
@@ -83,57 +77,43 @@ class ExportedMeasure(_Asked):
     notes: list[str] = Field(default=[], max_length=20)
 
 
-class AskedExport(_Asked):
+class AskedExport(Config):
     """Measurements to write."""
 
     form: Literal["csv", "geojson"]
     measures: list[ExportedMeasure] = Field(min_length=1, max_length=_MOST_MEASURES)
 
 
-class _Model:
+class _ModelTab:
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
-        self._cached = lru_cache(maxsize=1)(self._opened)
-
-    def _opened(self, _state: tuple[str, ...]) -> MeasuredSurface:
-        return MeasuredSurface.of(self.studio.workspace.folder)
+        self._kept = KeptValue(lambda: MeasuredSurface.of(studio.workspace.folder))
 
     @contextmanager
     def _surface(self) -> Iterator[MeasuredSurface]:
         """The surface as it is now; what is replaced meanwhile is the page's to load again."""
-        workspace = self.studio.workspace
-        before = self._state()
-        if not workspace.has("dense/dem.tif"):
-            raise FileNotFoundError("dense/dem.tif")
-        try:
-            yield self._cached(before)
-        except (AliceError, OSError, rasterio.errors.RasterioError):
-            if self._state() != before:
-                raise ChangedError from None
-            raise
-        if self._state() != before:
-            raise ChangedError
+        with self._unchanged() as state:
+            if not self.studio.workspace.has("dense/dem.tif"):
+                raise FileNotFoundError("dense/dem.tif")
+            yield self._kept.of(state)
 
-    def _state(self) -> tuple[str, ...]:
+    @contextmanager
+    def _unchanged(self) -> Iterator[tuple[str, ...]]:
         """Tokens of the files that figures are of; a link among them is refused."""
         workspace = self.studio.workspace
         for path in _READ:
             if (workspace.folder / path).exists() and not workspace.has(path):
                 raise AliceError(f"{path} is, or lies behind, a link: files of a survey are none")
-        return workspace.state(_READ)
+        with workspace.unchanged(_READ) as state:
+            yield state
 
     def value(self, call: Call) -> dict[str, Any]:
         """Value and sigma of every raster at a place."""
         place = (call.number("east"), call.number("north"))
         workspace = self.studio.workspace
-        before = self._state()
-        files = [path for path in RASTERS if workspace.has(path)]
-        try:
+        with self._unchanged():
+            files = [path for path in RASTERS if workspace.has(path)]
             found = values_at(workspace.folder, place, files)
-        except AliceError:
-            if self._state() != before:
-                raise ChangedError from None
-            raise
         unit = Held.of(workspace.folder).unit
         numbers = {one.file: one for one in number_rasters(unit)}
         rows = []
@@ -265,7 +245,7 @@ class _Model:
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """Of the model."""
-    model = _Model(studio)
+    model = _ModelTab(studio)
     return (
         Endpoint(path="/api/model/about", answer=model.about),
         Endpoint(path="/api/model/value", answer=model.value),

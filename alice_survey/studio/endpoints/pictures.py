@@ -5,20 +5,21 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from alice_survey.base.artefacts import read_csv
+from alice_survey.base.config import Config
 from alice_survey.base.errors import AliceError, ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.records import ControlRecord, MappingRecord
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
-from alice_survey.studio.taken_pictures import TILE_PX, TakenPictures, levels_of
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
+from alice_survey.studio.taken_pictures import TILE_PX, levels_of
 from reconstruct.picking.lengths import Lengths, spot_residuals
 from reconstruct.picking.preview import preview_control
 from reconstruct.picking.refine import refine
 from reconstruct.picking.registered import RegisteredPictures, Sight
-from reconstruct.picking.surface import Surface, SurfacePlace
+from reconstruct.picking.surface import ModelSurface, SurfacePlace
 from reconstruct.placing.control_file import (
     CONTROL_FILE,
     MARKERS_FILE,
@@ -29,7 +30,6 @@ from reconstruct.placing.control_file import (
     read_picks,
 )
 from reconstruct.placing.control_tables import (
-    ChangedTableError,
     save_control,
     save_picks,
     table_token,
@@ -46,11 +46,7 @@ Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 
-class _Asked(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class _Pick(_Asked):
+class _AskedPick(Config):
     """Pixels count from 0 at the middle of the first, as in `picks.csv`."""
 
     image: Name
@@ -68,48 +64,48 @@ class _Pick(_Asked):
         )  # fmt: skip
 
 
-class _Refine(_Asked):
-    pick: _Pick
+class _Refine(Config):
+    pick: _AskedPick
     images: Annotated[list[Name], Field(max_length=_MOST_SEEING)] | None = None
     """The best of those that see the spot where they are not named."""
 
 
-class _SavePicks(_Asked):
+class _SavePicks(Config):
     token: str
     points: Annotated[list[Name], Field(max_length=1000)]
-    picks: Annotated[list[_Pick], Field(max_length=20_000)]
+    picks: Annotated[list[_AskedPick], Field(max_length=20_000)]
 
 
-class _SaveControl(_Asked):
+class _SaveControl(Config):
     token: str
     rows: Annotated[
         list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)
     ]
-    names: Annotated[list[tuple[Name, Name]], Field(max_length=5000)] = []
+    names: Annotated[tuple[tuple[Name, Name], ...], Field(max_length=5000)] = ()
 
 
-class _Spot(_Asked):
-    picks: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
+class _AskedSpot(Config):
+    picks: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
 
 
-class _Ends(_Asked):
+class _AskedEnds(Config):
     """Two spots, each by the picks of it."""
 
-    first: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
-    second: Annotated[list[_Pick], Field(min_length=1, max_length=200)]
+    first: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
+    second: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
 
 
-class _Scale(_Ends):
+class _AskedScale(_AskedEnds):
     length_m: Annotated[float, Field(gt=0)]
 
 
-class _Model:
+class _OpenModel:
     """A registered model, as long as its files are what they were."""
 
     def __init__(self, studio: Studio) -> None:
         folder = studio.workspace.folder
         self.pictures = RegisteredPictures.read(folder)
-        self.surface = Surface(folder)
+        self.surface = ModelSurface(folder)
         self.lengths = Lengths(folder, self.pictures)
         self.lock = threading.Lock()
 
@@ -117,9 +113,8 @@ class _Model:
 class _Tab:
     def __init__(self, studio: Studio) -> None:
         self._studio = studio
-        self._taken = TakenPictures(studio.workspace)
-        self._lock, self._writing = threading.Lock(), threading.Lock()
-        self._model: tuple[tuple[str, ...], _Model] | None = None
+        self._taken, self._writing = studio.taken, threading.Lock()
+        self._model = KeptValue(lambda: _OpenModel(studio))
 
     # ---- Pictures ----
 
@@ -138,7 +133,7 @@ class _Tab:
             ],
         }
 
-    def _about(self, record: ImageRecord, model: _Model | None) -> dict[str, Any]:
+    def _about(self, record: ImageRecord, model: _OpenModel | None) -> dict[str, Any]:
         place = None
         if model is not None and record.image in model.pictures:
             place = model.pictures.centres[model.pictures.row(record.image)].tolist()
@@ -158,15 +153,12 @@ class _Tab:
 
     def tile(self, call: Call) -> Content:
         """A tile of a picture as taken, WebP; level 0 is the coarsest."""
-        try:
-            level, x, y = (int(call.path[key]) for key in ("level", "x", "y"))
-        except ValueError:
-            raise FileNotFoundError from None
+        level, x, y = (call.whole(key) for key in ("level", "x", "y"))
         name = call.path["name"]
         token = self._taken.token(name)
         wide, high = self._taken.size(name)
         halvings = levels_of(wide, high) - 1 - level
-        if min(halvings, x, y) < 0:
+        if halvings < 0:
             raise FileNotFoundError(name)
         data = self._taken.tile(name, halvings, x, y)
         return Content(data=data, kind="image/webp", tag=f"{token}-{level}-{x}-{y}")
@@ -197,13 +189,13 @@ class _Tab:
             ],
         }  # fmt: skip
 
-    def _place(self, model: _Model, call: Call) -> SurfacePlace:
+    def _place(self, model: _OpenModel, call: Call) -> SurfacePlace:
         if "image" not in call.query:
             return model.surface.below(call.number("n"), call.number("e"))
         return self._met(model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5)
 
     @staticmethod
-    def _met(model: _Model, image: str, x_px: float, y_px: float) -> SurfacePlace:
+    def _met(model: _OpenModel, image: str, x_px: float, y_px: float) -> SurfacePlace:
         size = model.pictures.warp(image).size_px
         if not (0 <= x_px <= size[0] and 0 <= y_px <= size[1]):
             raise ReconstructionError(
@@ -325,7 +317,7 @@ class _Tab:
 
     def spot(self, call: Call) -> dict[str, Any]:
         """The spot that picks show and how far each misses it; nothing is written."""
-        asked, model = call.read(_Spot), self._read_model()
+        asked, model = call.read(_AskedSpot), self._read_model()
         picks = [p.pick for p in asked.picks]
         found = model.lengths.spot(picks)
         off = spot_residuals({p.point: found for p in picks}, picks, model.pictures)
@@ -342,7 +334,7 @@ class _Tab:
 
     def length(self, call: Call) -> dict[str, Any]:
         """The distance between two spots and its sigma; nothing is written."""
-        asked, model = call.read(_Ends), self._read_model()
+        asked, model = call.read(_AskedEnds), self._read_model()
         with model.lock:
             found = model.lengths.between(
                 [p.pick for p in asked.first], [p.pick for p in asked.second]
@@ -355,7 +347,7 @@ class _Tab:
 
     def scale(self, call: Call) -> dict[str, Any]:
         """Note a known length in `scale.json`."""
-        asked, model = call.read(_Scale), self._read_model()
+        asked, model = call.read(_AskedScale), self._read_model()
         ends = [[p.pick for p in one] for one in (asked.first, asked.second)]
         places = [model.lengths.spot(picks).model for picks in ends]
         names = [
@@ -378,8 +370,6 @@ class _Tab:
         with self._writing, self._studio.only_writer():
             try:
                 token = write(path)
-            except ChangedTableError as error:
-                raise StaleError(str(error)) from None
             except WorkspaceError as error:  # a row of the page, or of the file by its line
                 raise AliceError(str(error)) from None
         self._studio.publish("picks", {"file": name, "token": token})
@@ -394,19 +384,14 @@ class _Tab:
     def _has_model(self) -> bool:
         return all(self._studio.workspace.has(path) for path in _MODEL)
 
-    def _read_model(self) -> _Model:
+    def _read_model(self) -> _OpenModel:
         workspace = self._studio.workspace
         if not self._has_model():
             raise AliceError("no model yet: run 'alice-survey reconstruct' first")
-        with self._lock:
-            dense = [p for p in ("dense/dem.tif",) if workspace.has(p)]
-            tokens = tuple(workspace.token(path) for path in (*_MODEL, *dense))
-            if self._model is None or self._model[0] != tokens:
-                self._model = tokens, _Model(self._studio)
-            return self._model[1]
+        return self._model.of(workspace.state((*_MODEL, "dense/dem.tif")))
 
 
-def _unhidden(model: _Model, place: SurfacePlace) -> tuple[list[Sight], int]:
+def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]:
     """Pictures that see a place with nothing between, and how many it is hidden from."""
     found = model.pictures.seeing(place.point, place.normal)[: 4 * _MOST_SEEING]
     centres = np.array([model.pictures.centres[model.pictures.row(s.image)] for s in found])

@@ -1,12 +1,9 @@
 """The tab Plan: settings and shapes as they are, planned again while they change, and saved."""
 
 import base64
-import hashlib
-import io
 import math
 import tempfile
 import threading
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,13 +17,21 @@ from pydantic_core import to_json
 
 from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
+from alice_survey.base.edited_files import check_token, content_of, content_token
 from alice_survey.base.errors import AliceError, ConfigError, PlanError, collected_by, heard
 from alice_survey.base.executor import local_executor
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
 from alice_survey.base.trajectory import read_columns, read_track
 from alice_survey.kit.document import PictureLayer
 from alice_survey.stages import spec
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import (
+    Call,
+    Content,
+    Endpoint,
+    Studio,
+    scale_json,
+    zipped,
+)
 from alice_survey.studio.newest import Newest, SupersededError
 from alice_survey.studio.paths import RefusedError
 from alice_survey.studio.setting_limits import setting_limits
@@ -54,10 +59,6 @@ _MOST_MOMENTS = 4000
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 _JSON = "application/json"
-_CHANGED = (
-    "survey.toml was changed meanwhile, by another page or by hand: load it again; what you "
-    "changed here is kept in the page"
-)
 
 
 class PlanRequest(Config):
@@ -112,7 +113,7 @@ class _PlanTab:
             text = data.decode("utf-8")
         except UnicodeDecodeError:
             raise ConfigError(f"{self.path}: is not text") from None
-        return _Settings(text, hashlib.sha256(data).hexdigest()[:32])
+        return _Settings(text, content_token(data))
 
     def draft(self, request: PlanRequest) -> Draft:
         """The settings with a page's changes."""
@@ -259,8 +260,7 @@ class _PlanTab:
         folder = self.studio.workspace.folder
         with self.saving, _quiet():
             with self.studio.only_writer():
-                if request.token != self.settings().token:
-                    raise StaleError(_CHANGED)
+                check_token(SETTINGS, content_of(self.path), request.token or "")
                 draft = self.draft(request)
                 if not request.token:
                     init_survey(folder)
@@ -294,11 +294,8 @@ class _PlanTab:
             return Content(
                 data=paths[0].read_bytes(), kind="application/octet-stream", name=names[0]
             )
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in paths:
-                archive.write(path, path.relative_to(folder / "exports"))
-        return Content(data=packed.getvalue(), kind="application/zip", name=f"{name}.zip")
+        exports = folder / "exports"
+        return zipped(f"{name}.zip", {str(one.relative_to(exports)): one for one in paths})
 
 
 def _json(found: Mapping[str, Any]) -> Content:
@@ -363,18 +360,14 @@ def _datum(datum: Datum) -> dict[str, float]:
 def _layer(layer: PictureLayer) -> dict[str, Any]:
     """A picture for the map, and what its colours mean."""
     [png] = layer.tiles.values()
-    scale = layer.scale
     return {
         "png": f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}",
         "north": layer.north_m,
         "west": layer.west_m,
         "pixel": layer.pixel_m,
         "title": layer.title,
-        "scale": None if scale is None else {
-            "label": scale.label, "low": scale.low, "high": scale.high,
-            "colours": list(scale.colours),
-        },
-    }  # fmt: skip
+        "scale": scale_json(layer),
+    }
 
 
 def _flown(folder: Path, config: SurveyConfig) -> dict[str, Any]:

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
-from alice_survey.base.errors import AliceError
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 from alice_survey.report.held import Held
 from alice_survey.report.run import survey_map
 from alice_survey.report.shapes import shape_layers
 from alice_survey.studio.chart import CHART
-from alice_survey.studio.endpoints.base import Call, Endpoint, Studio
-from alice_survey.studio.layers import ChangedError
+from alice_survey.studio.endpoints.base import Call, Endpoint, Studio, scale_json
 
 TABS = ("plan", "model", "pictures", "annotate", "compare", "follow", "run")
 _PRODUCTS = {
@@ -60,13 +58,8 @@ class _Shell:
 
     def map(self, call: Call) -> dict[str, Any]:
         """The layers of what the workspace holds, as the map's script takes them."""
-        before = self.studio.workspace.state(())
-        try:
+        with self.studio.workspace.unchanged():
             return self._map()
-        except (AliceError, FileNotFoundError):
-            if self.studio.workspace.state(()) == before:
-                raise
-            raise ChangedError from None
 
     def _map(self) -> dict[str, Any]:
         held = Held.of(self.studio.workspace.folder)
@@ -86,7 +79,6 @@ class _Shell:
 
 def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     """What the list of layers says of one."""
-    scale = layer.scale if isinstance(layer, PictureLayer) else None
     is_base = isinstance(layer, PictureLayer) and layer.base
     return {
         "title": layer.title,
@@ -94,11 +86,8 @@ def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
         "shown": layer.shown,
         "group": "Picture" if is_base else "Under it" if layer.name == CHART else layer.group,
         "under": layer.name == CHART,
-        "scale": None if scale is None else {
-            "label": scale.label, "low": scale.low, "high": scale.high,
-            "colours": list(scale.colours),
-        },
-    }  # fmt: skip
+        "scale": scale_json(layer) if isinstance(layer, PictureLayer) else None,
+    }
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

@@ -11,10 +11,11 @@ from pydantic import Field
 
 from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import Config, load_config
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError, WorkspaceError
 from alice_survey.base.settings_text import Values
 from alice_survey.studio.commands import ImportImagesArguments
-from alice_survey.studio.endpoints.base import Call, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.studio.folders import Folders
 from alice_survey.survey import init_survey
 from missions.areas.files import SUFFIXES

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from alice_survey.base.contents import shown
+from alice_survey.base.contents import first_fault, shown
 from alice_survey.base.errors import WorkspaceError
 from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.keyhole import joined, parted
@@ -78,7 +78,7 @@ class Reading:
                 Annotation(shape=backdrop.from_pixels(shape), image=backdrop.image, **values)
             )
         except ValidationError as error:
-            raise WorkspaceError(f"{where}: {_first(error)}") from None
+            raise WorkspaceError(f"{where}: {first_fault(error)}") from None
 
     @property
     def values(self) -> AnnotationSet:
@@ -122,7 +122,7 @@ def shape_of(
             {"kind": kind, "points": outer, "holes": holes, "radius": radius}
         )
     except ValidationError as error:
-        raise WorkspaceError(f"{where}: {_first(error)}") from None
+        raise WorkspaceError(f"{where}: {first_fault(error)}") from None
 
 
 def pairs(where: str, flat: Any) -> list[Place]:
@@ -231,10 +231,3 @@ def placed(
 
 def _open(ring: Sequence[Place]) -> Sequence[Place]:
     return ring[:-1] if len(ring) > 1 and tuple(ring[0]) == tuple(ring[-1]) else ring
-
-
-def _first(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
-    text = first["msg"].removeprefix("Value error, ")
-    where = ".".join(str(name) for name in first["loc"])
-    return f"{where}: {text}" if where else text

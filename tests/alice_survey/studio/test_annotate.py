@@ -43,7 +43,7 @@ def test_what_is_put_is_there_and_a_second_page_does_not_overwrite_it(server: Se
     first = change(server, "", labels=LABELS, put=[square("a")])
     assert first.status == 200
     late = change(server, "", put=[square("b")])
-    assert late.status == 409 and "another writer" in late.json["error"]
+    assert late.status == 409 and "changed meanwhile" in late.json["error"]
     token = first.json["token"]
     second = change(server, token, put=[square("a", 0.2), square("b", label="sand")])
     found = ask(server, "/api/annotations").json

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 from pydantic import BaseModel
 
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError, WorkspaceError
 from alice_survey.studio import app as studio_app
-from alice_survey.studio.endpoints.base import Call, Content, Endpoint, StaleError, Studio
+from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.studio.server import Server
 from tests.alice_survey.report.tiny import tiny_workspace
 from tests.alice_survey.studio.client import ask, call, serving

@@ -18,7 +18,7 @@ from alice_survey.studio.server import Server
 from camera_calib.rig import read_rig
 from reconstruct.adjustment.uncertainty import read_uncertainty
 from reconstruct.evaluate.truth import read_true_poses, surface_depth
-from reconstruct.picking.lengths import Block
+from reconstruct.picking.lengths import StationBlock
 from reconstruct.picking.registered import RegisteredPictures
 from tests.alice_survey.studio.client import Reply, ask, call, serving
 
@@ -153,7 +153,7 @@ def test_matches_err_as_they_state(server: Server, workspace: Path) -> None:
 def test_stations_around_a_spot_are_known_as_the_model_states(workspace: Path) -> None:
     """A block of all stations has the covariance that the adjustment wrote."""
     pictures = RegisteredPictures.read(workspace)
-    block = Block.around(workspace, pictures, np.unique(pictures.station))
+    block = StationBlock.around(workspace, pictures, np.unique(pictures.station))
     stated = read_uncertainty(workspace / "sparse" / "covariance.npz")
     for row, station in enumerate(stated.stations.tolist()):
         where = np.zeros((6, len(block.numbers), 6))

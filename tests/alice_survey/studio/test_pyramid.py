@@ -10,8 +10,9 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.transform import Affine
 
+from alice_survey.base.edited_files import StaleError
 from alice_survey.report.colours import TILE_PX, coloured, limits_of, number_rasters
-from alice_survey.studio.layers import ChangedError, Layers, Pyramid
+from alice_survey.studio.layers import Layers, Pyramid
 from alice_survey.studio.paths import Workspace
 from tests.alice_survey.report.tiny import tiny_workspace
 
@@ -174,7 +175,7 @@ def test_encoded_tiles_show_the_rasters_own_pixels(folder: Path) -> None:
         assert abs(int(red) - (2 * TILE_PX + row) % 256) < 12
         assert abs(int(green) - (TILE_PX + column) % 256) < 12
     assert layers.tile("mosaic", 2, 1, 2, token) == (content, token)
-    with pytest.raises(ChangedError):
+    with pytest.raises(StaleError):
         layers.tile("mosaic", 2, 1, 2, "another")
     for missing in ((3, 0, 0), (2, 3, 0), (2, 0, 3), (-1, 0, 0)):
         with pytest.raises(FileNotFoundError):

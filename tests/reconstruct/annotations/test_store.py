@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from rasterio.transform import Affine as GridAffine
 
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import ConfigError, WorkspaceError
 from alice_survey.base.frames import Datum
 from reconstruct.annotations.store import (
     FILE,
-    OtherVersionError,
     change_annotations,
     geojson,
     read_annotations,
     token_of,
 )
-from reconstruct.annotations.table import KnownGround, Measured, quadrats
+from reconstruct.annotations.table import KnownGround, MeasuredMark, quadrats
 from reconstruct.annotations.values import Annotation, AnnotationSet, DrawnShape, Label, with_labels
 from reconstruct.views.model import WorldFrame
 
@@ -48,7 +48,7 @@ def test_what_is_written_is_there_and_a_second_writer_is_refused(tmp_path: Path)
 
     second = change_annotations(tmp_path, FRAME, add, first)
     assert second != first
-    with pytest.raises(OtherVersionError):
+    with pytest.raises(StaleError):
         change_annotations(tmp_path, FRAME, lambda _: some(), first)
     assert len(read_annotations(tmp_path, FRAME).annotations) == 2
 
@@ -85,8 +85,8 @@ def test_a_gis_sees_them_where_they_are() -> None:
     assert feature["properties"]["label"] == "coral"
 
 
-def measured(one: Annotation, sigma: float = 0.01) -> Measured:
-    return Measured(annotation=one, shape=one.shape, area=one.shape.area, sigma=sigma,
+def measured(one: Annotation, sigma: float = 0.01) -> MeasuredMark:
+    return MeasuredMark(annotation=one, shape=one.shape, area=one.shape.area, sigma=sigma,
                     length=float("nan"))  # fmt: skip
 
 

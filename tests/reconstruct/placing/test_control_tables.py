@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import WorkspaceError
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.control_tables import (
-    ChangedTableError,
     save_control,
     save_picks,
     table_token,
@@ -62,7 +62,7 @@ def test_of_two_writers_the_second_is_told(tmp_path: Path) -> None:
     token = save_picks(path, "", [pick("a.png", "p")], {"p"})
     before = path.read_bytes()
 
-    with pytest.raises(ChangedTableError):
+    with pytest.raises(StaleError):
         save_picks(path, "", [pick("b.png", "q")], {"q"})
     assert path.read_bytes() == before
 
