@@ -2,7 +2,8 @@
 
 const RIMMED = 20;
 
-/* Metres east and north stand where Leaflet has longitude and latitude. Returns Leaflet's map and
+/* Metres east and north stand where Leaflet has longitude and latitude. `data.room()`, if there is one,
+   returns what Leaflet is to leave free where all is shown. Returns Leaflet's map and
    what changes it: `put` and `remove` a layer that is described as in `data.layers`, `show` one,
    `fit` all, `moreAt` a place in the line below the map, `take` clicks for a tool and `release`. */
 function startMap(data, root) {
@@ -22,7 +23,7 @@ function startMap(data, root) {
   map.createPane("over").style.zIndex = 300;
   const layers = new Map();
   let whole = null;
-  const fit = (animate) => map.fitBounds(whole, {padding: [24, 24], animate});
+  const fit = (animate) => map.fitBounds(whole, {padding: [24, 24], ...data.room?.(), animate});
 
   /* What the map holds: west, south, east and north limits. */
   function extend([west, south, east, north]) {
@@ -259,7 +260,7 @@ function startMap(data, root) {
   new ResizeObserver(() => map.invalidateSize({pan: false})).observe(box);
   root.dataset.ready = "";
   return {
-    leaflet: map, layers, put, remove, show, extend, fit: () => fit(!still), take, release,
+    leaflet: map, layers, put, remove, show, extend, fit: (animate = !still) => fit(animate), take, release,
     data, moreAt: (add) => more.push(add), refresh: readCentre,
   };
 }

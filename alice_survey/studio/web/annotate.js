@@ -1,38 +1,50 @@
 /* The Annotate tab: labels, annotations on the mosaic, their areas, and other tools' files. */
 
-import {attempt, button, download, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
-import {annotationsOn, drawing} from "./annotate_map.js";
-import {shownPictures} from "./annotate_pictures.js";
+import {attempt, button, download, el, field, get, on, save as saveFile, say, send, table} from "./core.js";
+import {BLUE} from "./palette.js";
+import {Wall} from "./picture_views.js";
+import {canRedo, canUndo, current, record, redo, startHistory, undo} from "./undo.js";
+import {vertexHandles} from "./vertices.js";
+import {counted, csv, number, withSigma} from "./words.js";
+import {annotationsOn} from "./annotate_map.js";
+import {isArea, targetOf} from "./annotate_shapes.js";
+import {drawingTool} from "./drawing.js";
+import {missing} from "./missing.js";
 
 const MOST_ROWS = 100;
+const NOTHING = {labels: [], annotations: new Map()};
 const KINDS = {point: "Point", polyline: "Line", polygon: "Polygon", rectangle: "Rectangle"};
 
 export function tab(studio) {
+  const unit = studio.state.unit;
+  const square = unit + "²";
   let token = "";
-  let labels = [];
-  let annotations = new Map();
+  let history = startHistory(NOTHING);
+  let stored = NOTHING;  /* what the server has */
   let colours = [];
   let formats = [];
-  let pixel = 0;
   let marks = new Map();
   let label = "";
   let chosen = null;
   let tool = null;
-  let loaded = false;
+  let pixel = 0;
+  let [loaded, entered] = [false, false];
   const hidden = new Set();
-  const past = [];
-  const future = [];
-  const unit = studio.state.unit;
-  const square = unit + "²";
   const drawn = annotationsOn(studio, choose);
+  const drawing = drawingTool(studio, "annotate");
+  const handles = vertexHandles(studio.map.leaflet, "annotate", {
+    unit, changed: (next, tag) => (next ? put(next, tag) : remove(chosen)), moving: redraw,
+    left: () => { choose(null); document.getElementById("map-canvas").focus(); },
+  });
+  const now = () => current(history);
 
   /* ---- What the server has ---- */
 
   async function load() {
     const all = await get("/api/annotations");
-    ({token, labels, colours, formats, pixel} = all);
-    annotations = new Map(all.annotations.map((one) => [one.id, one]));
-    if (!labels.some((one) => one.id === label)) label = labels[0]?.id || "";
+    ({token, colours, formats, pixel} = all);
+    stored = {labels: all.labels, annotations: new Map(all.annotations.map((one) => [one.id, one]))};
+    history = startHistory(stored);
     loaded = true;
     await measure();
     render();
@@ -41,70 +53,55 @@ export function tab(studio) {
   async function measure() {
     marks = new Map();
     cover.replaceChildren();
-    if (!annotations.size || !studio.state.has.mosaic) return;
+    if (!stored.annotations.size || !studio.state.has.mosaic) return;
     const found = await attempt(() => get("/api/annotations/table", quadrat.value ? {quadrat: quadrat.value} : {}));
     if (!found) return;
     found.marks.forEach((mark) => marks.set(mark.id, mark));
     cover.replaceChildren(coverTable(found), ...found.not_counted.map((line) => el("p", {class: "warn"}, "Not counted: " + line)));
   }
 
-  /* Each change knows the way back. */
-  function changeOf(put, gone, newLabels) {
-    const before = {put: [], delete: [], labels: newLabels ? labels : null};
-    put.forEach((one) => {
-      if (annotations.has(one.id)) before.put.push(annotations.get(one.id));
-      else before.delete.push(one.id);
-    });
-    gone.forEach((id) => before.put.push(annotations.get(id)));
-    return [{put, delete: gone, labels: newLabels || null}, before];
-  }
-
-  async function write(change) {
-    const answer = await send("/api/annotations/change", {token, ...change});
-    ({token} = answer);
-    if (change.labels) labels = change.labels;
-    change.delete.forEach((id) => annotations.delete(id));
-    change.put.forEach((one) => annotations.set(one.id, one));
-    if (chosen && !annotations.has(chosen)) chosen = null;
-    await measure();
-    render();
-  }
-
-  /* One change after the other: each needs the token that the one before returned. */
+  /* One request after the other: each needs the token that the one before returned. */
   let waiting = Promise.resolve();
   const inTurn = (work) => { waiting = waiting.then(() => attempt(work)); return waiting; };
 
-  function apply(put, gone = [], newLabels = null) {
+  function edit(state, tag = "") {
+    history = record(history, {...now(), ...state}, tag, Date.now());
+    return store();
+  }
+  const put = (one, tag) => edit({annotations: new Map(now().annotations).set(one.id, one)}, tag);
+  function remove(id) {
+    const annotations = new Map(now().annotations);
+    annotations.delete(id);
+    return edit({annotations});
+  }
+
+  /* Shown at once, and written when it is its turn; where that fails, what the server has is shown. */
+  function store() {
+    render();
     return inTurn(async () => {
-      const [change, before] = changeOf(put, gone, newLabels);
-      await write(change);
-      past.push([change, before]);
-      future.length = 0;
+      const next = now();
+      if (next === stored) return;
+      try {
+        ({token} = await send("/api/annotations/change", {token, ...changeBetween(stored, next)}));
+      } catch (fault) {
+        await load();
+        throw fault;
+      }
+      stored = next;
+      await measure();
       render();
     });
   }
 
-  const step = (from, to, which) => inTurn(async () => {
-    const pair = from.pop();
-    if (!pair) return;
-    try {
-      await write(pair[which]);
-    } catch (fault) {
-      from.push(pair);
-      throw fault;
-    }
-    to.push(pair);
-    say(which ? "Taken back" : "Done again");
-    render();
-  });
-  const undo = () => step(past, future, 1);
-  const redo = () => step(future, past, 0);
+  function step(way, text) {
+    history = way(history);
+    say(text);
+    return store();
+  }
 
   on("annotations", (data) => {
     inTurn(async () => {
       if (!loaded || data.token === token) return;
-      past.length = 0;
-      future.length = 0;
       await load();
       say("The annotations were changed by another page: these are the new ones");
     });
@@ -115,11 +112,12 @@ export function tab(studio) {
   const labelList = el("div", {role: "radiogroup", "aria-label": "Label of what is drawn next"});
   const name = el("input", {type: "text", maxlength: 200, autocomplete: "off"});
   const aphia = el("input", {type: "text", inputmode: "numeric", autocomplete: "off"});
-  const colour = el("input", {type: "color", value: "#0072b2"});
+  const colour = el("input", {type: "color", value: BLUE});
   const addLabel = el("form", {onsubmit(event) {
     event.preventDefault();
     const id = name.value.trim().split(/\s*>\s*/).filter(Boolean).join(" > ");
     if (!id) return say("A label needs a name", "error");
+    const {labels} = now();
     if (labels.some((one) => one.id === id)) return say("There is a label " + id + " already", "error");
     const digits = aphia.value.trim();
     if (digits && !/^[1-9][0-9]*$/.test(digits)) return say("An AphiaID is a whole number", "error");
@@ -127,13 +125,14 @@ export function tab(studio) {
     label = id;
     name.value = "";
     aphia.value = "";
-    return apply([], [], [...labels, made]).then(() => { colour.value = colours[labels.length % colours.length]; });
+    colour.value = colours[(labels.length + 1) % colours.length];
+    return edit({labels: [...labels, made]});
   }}, field("Name", name, "Parts of a tree with > between: Porifera > Axinella"),
   el("div", {class: "row"}, field("AphiaID", aphia), field("Colour", colour)),
   el("button", {type: "submit"}, "Add the label"));
 
   function codeOf(id) {
-    const taken = new Set(labels.map((one) => one.code));
+    const taken = new Set(now().labels.map((one) => one.code));
     const word = id.split(" > ").pop().replace(/[^\p{L}\p{N}]/gu, "").toUpperCase() || "X";
     const tries = [word[0], ...[...word.slice(1)].map((c) => word[0] + c), ...Array.from({length: 99}, (_, n) => word[0] + (n + 1))];
     return tries.find((code) => !taken.has(code)) || "";
@@ -141,7 +140,8 @@ export function tab(studio) {
 
   function labelRows() {
     const counts = new Map();
-    annotations.forEach((one) => counts.set(one.label, (counts.get(one.label) || 0) + 1));
+    const {labels} = now();
+    now().annotations.forEach((one) => counts.set(one.label, (counts.get(one.label) || 0) + 1));
     return labels.map((one) => {
       const radio = el("input", {type: "radio", name: "annotate-label", value: one.id, checked: one.id === label});
       radio.addEventListener("change", () => { label = one.id; });
@@ -152,13 +152,13 @@ export function tab(studio) {
         redraw();
       });
       const count = counts.get(one.id) || 0;
-      const gone = button("×", () => apply([], [], labels.filter((other) => other !== one)), {
-        "aria-label": "Remove the label " + one.id, disabled: count > 0, title: count ? "It is in use" : "Remove",
+      const gone = button("×", () => edit({labels: labels.filter((other) => other !== one)}), {
+        "aria-label": "Delete the label " + one.id, disabled: count > 0, title: count ? "It is in use" : "Delete",
       });
-      return el("div", {style: {display: "flex", alignItems: "center", gap: "8px", margin: "4px 0"}},
-        shown, el("label", {style: {display: "flex", alignItems: "center", gap: "8px", flex: "1", minWidth: "0"}},
+      return el("div", {class: "option"},
+        shown, el("label", {class: "option"},
           radio, el("span", {class: "swatch", style: {background: one.colour}}), el("b", {}, one.code),
-          el("span", {style: {overflowWrap: "anywhere"}}, one.id + " (" + count + ")")), gone);
+          el("span", {}, one.id + " (" + count + ")")), gone);
     });
   }
 
@@ -168,66 +168,71 @@ export function tab(studio) {
     const made = button(text, () => take(kind), {"aria-pressed": "false", "data-kind": kind});
     return made;
   });
-  const finish = button("Finish", () => tool?.finish(), {disabled: true});
 
   function take(kind) {
-    const same = tool && tool.kind === kind;
+    const isSame = tool === kind;
     studio.map.release();
-    if (same) return;
+    if (isSame) return;
     if (!label) {
       say("Add a label first: what is drawn carries it", "warn");
       return;
     }
-    tool = drawing(studio, kind, (shape) => {
-      const id = Array.from(crypto.getRandomValues(new Uint8Array(6)), (v) => v.toString(16).padStart(2, "0")).join("");
-      chosen = id;
-      apply([{
-        id, label, shape, image: null, author: author.value.trim(),
-        time_utc: new Date().toISOString().replace(/\.\d+/, ""), note: "", attributes: {},
-      }]);
-    }, () => {
-      tool = null;
-      press();
-    });
-    tool.kind = kind;
     choose(null);
-    studio.map.take(tool);
+    const {colour: of} = now().labels.find((one) => one.id === label);
+    drawing.begin({
+      kind: kind === "polyline" ? "line" : kind, colour: of, again: true,
+      done(points) {
+        const id = Array.from(crypto.getRandomValues(new Uint8Array(6)), (v) => v.toString(16).padStart(2, "0")).join("");
+        chosen = id;
+        put({
+          id, label, shape: {kind, points: points.map(([n, e]) => [e, n]), holes: [], radius: null}, image: null,
+          author: author.value.trim(), time_utc: new Date().toISOString().replace(/\.\d+/, ""), note: "", attributes: {},
+        });
+      },
+      ended() {
+        tool = null;
+        press();
+      },
+    });
+    tool = kind;
     press();
-    say("Click on the map, or move it with the arrow keys and take its middle with Enter; Escape ends");
   }
 
   function press() {
-    tools.forEach((one) => one.setAttribute("aria-pressed", String(tool?.kind === one.dataset.kind)));
-    finish.disabled = !["polygon", "polyline"].includes(tool?.kind);
+    tools.forEach((one) => one.setAttribute("aria-pressed", String(tool === one.dataset.kind)));
+    redraw();
   }
 
   /* ---- One annotation ---- */
 
   const card = el("section", {"aria-label": "Chosen annotation"});
-  const pictures = el("div", {});
+  let wall = null;
 
-  function choose(id, keep = false) {
+  function choose(id) {
     chosen = id;
-    if (!keep) pictures.replaceChildren();
+    wall?.hide();
     redraw();
     render();
   }
 
-  function edited(shape, at) {
-    const one = annotations.get(chosen);
-    if (!one) return;
-    apply([{...one, shape}]).then(() => drawn.focus(at));
+  async function showPictures(one) {
+    const {pictures} = await get("/api/annotations/" + one.id + "/pictures");
+    if (!pictures.length) throw new Error("no registered picture shows it");
+    wall = wall || new Wall();
+    wall.show(counted(pictures.length, "picture that shows it best", "pictures that show it best"), pictures.map(({image, rings, sigma_px}) => ({
+      name: image, rings, closed: isArea(one.shape), x: 0, y: 0, about: "outline known to " + number(sigma_px, "px", 2),
+    })));
   }
 
   function cardOf() {
-    const one = annotations.get(chosen);
+    const one = now().annotations.get(chosen);
     if (!one) return [];
     const mark = marks.get(one.id);
-    const choice = el("select", {}, labels.map((other) => el("option", {value: other.id}, other.id)));
+    const choice = el("select", {}, now().labels.map((other) => el("option", {value: other.id}, other.id)));
     choice.value = one.label;
-    choice.addEventListener("change", () => apply([{...one, label: choice.value}]));
+    choice.addEventListener("change", () => put({...one, label: choice.value}));
     const note = el("input", {type: "text", value: one.note, maxlength: 1000});
-    note.addEventListener("change", () => apply([{...one, note: note.value}]));
+    note.addEventListener("change", () => put({...one, note: note.value}));
     const facts = [["Where", one.image || "on the mosaic"], ["Shape", one.shape.kind]];
     if (mark && mark.area !== null) facts.push(["Area", withSigma(mark.area, mark.sigma, square)]);
     if (mark && mark.length !== null) facts.push(["Length", number(mark.length, unit, 4)]);
@@ -237,9 +242,9 @@ export function tab(studio) {
     return [
       el("h2", {}, "Chosen"), field("Label", choice), field("Note", note), table("What is known of it", [], facts),
       el("p", {class: "buttons"},
-        button("Show in pictures", () => attempt(async () => pictures.replaceChildren(...await shownPictures(one))), {disabled: !studio.state.has.dem}),
+        button("Show in pictures", () => attempt(() => showPictures(one)), {disabled: !studio.state.has.dem}),
         button("Go there", () => go(one)),
-        button("Delete", () => apply([], [one.id])),
+        button("Delete", () => remove(one.id)),
         button("Close", () => choose(null))),
     ];
   }
@@ -267,15 +272,15 @@ export function tab(studio) {
 
   function wanted() {
     const text = words.value.trim().toLowerCase();
-    return [...annotations.values()].filter((one) => !hidden.has(one.label)
+    return [...now().annotations.values()].filter((one) => !hidden.has(one.label)
       && (!text || [one.label, one.note, one.author, one.image || ""].some((of) => of.toLowerCase().includes(text))));
   }
 
   function rowsOf() {
     const found = wanted();
-    const of = new Map(labels.map((one) => [one.id, one]));
+    const of = new Map(now().labels.map((one) => [one.id, one]));
     const shown = found.slice(0, MOST_ROWS);
-    if (!shown.length) return [el("p", {class: "note"}, annotations.size ? "None of these." : "Nothing is annotated yet.")];
+    if (!shown.length) return [el("p", {class: "note"}, now().annotations.size ? "None of these." : "Nothing is annotated yet.")];
     const lines = shown.map((one) => {
       const mark = marks.get(one.id);
       const size = mark && mark.area !== null ? withSigma(mark.area, mark.sigma)
@@ -286,7 +291,7 @@ export function tab(studio) {
       return [name, one.image === null ? one.shape.kind : one.shape.kind + ", picture", size];
     });
     const more = found.length > shown.length ? el("p", {class: "note"}, "The first " + MOST_ROWS + " of " + found.length + ".") : null;
-    return [table(found.length + " annotations", ["Label", "Shape", "Area, " + square], lines), more].filter(Boolean);
+    return [table(counted(found.length, "annotation"), ["Label", "Shape", "Area, " + square], lines), more].filter(Boolean);
   }
 
   function coverTable(found) {
@@ -295,14 +300,13 @@ export function tab(studio) {
       ...(side ? [row.quadrat] : []), row.label, String(row.count), withSigma(row.area, row.sigma),
       withSigma(100 * row.cover, 100 * row.cover_sigma, "%"),
     ]);
-    const csv = () => {
+    const save = () => {
       const keys = Object.keys(found.rows[0]);
-      const cell = (value) => (value === null ? "" : /[",\n]/.test(value) ? '"' + String(value).replaceAll('"', '""') + '"' : String(value));
-      download("cover.csv", [keys.join(","), ...found.rows.map((row) => keys.map((key) => cell(row[key])).join(","))].join("\n") + "\n", "text/csv");
+      download("cover.csv", csv(keys, found.rows.map((row) => keys.map((key) => row[key]))), "text/csv");
     };
     return el("div", {}, el("div", {style: {overflowX: "auto"}, tabindex: "0", role: "region", "aria-label": "What labels cover"},
       table("Of " + number(found.known, square) + " known ground", [...(side ? ["Quadrat"] : []), "Label", "Count", "Area, " + square, "Cover"], lines)),
-    el("p", {class: "buttons"}, button("Save as CSV", csv)));
+    el("p", {class: "buttons"}, button("Export CSV", save)));
   }
 
   /* ---- Files ---- */
@@ -313,60 +317,56 @@ export function tab(studio) {
     const [one] = file.files;
     if (!one) throw new Error("Choose a file first");
     const answer = await send("/api/annotations/import", one, {params: {format: format.value, token}});
-    past.length = 0;
-    future.length = 0;
     await load();
     say(answer.text);
     file.value = "";
   }));
   const save = el("p", {class: "buttons"});
 
-  async function give(kind) {
-    const response = await fetch("/api/annotations/export/" + kind);
-    if (!response.ok) throw new Error((await response.json()).error);
-    const named = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") || "");
-    download(named ? decodeURIComponent(named[1]) : "annotations", await response.blob(), response.headers.get("Content-Type"));
-  }
-
   /* ---- The panel ---- */
 
   const author = el("input", {type: "text", maxlength: 200, autocomplete: "name", value: localStorage.getItem("alice-survey author") || ""});
   author.addEventListener("change", () => localStorage.setItem("alice-survey author", author.value.trim()));
-  const back = button("Undo", undo);
-  const forth = button("Redo", redo);
-  const note = el("p", {class: "note"});
-  const panel = el("div", {},
-    note,
+  const back = button("Undo", () => step(undo, "Undone"), {title: "Ctrl+Z"});
+  const forth = button("Redo", () => step(redo, "Done again"), {title: "Ctrl+Shift+Z"});
+  const content = el("div", {},
     el("h2", {}, "Labels"), labelList, el("details", {}, el("summary", {}, "Add a label"), addLabel),
-    el("h2", {}, "Draw"), el("p", {class: "buttons"}, tools, finish, back, forth),
+    el("h2", {}, "Draw"), el("p", {class: "buttons"}, tools, back, forth), drawing.element,
     el("details", {}, el("summary", {}, "Your name"), field("Goes with what you draw", author)),
-    card, pictures,
+    card,
     el("h2", {}, "Annotations"), field("Filter", words, "Labels, notes, names, pictures"), rows,
     el("h2", {}, "Cover"), field("Quadrats of side, " + unit, quadrat, "Empty: the whole mosaic"), cover,
     el("details", {}, el("summary", {}, "Files of other tools"), field("Tool", format), field("File", file), el("p", {class: "buttons"}, bring),
-      el("h3", {}, "Save for"), save));
+      el("h3", {}, "Export for"), save));
+  const lack = missing(studio, content, () => (studio.state.has.mosaic ? null
+    : ["There is no mosaic to annotate yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
+  const panel = el("div", {}, lack.element, content);
 
-  function redraw() {
+  /* With one annotation as it is while it is dragged. */
+  function redraw(moved = null) {
+    const {labels, annotations} = now();
     const numbers = new Map(labels.map((one, n) => [one.id, n]));
-    const all = [...annotations.values()].filter((one) => !hidden.has(one.label)).map((one) => ({
+    const as = (one) => (moved && one.id === moved.id ? moved : one);
+    const all = [...annotations.values()].map(as).filter((one) => !hidden.has(one.label)).map((one) => ({
       annotation: one, label: labels[numbers.get(one.label)], number: numbers.get(one.label), shape: shapeOf(one),
     })).filter((mark) => mark.shape);
     drawn.draw(all, chosen);
-    const one = annotations.get(chosen);
-    drawn.edit(one && one.image === null && studio.mayWrite() ? one.shape : null, pixel || 0.001, edited);
+    const one = annotations.has(chosen) && as(annotations.get(chosen));
+    handles.show(entered && one && one.image === null && !tool && studio.mayWrite() ? targetOf(one) : null);
   }
 
   function render() {
-    note.textContent = studio.state.has.mosaic ? "" : "There is no mosaic to annotate yet.";
+    const {labels, annotations} = now();
+    if (!labels.some((one) => one.id === label)) label = labels[0]?.id || "";
+    if (!annotations.has(chosen)) chosen = null;
     const focused = document.activeElement?.value;
     labelList.replaceChildren(...labelRows());
     if (!labels.length) labelList.append(el("p", {class: "note"}, "No labels yet: add one, or import a species list."));
     card.replaceChildren(...cardOf());
     rows.replaceChildren(...rowsOf());
     format.replaceChildren(...formats.map((one) => el("option", {value: one.name}, one.title)));
-    save.replaceChildren(...[...formats, {name: "geojson", title: "GeoJSON"}].map((one) => button(one.title, () => attempt(() => give(one.name)), {"data-export": one.name, disabled: !annotations.size})));
-    back.disabled = !past.length;
-    forth.disabled = !future.length;
+    save.replaceChildren(...[...formats, {name: "geojson", title: "GeoJSON"}].map((one) => button(one.title, () => attempt(() => saveFile("/api/annotations/export/" + one.name, "annotations")), {"data-export": one.name, disabled: !annotations.size})));
+    [back.disabled, forth.disabled] = [!canUndo(history), !canRedo(history)];
     const writes = studio.mayWrite();
     [...tools, bring, ...addLabel.querySelectorAll("button")].forEach((one) => { one.disabled = !writes; });
     if (focused) labelList.querySelector(`input[type=radio][value="${CSS.escape(focused)}"]`)?.focus();
@@ -376,16 +376,30 @@ export function tab(studio) {
   return {
     name: "annotate", title: "Annotate", panel,
     enter() {
+      entered = true;
+      if (!lack.show()) return;
       drawn.show(true);
       if (!loaded) inTurn(load);
       else redraw();
     },
     leave() {
+      entered = false;
       drawn.show(false);
+      handles.show(null);
+      wall?.hide();
     },
     keys: {
-      "Ctrl+z": undo, "Ctrl+y": redo,
-      Delete: () => { if (chosen) apply([], [chosen]); },
+      "Ctrl+z": () => step(undo, "Undone"), "Ctrl+y": () => step(redo, "Done again"), "Ctrl+Z": () => step(redo, "Done again"),
+      Delete: () => chosen && remove(chosen),
     },
+  };
+}
+
+/* What to put, delete and name for the second state to follow on the first. */
+function changeBetween(from, to) {
+  return {
+    put: [...to.annotations.values()].filter((one) => from.annotations.get(one.id) !== one),
+    delete: [...from.annotations.keys()].filter((id) => !to.annotations.has(id)),
+    labels: from.labels === to.labels ? null : to.labels,
   };
 }

@@ -1,17 +1,19 @@
 /* The Compare tab: another survey next to this one or swiped over it, and what has changed. */
 
-import {attempt, button, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
+import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {showSteps} from "./job_progress.js";
+import {missing} from "./missing.js";
+import {BLUE, RED} from "./palette.js";
+import {fixed, number, withSigma} from "./words.js";
 import {boundsOf, comparedMaps} from "./compare_maps.js";
 
-const GAINED = "#0072b2";
-const LOST = "#d55e00";
 const NEAR_M = 0.5;
 
 export function tab(studio) {
   const maps = comparedMaps(studio, (share) => { swipe.value = String(Math.round(100 * share)); });
   let other = null;
   let results = [];
-  let running = false;
+  let job = null;  /* that runs in this survey */
   let looked = false;
 
   /* ---- The other survey ---- */
@@ -40,7 +42,7 @@ export function tab(studio) {
       render();
       show();
     });
-    return el("label", {style: {display: "flex", gap: "8px", alignItems: "center", margin: "4px 0"}}, input, text);
+    return el("label", {class: "option"}, input, text);
   });
   const swipe = el("input", {type: "range", min: "0", max: "100", step: "1", value: "50"});
   swipe.addEventListener("input", () => maps.setShare(Number(swipe.value) / 100));
@@ -69,23 +71,30 @@ export function tab(studio) {
     await load();
     if (!studio.mayWrite()) return;
     const found = await send("/api/compare/near");
-    near.replaceChildren(el("option", {value: ""}, found.surveys.length ? "Choose one" : "There is none in " + found.folder),
+    [alone.hidden, nearField.hidden] = [found.surveys.length > 0, !found.surveys.length];
+    alone.textContent = "No other survey is in " + found.folder + ": type the path of one that is elsewhere.";
+    near.replaceChildren(el("option", {value: ""}, "Choose one"),
       ...found.surveys.map((one) => el("option", {value: one.path}, one.name)));
   }
 
   /* ---- What has changed ---- */
 
   const find = button("Find what has changed", () => attempt(async () => {
-    await send("/api/compare/" + other.id + "/evaluate");
-    running = true;
-    say("Heights are compared; this takes some seconds to minutes");
+    await send("/api/run/start", {name: "evaluate", arguments: {against: other.path}});
+    say("Heights are compared");
+    job = {steps: []};
     render();
   }));
-  on("compare", (data) => attempt(async () => {
-    running = false;
-    say(data.text, data.ok ? "note" : "error");
-    await load();
-  }));
+  const progress = el("div", {class: "run"});
+  on("run", (data) => {
+    if (data.job) {
+      job = data.job;
+      if (!panel.hidden) render();
+    } else if (data.ended) {
+      job = null;
+      attempt(load);
+    }
+  });
 
   const which = el("select", {});
   which.addEventListener("change", render);
@@ -93,7 +102,7 @@ export function tab(studio) {
 
   async function load() {
     const found = await get("/api/compare/results");
-    ({results, running} = found);
+    ({results} = found);
     const before = which.value;
     which.replaceChildren(...results.map((one) => el("option", {value: one.name}, one.name)));
     if (results.some((one) => one.name === before)) which.value = before;
@@ -104,8 +113,8 @@ export function tab(studio) {
     ["difference", "significance", "change-gained", "change-lost"].forEach((name) => studio.map.remove(name));
     if (!result) return;
     result.layers.forEach((layer) => studio.map.put({...layer, group: "Change", shown: false}));
-    [["change-gained", "Gained", GAINED, (r) => r.volume_l > 0, false],
-      ["change-lost", "Lost", LOST, (r) => r.volume_l < 0, true]].forEach(([name, title, colour, wanted, dashed]) => {
+    [["change-gained", "Gained", BLUE, (r) => r.volume_l > 0, false],
+      ["change-lost", "Lost", RED, (r) => r.volume_l < 0, true]].forEach(([name, title, colour, wanted, dashed]) => {
       const shapes = [];
       const texts = [];
       result.regions.filter(wanted).forEach((region) => region.outlines.forEach((ring) => {
@@ -136,15 +145,15 @@ export function tab(studio) {
     if (!result) return [el("p", {class: "note"}, "No comparison has been made yet.")];
     const lines = result.regions.map((region, n) => [
       button((n + 1) + (region.volume_l > 0 ? " gained" : " lost"), () => go(region)),
-      region.area_m2.toFixed(3), withSigma(region.volume_l, region.sigma_l),
+      fixed(region.area_m2, 3), withSigma(region.volume_l, region.sigma_l),
     ]);
     const still = result.unchanged;
     const facts = [
-      ["Common ground", result.area_m2.toFixed(2) + " m²"], ["Changed", result.changed_m2.toFixed(2) + " m²"],
+      ["Common ground", fixed(result.area_m2, 2, "m²")], ["Changed", fixed(result.changed_m2, 2, "m²")],
       ["Gained", withSigma(result.gained.volume_l, result.gained.sigma_l, "l")],
       ["Lost", withSigma(Math.abs(result.lost.volume_l), result.lost.sigma_l, "l")],
     ];
-    if (still && still.robust_sigma_mm !== null) facts.push(["Unchanged ground differs by", still.robust_sigma_mm.toFixed(2) + " mm"]);
+    if (still && still.robust_sigma_mm !== null) facts.push(["Unchanged ground differs by", fixed(still.robust_sigma_mm, 2, "mm")]);
     return [
       table("Against " + result.name, [], facts),
       lines.length ? table("Changed places", ["Place", "Area, m²", "Volume, l"], lines)
@@ -154,26 +163,32 @@ export function tab(studio) {
   }
 
   const about = el("div", {});
+  const alone = el("p", {class: "note", hidden: true});
+  const nearField = field("Next to this one", near);
   const colours = el("p", {class: "note"});
+  const looks = el("div", {}, el("fieldset", {class: "options"}, el("legend", {}, "Show"), radios),
+    field("Raster", kind), colours, swipeField);
   const whichField = field("Comparison", which);
-  const panel = el("div", {},
-    el("h2", {}, "Other survey"), field("Next to this one", near), field("Folder", path, "It is only read"),
+  const content = el("div", {},
+    el("h2", {}, "Other survey"), alone, nearField, field("Folder", path, "It is only read"),
     el("p", {class: "buttons"}, choose), about,
-    el("fieldset", {style: {border: "0", padding: "0", margin: "0 0 12px"}}, el("legend", {style: {fontWeight: "650"}}, "Show"), radios),
-    field("Raster", kind), colours, swipeField,
-    el("h2", {}, "Change"), el("p", {class: "buttons"}, find), whichField, changes);
+    looks,
+    el("h2", {}, "Change"), el("p", {class: "buttons"}, find), progress, whichField, changes);
+  const lack = missing(studio, content, () => (studio.state.has.dem || studio.state.has.mosaic ? null
+    : ["There is no model of this survey to compare yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
+  const panel = el("div", {}, lack.element, content);
 
   function render() {
     const writes = studio.mayWrite();
     choose.disabled = !writes;
-    find.disabled = !writes || !other || !other.comparable || running;
-    find.textContent = running ? "Comparing…" : "Find what has changed";
+    find.disabled = !writes || !other || !other.comparable || Boolean(job);
+    showSteps(progress, job || {steps: []});
     const scale = other?.layers.find((layer) => layer.name === kind.value)?.scale;
     colours.textContent = scale && mode !== "off"
       ? "Colours of the other run from " + [scale.low, scale.high].map((v) => number(v, "", 4)).join(" to ") + " (" + scale.label + "); those of this one are in the list of layers." : "";
     about.replaceChildren(...(other ? [el("p", {class: other.note ? "warn" : "note"}, other.note ? other.note : other.name + ", " + other.path)] : []));
     swipeField.hidden = !other || mode !== "swipe";
-    [kind, ...radios.map((one) => one.firstChild)].forEach((one) => { one.disabled = !other; });
+    looks.hidden = !other;
     whichField.hidden = results.length < 2;
     changes.replaceChildren(...changesOf());
   }
@@ -181,6 +196,7 @@ export function tab(studio) {
   return {
     name: "compare", title: "Compare", panel,
     enter() {
+      if (!lack.show()) return;
       render();
       show();
       if (!looked) attempt(look);

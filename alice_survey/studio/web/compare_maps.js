@@ -15,14 +15,7 @@ export function comparedMaps(studio, swiped) {
   const frame = view.parentElement;
   const pane = map.createPane(PANE);
   pane.style.zIndex = 250;
-  const line = el("div", {"aria-hidden": "true", style: {
-    position: "absolute", top: "0", bottom: "0", width: "4px", marginLeft: "-2px", background: "#fff",
-    boxShadow: "0 0 0 1.5px #16232b", zIndex: "1", cursor: "ew-resize", touchAction: "none",
-  }}, el("span", {style: {
-    position: "absolute", top: "50%", left: "50%", transform: "translate(-50%, -50%)", width: "28px", height: "28px",
-    borderRadius: "50%", background: "#fff", boxShadow: "0 0 0 1.5px #16232b", color: "#16232b",
-    font: "700 16px/28px system-ui, sans-serif", textAlign: "center",
-  }}, "↔"));
+  const line = el("div", {"aria-hidden": "true", class: "swipe"}, el("span", {}, "↔"));
   let mode = "off";
   let share = 0.5;
   let layer = null;
@@ -74,8 +67,7 @@ export function comparedMaps(studio, swiped) {
   function beside(about, name) {
     resize("50%");
     if (!map.getBounds().intersects(boundsOf(about))) map.fitBounds(boundsOf(about), {animate: false});
-    box = el("div", {tabindex: "0", role: "application", "aria-label": "Map of " + name + ": it moves with the other",
-      style: {position: "absolute", top: "0", bottom: "0", left: "50%", right: "0", background: "var(--wash)", borderLeft: "2px solid var(--soft)"}});
+    box = el("div", {tabindex: "0", role: "application", "aria-label": "Map of " + name + ": it moves with the other", class: "second-map"});
     document.querySelector(".map-side").append(box);
     second = new leaflet.Map(box, {
       crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false, zoomSnap: 0.25,

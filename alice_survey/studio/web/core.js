@@ -1,4 +1,4 @@
-/* What every tab uses: requests to the server, its events, elements, messages, numbers. */
+/* What every tab uses: requests to the server, its events, elements, messages. */
 
 const key = "alice-survey token";
 const given = new URLSearchParams(window.location.search).get("token");
@@ -10,27 +10,18 @@ if (given) {
 /* Whether this page may change anything: it was opened by the address with the token. */
 export const mayWrite = () => Boolean(sessionStorage.getItem(key));
 
-async function answered(response) {
-  const text = await response.text();
-  let values = null;
-  try {
-    values = JSON.parse(text);
-  } catch {
-    values = {error: text.trim()};
-  }
-  if (response.ok) return values;
-  const fault = new Error(values.error || "the studio answered " + response.status);
-  fault.status = response.status;
-  throw fault;
-}
-
 async function asked(address, options) {
+  let response = null;
   try {
-    return await fetch(address, options);
+    response = await fetch(address, options);
   } catch (fault) {
     if (fault.name === "AbortError") throw fault;
     throw new Error("the studio does not answer: start it again with 'alice-survey studio'");
   }
+  if (response.ok) return response;
+  const text = (await response.text()).trim();
+  const line = text.startsWith("{") ? JSON.parse(text).error : text;
+  throw Object.assign(new Error(line || "the studio answered " + response.status), {status: response.status});
 }
 
 const addressOf = (path, params) => {
@@ -39,21 +30,34 @@ const addressOf = (path, params) => {
 };
 
 export async function get(path, params, options) {
-  return answered(await asked(addressOf(path, params), options));
+  return (await asked(addressOf(path, params), options)).json();
 }
 
+export const bytes = async (path) => (await asked(path)).arrayBuffer();
+
 /* A body that is a Blob or bytes goes as it is, anything else as JSON. */
-export async function send(path, body = {}, options = {}) {
+function posted(body, signal) {
   const raw = body instanceof Blob || body instanceof ArrayBuffer;
-  return answered(await asked(addressOf(path, options.params), {
+  return {
     method: "POST",
     body: raw ? body : JSON.stringify(body),
-    signal: options.signal,
+    signal,
     headers: {
       "Content-Type": raw ? "application/octet-stream" : "application/json",
       "X-Studio-Token": sessionStorage.getItem(key) || "",
     },
-  }));
+  };
+}
+
+export async function send(path, body = {}, {params, signal} = {}) {
+  return (await asked(addressOf(path, params), posted(body, signal))).json();
+}
+
+/* Save a file that the server makes, under the name that it gives, else the given one. */
+export async function save(path, name, body = null) {
+  const response = await asked(path, body ? posted(body) : {});
+  const named = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") || "");
+  download(named ? decodeURIComponent(named[1]) : name, await response.blob(), response.headers.get("Content-Type"));
 }
 
 /* Events of the server: `on("run", (data) => ...)`; returns a function that ends it. */
@@ -94,11 +98,14 @@ export function field(label, control, hint) {
   return el("div", {class: "field"}, el("label", {for: control.id}, label), control, about);
 }
 
-/* A table of figures: rows of texts or elements; the first cell of a row heads it. */
+/* A table of figures: rows of texts or elements, or {cells, attributes of the row}; the first cell of a
+   row heads it. */
 export function table(caption, header, rows) {
   const head = header.length ? el("thead", {}, el("tr", {}, header.map((text) => el("th", {scope: "col"}, text)))) : null;
-  return el("table", {class: "figures"}, el("caption", {}, caption), head, el("tbody", {}, rows.map((row) => el("tr", {},
-    row.map((cell, i) => (i ? el("td", {}, cell) : el("th", {scope: "row"}, cell)))))));
+  return el("table", {class: "figures"}, el("caption", {}, caption), head, el("tbody", {}, rows.map((row) => {
+    const {cells, ...attributes} = Array.isArray(row) ? {cells: row} : row;
+    return el("tr", attributes, cells.map((cell, i) => (i ? el("td", {}, cell) : el("th", {scope: "row"}, cell))));
+  })));
 }
 
 /* A line for everybody, screen readers too; it stays until the next one. */
@@ -116,22 +123,6 @@ export async function attempt(work) {
     if (fault.name !== "AbortError") say(fault.message, "error");
     return undefined;
   }
-}
-
-const MINUS = "−";
-export function number(value, unit = "", digits = 3) {
-  if (value === null || value === undefined || Number.isNaN(value)) return "unknown";
-  const size = Math.abs(value);
-  const places = size === 0 ? 0 : Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(size))));
-  const text = value.toLocaleString("en", {maximumFractionDigits: places, minimumFractionDigits: Math.min(places, 6)});
-  return text.replace("-", MINUS) + (unit ? " " + unit : "");
-}
-
-/* A value to the second digit of its sigma: 1.2345 ± 0.0012 m. */
-export function withSigma(value, sigma, unit = "") {
-  if (!(sigma > 0) || value === null) return number(value, unit, 4);
-  const places = Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(sigma))));
-  return value.toFixed(places).replace("-", MINUS) + " ± " + sigma.toFixed(places) + (unit ? " " + unit : "");
 }
 
 export function download(name, content, type = "text/plain") {

@@ -1,48 +1,16 @@
 /* Follow a dive: figures to read on deck, the map of what is seen, holes, and lines that close them. */
 
-import {attempt, button, el, field, get, number, on, say, send, table} from "./core.js";
+import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
+import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.js";
+import {profileChart} from "./profile_chart.js";
+import {clock, counted, number, paceText, share} from "./words.js";
 
-/* Safe for the colour-blind (Okabe and Ito 2008), as the coverage's own. */
-const COLOURS = {left: "#0072b2", done: "#6b6b6b", track: "#1a1a1a", hole: "#d55e00", proposal: "#cc79a7"};
-const LEGEND = [["#009e73", "at the requested overlap"], ["#56b4e9", "in stereo"], ["#e69f00", "in a picture"]];
-const STYLE = `
-#panel-follow .now{margin:0 0 10px;padding:10px 12px;border-radius:8px;border:1px solid var(--line);
-background:var(--wash);font:650 19px/1.3 system-ui,sans-serif}
-#panel-follow .now.bad{background:var(--badwash);border-color:var(--bad);color:var(--bad)}
-#panel-follow .now.good{background:var(--goodwash);border-color:var(--good)}
-#panel-follow .big{display:grid;grid-template-columns:1fr 1fr;gap:8px;margin:0 0 12px}
-#panel-follow .big div{border:1px solid var(--line);border-radius:8px;padding:8px 10px;min-width:0}
-#panel-follow .big dt{font-size:14px;color:var(--soft);font-weight:600}
-#panel-follow .big dd{margin:0;white-space:nowrap;font:750 31px/1.15 system-ui,sans-serif;font-variant-numeric:tabular-nums;color:var(--ink)}
-#panel-follow .big dd small{display:block;white-space:normal;font:500 14px/1.35 system-ui,sans-serif;color:var(--soft)}
-#panel-follow .big .bad dd{color:var(--bad)}
-#panel-follow svg.profile{display:block;width:100%;height:110px;background:var(--wash);border-radius:6px}
-#panel-follow .profile text{font:12px system-ui,sans-serif;fill:var(--soft)}
-#panel-follow .legend-row{display:flex;flex-wrap:wrap;gap:4px 14px;list-style:none;margin:6px 0 12px;padding:0;font-size:14px}
-#panel-follow .legend-row li{display:flex;align-items:center;gap:6px;margin:0}
-img.follow-block{image-rendering:pixelated}
-`;
+const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"]];  /* as the coverage's own */
 const PROFILE_S = 300;
 const KEPT = 6000;
 
-const clock = (seconds) => {
-  if (seconds === null || seconds === undefined) return "–";
-  const whole = Math.round(Math.abs(seconds));
-  const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
-  const two = (n) => String(n).padStart(2, "0");
-  return (seconds < -0.5 ? "−" : "") + (h ? h + ":" + two(m) : m) + ":" + two(s);
-};
-const percent = (share) => {
-  if (share === null || share === undefined) return "–";
-  /* Never more than there is: 99.96 % is no 100 %. */
-  return (share >= 1 ? "100" : (Math.floor(share * 1000) / 10).toFixed(1)) + " %";
-};
-
 export function tab(studio) {
-  const sheet = new CSSStyleSheet();
-  sheet.replaceSync(STYLE);
-  document.adoptedStyleSheets.push(sheet);
-
   const {map} = studio;
   let state = null;
   let heardAt = 0;
@@ -58,7 +26,7 @@ export function tab(studio) {
 
   /* ---- The panel ---- */
 
-  const now = el("p", {class: "now"}, "Loading");
+  const now = el("p", {class: "now"}, "Loading …");
   const figure = (name, title) => {
     const value = el("dd", {"data-figure": name}, "–");
     return {box: el("div", {}, el("dt", {}, title), value), value};
@@ -78,7 +46,7 @@ export function tab(studio) {
     box.classList.toggle("bad", bad);
   };
 
-  const profile = el("svg", {class: "profile", viewBox: "0 0 340 110", role: "img", "aria-label": "Altitude over time"});
+  const profile = profileChart("Altitude over time", {high: 120});
   const holeTable = el("div", {});
   const proposalText = el("p", {}, "");
   const minutes = el("input", {type: "number", min: "0.5", max: "6000", step: "0.5", inputmode: "decimal"});
@@ -89,20 +57,21 @@ export function tab(studio) {
   const more = el("div", {});
   const keep = el("input", {type: "checkbox", checked: true});
   const logs = el("select", {});
-  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map((n) => el("option", {value: n}, n + " times")));
+  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map((n) => el("option", {value: n}, paceText(n))));
+  const stop = button("Stop", () => change("/api/follow/end", {}), {hidden: true});
   const choose = el("details", {}, el("summary", {}, "Choose a log"),
     field("Navigation CSV of this workspace", logs),
-    field("Replay, for training", pace, "A finished log as if it were flown now"),
+    field("Pace of a replay", pace, "For training: a finished log as if it were flown now"),
     el("div", {class: "buttons"}, button("Follow it", () => opened({log: logs.value})),
       button("Replay it", () => opened({log: logs.value, replay: Number(pace.value)})),
-      button("Stop", () => change("/api/follow/end", {}))),
+      stop),
     el("p", {class: "note"}, "For files elsewhere and for vehicles: alice-survey studio --log nav.csv, udp:14600, mavlink:udpin:127.0.0.1:14550 or ros."));
 
   const live = el("div", {hidden: true}, big,
     el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"}, LEGEND.map(([colour, text]) => el("li", {},
       el("span", {class: "swatch", style: {background: colour}}), text))),
     el("div", {class: "field"}, el("label", {}, keep, " Keep the vehicle in view")),
-    el("h3", {}, "Altitude against the plan"), profile,
+    el("h3", {}, "Altitude against the plan"), profile.element,
     el("h3", {}, "Lines that close the holes"), proposalText,
     el("div", {class: "row"}, field("May take, minutes", minutes, "Empty: what is to spare"), field("Format", format)),
     el("div", {class: "buttons"}, button("Look for lines", propose), accept, again),
@@ -111,7 +80,10 @@ export function tab(studio) {
       el("div", {class: "row"}, field("Up in, minutes", upIn, "When the vehicle has to be at the surface")),
       el("div", {class: "buttons"}, button("Set", () => change("/api/follow/allow", {minutes: upIn.value ? Number(upIn.value) : null}))),
       more));
-  const panel = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
+  const content = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
+  const lack = missing(studio, content, () => (studio.state.has.plan || state?.following ? null
+    : ["A dive is followed along its plan, and there is none yet: draw it in Plan, and save it.", "plan", "Open Plan"]));
+  const panel = el("div", {}, lack.element, content);
 
   /* ---- What the server says ---- */
 
@@ -153,12 +125,13 @@ export function tab(studio) {
     const source = state && state.source;
     state = {...(state || {}), ...heard};
     if (heard.logs) fillChoices(heard);
-    live.hidden = !state.following;
+    lack.show();
+    [live.hidden, stop.hidden] = [!state.following, !state.following];
     choose.open = choose.open || !state.following;
     if (!state.following) {
       forget();
       now.className = state.fault ? "now bad" : "now";
-      now.textContent = state.fault || (state.has_plan ? "No dive is followed: choose its log" : "There is no plan yet: plan the survey first");
+      now.textContent = state.fault || "No dive is followed: choose its log";
       return;
     }
     if (source !== state.source) forget();
@@ -224,9 +197,9 @@ export function tab(studio) {
     const tight = (spare.time_s !== null && spare.time_s < 0) || (spare.energy_wh !== null && spare.energy_wh < 0);
     put("spare", spare.time_s === null ? number(spare.energy_wh, "", 3) : clock(spare.time_s),
       spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3), tight);
-    put("overlap", percent(coverage.at_overlap), "then " + percent(coverage.expected_at_overlap) + "; seen " + percent(coverage.seen));
+    put("overlap", share(coverage.at_overlap, 1), "then " + share(coverage.expected_at_overlap, 1) + "; seen " + share(coverage.seen, 1));
     put("holes", holes.count ? holes.area_m2.toFixed(holes.area_m2 < 99.5 ? 1 : 0) + " m²" : "none",
-      holes.count ? holes.count + (holes.count === 1 ? " hole" : " holes") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "nothing is missed", holes.area_m2 >= 0.05);
+      holes.count ? counted(holes.count, "hole") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "nothing is missed", holes.area_m2 >= 0.05);
     put("lines", lines.left + " of " + (lines.left + lines.done), "dive " + state.dive.number + " of " + state.dive.of);
     const left = Object.entries(state.left_out).filter(([, count]) => count);
     more.replaceChildren(table("So far", [], [
@@ -300,12 +273,12 @@ export function tab(studio) {
 
   function showLines(lines) {
     const ends = (wanted) => lines.filter(wanted).map((line) => [flat(line.start_ne), flat(line.end_ne)]);
-    shapes("follow-done", "line", "Lines done", COLOURS.done, ends((line) => line.state === "done"), {width: 1.5});
-    shapes("follow-left", "line", "Lines left", COLOURS.left, ends((line) => line.state !== "done"), {dashed: true});
+    shapes("follow-done", "line", "Lines done", GREY, ends((line) => line.state === "done"), {width: 1.5});
+    shapes("follow-left", "line", "Lines left", BLUE, ends((line) => line.state !== "done"), {dashed: true});
   }
 
   function showTrack() {
-    shapes("follow-track", "line", "Track", COLOURS.track, [fixes.map((fix) => [fix[2], fix[1]])], {width: 1.6});
+    shapes("follow-track", "line", "Track", INK, [fixes.map((fix) => [fix[2], fix[1]])], {width: 1.6});
     showProfile();
     const fix = fixes[fixes.length - 1];
     const place = leaflet.latLng(fix[1], fix[2]);
@@ -330,7 +303,7 @@ export function tab(studio) {
     if (arrow) {
       arrow.setLatLngs(corners);
     } else {
-      arrow = leaflet.polygon(corners, {color: "#fff", weight: 2, fillColor: "#0072b2", fillOpacity: 1, interactive: false}).addTo(map.leaflet);
+      arrow = leaflet.polygon(corners, {color: WHITE, weight: 2, fillColor: BLUE, fillOpacity: 1, interactive: false}).addTo(map.leaflet);
     }
     arrow.bringToFront();
   }
@@ -338,7 +311,7 @@ export function tab(studio) {
 
   function showHoles(holes) {
     const outlines = holes.flatMap((hole) => hole.rings_ne.map((ring) => ring.map(flat)));
-    shapes("follow-holes", "polygon", "Holes", COLOURS.hole, outlines);
+    shapes("follow-holes", "polygon", "Holes", RED, outlines);
     holeTable.replaceChildren(holes.length ? table("Holes, worst first", ["hole", "m²", "unseen m²", "north, east m"],
       holes.slice(0, 6).map((hole, i) => [
         el("button", {type: "button", onclick: () => map.leaflet.panTo([hole.north_m, hole.east_m])}, "Hole " + (i + 1)),
@@ -348,15 +321,14 @@ export function tab(studio) {
   function showProposal({number: shown, proposal}) {
     shownNumber = shown;
     accept.disabled = !proposal || !studio.mayWrite();
-    shapes("follow-proposal", "line", "Proposed lines", COLOURS.proposal,
+    shapes("follow-proposal", "line", "Proposed lines", PINK,
       proposal ? proposal.lines.map((line) => [flat(line.start_ne), flat(line.end_ne)]) : [], {width: 5});
     if (proposal) {
-      const lines = proposal.lines.length === 1 ? "1 more line takes " : proposal.lines.length + " more lines take ";
-      proposalText.textContent = lines + clock(proposal.extra_s) + " min and " + number(proposal.extra_wh, "Wh", 2)
+      proposalText.textContent = counted(proposal.lines.length, "more line takes", "more lines take") + " " + clock(proposal.extra_s) + " min and " + number(proposal.extra_wh, "Wh", 2)
         + " for " + number(proposal.gain_m2, "m²", 3) + " of the " + number(proposal.holes_m2, "m²", 3) + " of holes: then "
-        + percent(proposal.share_at_overlap) + " is at the overlap. They are flown after the planned lines, on the way home.";
+        + share(proposal.share_at_overlap, 1) + " is at the overlap. They are flown after the planned lines, on the way home.";
     } else if (state.accepted) {
-      proposalText.textContent = state.accepted.lines + " accepted lines are flown after the planned ones.";
+      proposalText.textContent = counted(state.accepted.lines, "accepted line is", "accepted lines are") + " flown after the planned ones.";
     } else {
       proposalText.textContent = state.holes.count ? "No lines fit what is to spare, or can be reached." : "No holes so far: nothing to close.";
     }
@@ -368,20 +340,13 @@ export function tab(studio) {
     const last = fixes[fixes.length - 1][0];
     const shown = fixes.filter((fix) => fix[0] > last - PROFILE_S && fix[3] !== null);
     const plan = state.planned_altitude_m;
-    const [wide, high, left] = [340, 110, 34];
-    const top = 2 * plan;
-    const x = (s) => left + ((s - (last - PROFILE_S)) / PROFILE_S) * (wide - left);
-    const y = (m) => 8 + (1 - Math.min(Math.max(m / top, 0), 1)) * (high - 26);
-    const points = shown.map((fix) => x(fix[0]).toFixed(1) + "," + y(fix[3]).toFixed(1)).join(" ");
+    const minutes = (fix) => (fix[0] - last) / 60;
     const latest = shown.length ? shown[shown.length - 1][3] : null;
-    profile.setAttribute("aria-label", "Altitude over the last five minutes: now " + number(latest, "m", 3) + ", planned " + number(plan, "m", 3));
-    profile.replaceChildren(
-      el("line", {x1: left, x2: wide, y1: y(plan), y2: y(plan), stroke: "var(--blue)", "stroke-dasharray": "6 4", "stroke-width": 1.5}),
-      el("text", {x: 2, y: y(plan) + 4}, number(plan, "m", 2)),
-      el("text", {x: 2, y: y(0) + 4}, "0 m"),
-      el("text", {x: left, y: high - 3}, "5 min ago"),
-      el("text", {x: wide - 26, y: high - 3}, "now"),
-      el("polyline", {points, fill: "none", stroke: "var(--ink)", "stroke-width": 1.8}));
+    profile.show({
+      lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]}, {kind: "flown", xs: shown.map(minutes), ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
+      range: [0, 2 * plan], caption: "minutes from now; altitude, m",
+    });
+    profile.element.firstChild.setAttribute("aria-label", "Altitude over the last five minutes: now " + number(latest, "m") + ", planned " + number(plan, "m"));
   }
 
   return {
@@ -391,6 +356,7 @@ export function tab(studio) {
     enter() {
       isHere = true;
       blocks.forEach((block) => block.overlay.addTo(map.leaflet));
+      lack.show();
       attempt(async () => take(await get("/api/follow/state")));
     },
     leave() {

@@ -1,19 +1,21 @@
 /* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
 
-import {attempt, button, download, el, field, get, number, say, send, table, withSigma} from "./core.js";
-import {profileView} from "./model_profile.js";
+import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
+import {PINK, RED} from "./palette.js";
+import {counted, number, withSigma} from "./words.js";
+import {drawingTool} from "./drawing.js";
 import {meshPart} from "./model_mesh.js";
+import {measuredProfile} from "./model_profile.js";
 
-const COLOUR = "#d55e00";
-const FAINT = "#cc79a7";
 const ASK_MS = 120;
 /* What each tool draws, how many places end it, and the figure that stands for the measure. */
 const TOOLS = {
-  length: {title: "Length", key: "l", kind: "line", ends: 2, main: "length", hint: "Click two places."},
-  profile: {title: "Profile", key: "p", kind: "line", main: "surface_length", hint: "Click along a line, then finish."},
-  area: {title: "Area", key: "a", kind: "polygon", main: "surface_area", hint: "Click the corners in order, then finish."},
-  volume: {title: "Volume", key: "v", kind: "polygon", main: "volume", hint: "Click the corners in order, then finish."},
-  rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity", hint: "Click the corners in order, then finish."},
+  length: {title: "Length", key: "l", kind: "line", ends: 2, main: "length"},
+  profile: {title: "Profile", key: "p", kind: "line", main: "surface_length"},
+  area: {title: "Area", key: "a", kind: "polygon", main: "surface_area"},
+  volume: {title: "Volume", key: "v", kind: "polygon", main: "volume"},
+  rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity"},
 };
 const FILES = [
   ["report/report.html", "The report"], ["mosaic/mosaic.tif", "The mosaic, cloud-optimised GeoTIFF"],
@@ -24,7 +26,6 @@ const FILES = [
 
 export function tab(studio) {
   const {map, state} = studio;
-  document.head.append(el("link", {rel: "stylesheet", href: "/app/model.css"}));
   const kept = "alice-survey measures " + state.workspace;
   let measures = restored();
   let chosen = null;
@@ -50,7 +51,7 @@ export function tab(studio) {
   }
 
   function valueOf({value, unit}) {
-    if (!Array.isArray(value)) return Number.isInteger(value) ? value + " " + unit : number(value, unit, 5);
+    if (!Array.isArray(value)) return Number.isInteger(value) ? value + " " + unit : number(value, unit, unit === state.unit ? 5 : 3);
     return el("span", {title: value.join(", ")}, el("span", {class: "swatch", style: {background: "rgb(" + value.join(",") + ")"}}), " ", value.join(" "));
   }
 
@@ -63,7 +64,7 @@ export function tab(studio) {
       under.replaceChildren(el("p", {class: "error"}, found.fault.message));
       return;
     }
-    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], "", 6) + " " + axis).join(", ");
+    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], state.unit, 6) + " " + axis).join(", ");
     under.replaceChildren(el("p", {}, found.values.length ? "At " + at : "No raster knows anything at " + at + "."),
       el("dl", {}, found.values.map((row) => el("div", {}, el("dt", {}, row.title.replace(" of height", "")), el("dd", {}, valueOf(row))))));
     if (wanted === place) readout.textContent += heightText(found);
@@ -84,13 +85,7 @@ export function tab(studio) {
 
   /* ---- Drawing ---- */
 
-  const draft = leaflet.polyline([], {color: COLOUR, weight: 3, dashArray: "6 4", interactive: false});
-  const dots = leaflet.featureGroup();
-  let drawing = null;
-  const hint = el("p", {class: "note", role: "status"});
-  const finishing = button("Finish (D)", () => finish(), {class: "primary"});
-  const steps = el("div", {class: "buttons", hidden: true}, finishing,
-    button("Undo the last place", () => undo()), button("Cancel", () => map.release()));
+  const drawing = drawingTool(studio, "model");
   const toolButtons = Object.entries(TOOLS).map(([name, tool]) => button(tool.title, () => begin(name), {
     "aria-pressed": "false", "data-tool": name, title: tool.title + " (" + tool.key.toUpperCase() + ")",
   }));
@@ -105,79 +100,40 @@ export function tab(studio) {
   base.addEventListener("change", () => { levelField.hidden = base.value !== "level"; });
   levelField.hidden = true;
 
-  function redraw(pointer) {
-    const places = [...drawing.places, ...(pointer ? [pointer] : [])];
-    draft.setLatLngs(drawing.tool.kind === "polygon" && places.length > 2 ? [...places, places[0]] : places);
-    dots.clearLayers();
-    drawing.places.forEach((place) => dots.addLayer(leaflet.circleMarker(place, {
-      radius: 5, color: "#fff", weight: 1.5, fillColor: COLOUR, fillOpacity: 1, interactive: false,
-    })));
-    const least = drawing.tool.kind === "polygon" ? 3 : 2;
-    finishing.disabled = drawing.places.length < least;
-    hint.textContent = drawing.tool.hint + " Enter takes the middle of the map. " + drawing.places.length + " so far.";
-  }
-
+  let inHand = null;
   function begin(name) {
-    if (drawing?.name === name) {
+    if (inHand === name) {
       map.release();
       return;
     }
     const tool = TOOLS[name];
-    map.take({
-      name,
-      click: (place) => add(place),
-      move: (place) => drawing && redraw(place),
-      end: ended,
-      keys: {d: () => finish(), Backspace: () => undo()},
+    drawing.begin({
+      kind: tool.kind, colour: RED, most: tool.ends, ended: () => held(null),
+      ready: () => name !== "volume" || hasPlane(),
+      done: (points) => finish(name, points.map(([north, east]) => [east, north])),
     });
-    drawing = {name, tool, places: []};
-    draft.addTo(map.leaflet);
-    dots.addTo(map.leaflet);
+    held(name);
+  }
+
+  function held(name) {
+    inHand = name;
     toolButtons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === name)));
-    steps.hidden = false;
+    if (!name) return;
     forVolume.hidden = name !== "volume";
     forRugosity.hidden = name !== "rugosity";
-    redraw();
   }
 
-  function ended() {
-    drawing = null;
-    draft.remove();
-    dots.remove();
-    toolButtons.forEach((one) => one.setAttribute("aria-pressed", "false"));
-    steps.hidden = true;
-    hint.textContent = "";
+  function hasPlane() {
+    if (base.value === "rim" || Number.isFinite(level.valueAsNumber)) return true;
+    say("Give the height of the plane", "warn");
+    level.focus();
+    return false;
   }
 
-  function add(place) {
-    if (drawing.places.length && drawing.places[drawing.places.length - 1].equals(place, 1e-12)) {
-      say("That is the last place again: move the map or the pointer first.", "warn");
-      return;
-    }
-    drawing.places.push(leaflet.latLng(place.lat, place.lng));
-    redraw();
-    if (drawing.places.length === drawing.tool.ends) finish();
-  }
-
-  function undo() {
-    drawing?.places.pop();
-    if (drawing) redraw();
-  }
-
-  async function finish() {
-    if (!drawing || finishing.disabled) return;
-    const {name, tool, places} = drawing;
-    const asked = {kind: tool.kind, places: places.map((place) => [place.lng, place.lat])};
-    if (name === "volume") {
-      if (base.value === "level" && !Number.isFinite(level.valueAsNumber)) {
-        say("Give the height of the plane.", "warn");
-        level.focus();
-        return;
-      }
-      asked.base = base.value === "level" ? level.valueAsNumber : "rim";
-    }
+  async function finish(name, places) {
+    const asked = {kind: TOOLS[name].kind, places};
+    if (name === "volume") asked.base = base.value === "level" ? level.valueAsNumber : "rim";
     if (name === "rugosity" && quadrat.value) asked.quadrat = quadrat.valueAsNumber;
-    map.release();
     await measure(name, asked);
   }
 
@@ -218,7 +174,7 @@ export function tab(studio) {
     const described = (kind) => {
       const some = measures.filter((one) => (one.kind === "polygon") === (kind === "polygon"));
       return {
-        kind, name: "measured-" + kind, title: kind === "polygon" ? "Measured areas" : "Measured lines", colour: COLOUR,
+        kind, name: "measured-" + kind, title: kind === "polygon" ? "Measured areas" : "Measured lines", colour: RED,
         dashed: false, fill: 0.12, width: 3, group: "Measures",
         shapes: some.map((one) => one.places.map(([east, north]) => [east, north])),
         texts: some.map((one) => one.name + ": " + withSigma(mainOf(one).value, mainOf(one).sigma, mainOf(one).unit)),
@@ -233,7 +189,7 @@ export function tab(studio) {
     map.remove("quadrats");
     if (squares.length) {
       map.put({
-        kind: "polygon", name: "quadrats", title: "Quadrats", colour: FAINT, dashed: false, fill: 0.1, width: 1.5, group: "Measures",
+        kind: "polygon", name: "quadrats", title: "Quadrats", colour: PINK, dashed: false, fill: 0.1, width: 1.5, group: "Measures",
         shapes: squares.map((one) => one.places),
         texts: squares.map((one) => figureText(one.figures.find((figure) => figure.name === "rugosity"))),
       });
@@ -254,15 +210,13 @@ export function tab(studio) {
         changed();
       });
       const main = mainOf(one);
-      return el("tr", {"data-measure": one.id, "aria-current": one.id === chosen ? "true" : null},
-        el("td", {}, name), el("td", {}, withSigma(main.value, main.sigma, main.unit)),
-        el("td", {}, button("Show", () => { chosen = one.id; changed(); lookAt(one); }, {"aria-label": "Show " + one.name}), " ",
-          button("×", () => drop(one), {"aria-label": "Delete " + one.name})));
+      const cells = [name, withSigma(main.value, main.sigma, main.unit),
+        [button("Show", () => { chosen = one.id; changed(); lookAt(one); }, {"aria-label": "Show " + one.name}), " ",
+          button("×", () => drop(one), {"aria-label": "Delete " + one.name})]];
+      return {cells, "data-measure": one.id, "aria-current": one.id === chosen ? "true" : null};
     });
     results.replaceChildren(
-      el("table", {class: "figures measures"}, el("caption", {}, "Measures"),
-        el("thead", {}, el("tr", {}, ["Name", "Result", "Actions"].map((text) => el("th", {scope: "col"}, text)))),
-        el("tbody", {}, rows)),
+      el("div", {class: "measures"}, table("Measures", ["Name", "Result", "Actions"], rows)),
       el("div", {class: "buttons"}, button("Export CSV", () => attempt(() => exported("csv"))),
         button("Export GeoJSON", () => attempt(() => exported("geojson"))),
         button("Delete all", () => { measures = []; chosen = null; changed(); })),
@@ -280,7 +234,7 @@ export function tab(studio) {
     map.leaflet.fitBounds(bounds.pad(0.4), {animate: false});
   }
 
-  const profile = profileView(map, state.unit);
+  const profile = measuredProfile(map, state.unit);
 
   async function showChosen() {
     const one = measures.find((other) => other.id === chosen);
@@ -311,25 +265,22 @@ export function tab(studio) {
   }
 
   async function exported(form) {
-    const body = JSON.stringify({
+    await save("/api/model/export", "measures." + form, {
       form,
       measures: measures.map(({name, kind, places, figures, notes}) => ({name, kind, places, figures, notes})),
     });
-    const answer = await fetch("/api/model/export", {method: "POST", body, headers: {"Content-Type": "application/json"}});
-    if (!answer.ok) throw new Error((await answer.json()).error);
-    download("measures." + form, await answer.text(), answer.headers.get("Content-Type"));
-    say(measures.length + (measures.length === 1 ? " measure" : " measures") + " written to measures." + form);
+    say(counted(measures.length, "measure") + " written to measures." + form);
   }
 
   /* ---- What sigmas count, and the files ---- */
 
-  const counted = el("ul", {});
-  const about = el("details", {hidden: true}, el("summary", {}, "What the sigmas count"), counted);
+  const noted = el("ul", {});
+  const about = el("details", {hidden: true}, el("summary", {}, "What the sigmas count"), noted);
   async function fillAbout() {
     const found = await get("/api/model/about").catch(() => null);
     about.hidden = !found;
     if (!found) return;
-    counted.replaceChildren(...found.notes.map((note) => el("li", {}, note)),
+    noted.replaceChildren(...found.notes.map((note) => el("li", {}, note)),
       el("li", {}, "areas and rugosity are of cells of " + number(found.cell, found.unit, 3)));
   }
 
@@ -347,22 +298,23 @@ export function tab(studio) {
     "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with the protocol HTTP(S) and the address "
     + window.location.origin + "/files/mosaic/mosaic.tif"));
 
-  const mesh = meshPart(studio, {colour: COLOUR, measured: (points) => measure("length", {kind: "points", places: points})});
+  const mesh = meshPart(studio, {colour: RED, measured: (points) => measure("length", {kind: "points", places: points})});
 
-  const panel = el("div", {class: "model"},
+  const content = el("div", {},
     el("h2", {}, "Look and measure"),
     el("div", {class: "buttons", role: "group", "aria-label": "Measure on the map"}, toolButtons),
-    forVolume, forRugosity, hint, steps, under, results, details, mesh.element, about, files);
+    drawing.element, forVolume, forRugosity, under, results, details, mesh.element, about);
+  const lack = missing(studio, content, () => (state.has.dem ? null
+    : ["There is no model of the sea floor to look at yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
+  const panel = el("div", {class: "model"}, lack.element, content, files);
 
   return {
     name: "model", title: "Model", panel,
     enter() {
       active = true;
-      const there = Boolean(state.has.dem);
-      toolButtons.forEach((one) => { one.disabled = !there; });
-      if (!there) hint.textContent = "There is no surface yet: run 'alice-survey reconstruct', or the tab Run.";
-      fillAbout();
       fillFiles();
+      if (!lack.show()) return;
+      fillAbout();
       mesh.enter();
       changed();
       map.refresh();

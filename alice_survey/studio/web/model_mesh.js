@@ -1,6 +1,8 @@
 /* The mesh in the tab Model: it turns, a click picks a place on it, two picks give a length. */
 
-import {attempt, button, el, get, number, say} from "./core.js";
+import {attempt, button, bytes, el, get, say} from "./core.js";
+import {WHITE} from "./palette.js";
+import {number} from "./words.js";
 
 const STILL_PX = 4;
 const ACTS = [["left", "Turn left", "←"], ["right", "Turn right", "→"], ["up", "Look from higher", "↑"], ["down", "Look from lower", "↓"],
@@ -66,7 +68,7 @@ export function meshPart(studio, {colour, measured}) {
     spots.clearLayers().addTo(map.leaflet);
     const places = picks.map((point) => onMap(point, lies));
     places.forEach(([east, north]) => spots.addLayer(leaflet.circleMarker([north, east], {
-      radius: 6, color: "#fff", weight: 2, fillColor: colour, fillOpacity: 1, interactive: false,
+      radius: 6, color: WHITE, weight: 2, fillColor: colour, fillOpacity: 1, interactive: false,
     })));
     return places;
   }
@@ -96,10 +98,9 @@ export function meshPart(studio, {colour, measured}) {
     context.getExtension("WEBGL_lose_context")?.loseContext();
     await loaded("/app/vendor_mesh.js");
     await loaded("/app/mesh.js");
-    const answer = await fetch(lies.address);
-    if (!answer.ok) throw new Error((await answer.text()).trim());
+    const model = await bytes(lies.address);
     root.hidden = false;
-    scene = await startMesh(root, canvas, await answer.arrayBuffer(), {
+    scene = await startMesh(root, canvas, model, {
       told: (text) => { told.textContent = text; },
       lost: () => still("The browser took its graphics memory back"),
     });

@@ -1,9 +1,10 @@
 /* Control of the pictures tab: what is known of points and lengths, and how it fits at once. */
 
-import {button, el, field, number, table} from "./core.js";
+import {button, el, field, table} from "./core.js";
+import {number} from "./words.js";
 
 const BAD_SIGMAS = 4;
-const mm = (value) => number(1000 * value, "", 3);
+export const mm = (value) => number(1000 * value, "", 3);
 
 function fitOf(row, preview) {
   if (!preview) return "";

@@ -1,11 +1,13 @@
 /* Views of pictures as taken, each about a pixel, with crosses for what is expected and picked.
    Pixels count from 0 at the middle of the first one, as in picks.csv. */
 
-import {attempt, el, get, number} from "./core.js";
+import {attempt, el, get} from "./core.js";
+import {INK, WHITE} from "./palette.js";
+import {number} from "./words.js";
 
 const CLOSE = 2;  /* zoom at which a pixel has four of the screen's */
 const place = (x, y) => [-(y + 0.5), x + 0.5];
-const escaped = (name) => name.split("/").map(encodeURIComponent).join("/");
+export const addressOf = (name) => "/api/pictures/" + name.split("/").map(encodeURIComponent).join("/");
 
 /* A cross of lines with a gap in its middle, so that the pixel under it is seen. */
 function cross(kind) {
@@ -16,9 +18,10 @@ function cross(kind) {
     el("path", {d: paths, ...dark}), el("path", {d: paths, ...light}));
 }
 
-export class PictureView {
-  /* `seen` is a picture that sees the spot: name, and where it is expected (x, y). `changed(view)`
-     is called where a person picks, `used(view)` where one takes or drops its pick. */
+class PictureView {
+  /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the `rings` that are
+     seen in it. `changed(view)` is called where a person picks, if one may, `used(view)` where one takes
+     or drops its pick. */
   constructor(seen, {changed, used, chosen}) {
     this.name = seen.name;
     this.seen = seen;
@@ -27,11 +30,11 @@ export class PictureView {
     this.onPick = changed;
     this.box = el("div", {
       class: "picture-view", tabindex: "0", role: "application",
-      "aria-label": "Picture " + seen.name + ": click to pick; arrow keys move the pick by a pixel, with Shift by a tenth; Enter picks the middle; + and - zoom",
+      "aria-label": "Picture " + seen.name + (changed ? ": click to pick; arrow keys move the pick by a pixel, with Shift by a tenth; Enter picks the middle; + and - zoom" : ": arrow keys move it, + and - zoom"),
       onkeydown: (event) => this.key(event), onfocus: () => chosen(this),
     });
-    this.about = el("p", {}, seen.off_nadir_deg === undefined ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal");
-    this.text = el("p", {class: "note"}, "not picked");
+    this.about = el("p", {}, seen.about || (seen.off_nadir_deg === undefined ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal"));
+    this.text = el("p", {class: "note"}, changed ? "not picked" : "");
     this.check = el("input", {type: "checkbox", checked: true, onchange: () => {
       this.use = this.check.checked;
       used(this);
@@ -44,7 +47,7 @@ export class PictureView {
 
   /* Once it is on the page. */
   async open() {
-    const about = await attempt(() => get("/api/pictures/" + escaped(this.name) + "/about"));
+    const about = await attempt(() => get(addressOf(this.name) + "/about"));
     if (!about || !this.card.isConnected) return;
     const map = new leaflet.Map(this.box, {
       crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false, zoomSnap: 0.5, keyboard: false,
@@ -58,9 +61,10 @@ export class PictureView {
     map.setView(place(seen.x, seen.y), seen.whole ? Math.log2(this.box.clientWidth / about.width) : CLOSE);
     new Pyramid({
       west: 0, north: 0, pixel: 1, width: about.width, height: about.height, tile: about.tile, levels: about.levels,
-      address: "/api/pictures/" + escaped(this.name) + "/tile/{}.webp?v=" + about.token,
+      address: addressOf(this.name) + "/tile/{}.webp?v=" + about.token,
     }, "pictures").addTo(map);
-    this.crosses = seen.whole ? [] : [[cross("expected"), place(seen.x, seen.y)]];
+    if (seen.rings) this.outline(seen);
+    this.crosses = seen.whole || seen.rings ? [] : [[cross("expected"), place(seen.x, seen.y)]];
     map.on("move zoom resize", () => this.settle());
     map.on("click", ({latlng}) => {
       this.box.focus({preventScroll: true});
@@ -70,7 +74,18 @@ export class PictureView {
     this.box.dataset.ready = "";
   }
 
+  /* Rings of pixels, of which those that are not known are null. */
+  outline({rings, closed}) {
+    const places = rings.map((ring) => ring.filter(([x]) => x !== null).map(([x, y]) => place(x, y)));
+    const many = closed ? leaflet.polygon : leaflet.polyline;
+    [[INK, 6], [WHITE, 2.5]].forEach(([color, weight]) => (places[0].length > 1
+      ? many(places, {color, weight, fill: false, interactive: false})
+      : leaflet.circleMarker(places[0][0], {radius: 7, color, weight, fill: false, interactive: false})).addTo(this.map));
+    this.map.fitBounds(leaflet.latLngBounds(places.flat()).pad(0.3), {maxZoom: CLOSE, animate: false});
+  }
+
   byHand(x, y) {
+    if (!this.onPick) return;
     const [wide, high] = this.size || [0, 0];
     if (x < -0.5 || y < -0.5 || x > wide - 0.5 || y > high - 0.5) return;
     this.set({x, y, matched_to: "", sigma_px: null});
@@ -137,15 +152,15 @@ export class PictureView {
 
 /* The wall of views over the map. */
 export class Wall {
-  constructor({changed, used, refine}) {
+  constructor({changed, used, refine} = {}) {
     this.views = [];
     this.active = null;
     this.acts = {changed, used, chosen: (view) => this.choose(view)};
     this.title = el("strong", {}, "");
-    this.refineButton = el("button", {type: "button", disabled: true, onclick: () => refine(this.active)}, "Find it in all others");
+    this.refineButton = el("button", {type: "button", disabled: true, hidden: !refine, onclick: () => refine(this.active)}, "Find it in all others");
     this.more = el("button", {type: "button", hidden: true, onclick: () => this.showMore()}, "More pictures");
     this.light = el("input", {type: "range", min: "0.4", max: "3", step: "0.05", value: "1", oninput: () => this.lit()});
-    this.list = el("div", {class: "views", tabindex: "0", role: "region", "aria-label": "Pictures that show the spot"});
+    this.list = el("div", {class: "views", tabindex: "0", role: "region", "aria-label": "Pictures that show it"});
     this.root = el("div", {class: "wall", hidden: true, role: "region", "aria-label": "Pictures"},
       el("div", {class: "bar-top"}, this.title, this.refineButton,
         el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(1))}, "Closer"),

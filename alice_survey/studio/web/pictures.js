@@ -1,14 +1,16 @@
 /* Pictures: a spot picked in the pictures as taken, lengths with sigma, control, scale. */
 
-import {attempt, button, download, el, field, get, number, on, say, send, table, withSigma} from "./core.js";
-import {controlForm, controlRows} from "./picture_control.js";
-import {Wall} from "./picture_views.js";
+import {attempt, button, download, el, field, get, on, say, send, table} from "./core.js";
+import {missing} from "./missing.js";
+import {ORANGE} from "./palette.js";
+import {counted, csv, number, withSigma} from "./words.js";
+import {controlForm, controlRows, mm} from "./picture_control.js";
+import {Wall, addressOf} from "./picture_views.js";
 
 const BAD_PX = 2;
-const mm = (value) => number(1000 * value, "", 3);
+const shownBy = (count) => counted(count, "picture shows the spot", "pictures show the spot");
 
 export function tab(studio) {
-  document.head.append(el("link", {rel: "stylesheet", href: "/app/pictures.css"}));
   let held = {token: "", points: [], control: null, last: null, unit: studio.state.unit};
   let control = {token: "", rows: []};
   let chosen = [];
@@ -29,11 +31,11 @@ export function tab(studio) {
   const controlBox = el("div", {});
   const lastBox = el("div", {});
 
-  const panel = el("div", {class: "pictures"},
+  const content = el("div", {},
     el("h2", {}, "Pick a spot"),
     el("div", {class: "buttons"},
-      button("Choose it on the map", takeSpot, {class: "primary"}),
-      button("Show the pictures", () => { ready().root.hidden = false; })),
+      button("Choose on the map", takeSpot, {class: "primary"}),
+      button("Show pictures", () => { ready().root.hidden = false; })),
     el("details", {ontoggle: (event) => event.target.open && attempt(listPictures)},
       el("summary", {}, "Start from a picture"), field("Find", find), list),
     el("div", {class: "row"}, field("Name of the point", name), field("Sigma of a pick by eye, px", sigma)),
@@ -42,6 +44,9 @@ export function tab(studio) {
     el("h2", {}, "Length"), lengthText, scaleBox,
     el("h2", {}, "Control"), controlBox, lastBox,
   );
+  const lack = missing(studio, content, () => (["pictures", "sparse", "dem"].some((name) => studio.state.has[name]) ? null
+    : ["There are no pictures to pick in yet: fly the plan or import your own in Run, then reconstruct them.", "run", "Open Run"]));
+  const panel = el("div", {class: "pictures"}, lack.element, content);
   find.addEventListener("input", () => attempt(listPictures));
 
   function ready() {
@@ -70,7 +75,7 @@ export function tab(studio) {
     const found = await get("/api/pictures/seeing", {...params, count: 40});
     if (!found.pictures.length) throw new Error("no picture shows that spot");
     clearSpot();
-    ready().show(found.total + " pictures show the spot", found.pictures);
+    ready().show(shownBy(found.total), found.pictures);
     say("The spot is at " + number(found.place.n, held.unit, 5) + " north, " + number(found.place.e, held.unit, 5)
       + " east. Click it in a picture" + (found.hidden ? "; in " + found.hidden + " it is hidden." : "."));
     return found;
@@ -88,7 +93,7 @@ export function tab(studio) {
   /* A picture whole; what is picked in it says which others show the spot. */
   async function showOne(image) {
     clearSpot();
-    const about = await attempt(() => get("/api/pictures/" + image.split("/").map(encodeURIComponent).join("/") + "/about"));
+    const about = await attempt(() => get(addressOf(image) + "/about"));
     if (!about) return;
     ready().show("Click the spot in the picture", [{name: image, x: about.width / 2, y: about.height / 2, whole: true}]);
   }
@@ -110,7 +115,7 @@ export function tab(studio) {
       const {x, y} = view.pick;
       attempt(async () => {
         const found = await get("/api/pictures/seeing", {image: view.name, x, y, count: 40});
-        wall.title.textContent = found.total + " pictures show the spot";
+        wall.title.textContent = shownBy(found.total);
         wall.waiting = found.pictures.filter((one) => !wall.of(one.name));
         view.seen = {...view.seen, whole: false};
         wall.showMore(5);
@@ -132,7 +137,7 @@ export function tab(studio) {
     const found = await send("/api/picks/spot", {picks: views.map(asPick)});
     if (mine !== checking) return;
     const {spot} = found;
-    spotText.textContent = spot.views + " pictures, " + number(spot.rms_px, "px", 2) + " rms; sigma north "
+    spotText.textContent = counted(spot.views, "picture") + ", " + number(spot.rms_px, "px", 2) + " rms; sigma north "
       + mm(spot.sigma[0]) + ", east " + mm(spot.sigma[1]) + ", down " + mm(spot.sigma[2]) + (held.unit === "m" ? " mm" : " thousandths");
     found.residuals.forEach((one) => {
       const view = wall.of(one.image);
@@ -154,7 +159,7 @@ export function tab(studio) {
       if (!target.pick || target.pick.matched_to) target.set({x: one.x, y: one.y, sigma_px: one.sigma_px, matched_to: view.name});
     });
     found.refused.forEach((one) => wall.of(one.name)?.say("not found: " + one.why, "warn"));
-    say("Found in " + (found.picks.length - 1) + " pictures, not in " + found.refused.length + ".");
+    say("Found in " + counted(found.picks.length - 1, "picture") + ", not in " + found.refused.length + ".");
     await look();
   }
 
@@ -230,19 +235,19 @@ export function tab(studio) {
         point.coded ? "marker" : [button("Open", () => openPoint(point), {"aria-label": "Open " + point.name}), " ",
           button("Delete", () => attempt(() => removePoint(point.name)), {"aria-label": "Delete " + point.name})],
       ];
-    })), el("div", {class: "buttons"}, button("Save the table as CSV", exportPoints)));
+    })), el("div", {class: "buttons"}, button("Export CSV", exportPoints)));
     studio.map.put({
-      kind: "point", name: "picked", title: "Picked points", colour: "#e69f00", group: "Pictures",
+      kind: "point", name: "picked", title: "Picked points", colour: ORANGE, group: "Pictures",
       shapes: held.points.filter((point) => point.spot).map((point) => [[point.spot.e, point.spot.n]]),
       texts: held.points.filter((point) => point.spot).map((point) => point.name),
     });
   }
 
   function exportPoints() {
-    const quoted = (text) => (/[",\n]/.test(text) ? "\"" + text.replaceAll("\"", "\"\"") + "\"" : text);
     const rows = held.points.filter((point) => point.spot).map(({name: of, spot}) => [
-      quoted(of), spot.n, spot.e, spot.down, ...spot.sigma, spot.views, spot.rms_px].join(","));
-    download("points.csv", ["name,north,east,down,sigma_north,sigma_east,sigma_down,views,rms_px", ...rows].join("\n") + "\n", "text/csv");
+      of, spot.n, spot.e, spot.down, ...spot.sigma, spot.views, spot.rms_px]);
+    const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down", "views", "rms_px"];
+    download("points.csv", csv(header, rows), "text/csv");
   }
 
   function choose(point, isOn) {
@@ -319,6 +324,7 @@ export function tab(studio) {
   return {
     name: "pictures", title: "Pictures", panel,
     enter(args) {
+      if (!lack.show()) return;
       attempt(async () => {
         await load();
         if (!name.value) name.value = freeName();

@@ -1,18 +1,19 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
-import {attempt, button, el, field, get, number, on, say, send} from "./core.js";
+import {attempt, button, el, field, get, on, say, send} from "./core.js";
+import {fileDrop} from "./file_drop.js";
+import {AS_IN_FILE, withChange, withChanges} from "./plan_changes.js";
 import {drawing} from "./plan_draw.js";
-import {
-  AS_IN_FILE, canRedo, canUndo, current, record, redo, same, startHistory, undo, withChange, withChanges,
-} from "./plan_history.js";
 import {latest} from "./plan_latest.js";
 import {playback} from "./plan_play.js";
-import {profileView} from "./plan_profile.js";
+import {planProfile} from "./plan_profile.js";
 import {resultsPanel} from "./plan_results.js";
 import {settingsPanel} from "./plan_settings.js";
 import {noShapes, paths, withImported} from "./plan_shapes.js";
 import {shown} from "./plan_show.js";
 import {summaryOf} from "./plan_words.js";
+import {canRedo, canUndo, current, record, redo, same, startHistory, undo} from "./undo.js";
+import {number} from "./words.js";
 
 const QUIET_MS = 900;  /* after which the figures are said */
 const PAGE = crypto.randomUUID();
@@ -21,17 +22,16 @@ const ROLES = {survey: "area to survey", no_go: "no-go zones", allowed: "allowed
 const EMPTY = "Draw the area to survey on the map, or import a file with it.";
 
 export function tab(studio) {
-  let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(), false, null, false, null, false];
+  let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(AS_IN_FILE), false, null, false, null, false];
   const body = () => current(history);
   const isDirty = () => !same(body(), AS_IN_FILE);
-  document.head.append(el("link", {rel: "stylesheet", href: new URL("plan.css", import.meta.url).href}));
 
   /* ---- Parts ---- */
 
   const view = shown(studio);
   const draw = drawing(studio, {changed: reshaped, moving: (shapes) => plan({...body(), shapes})});
   const results = resultsPanel((changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
-  const along = profileView((place) => view.mark(place));
+  const along = planProfile((place) => view.mark(place));
   const play = playback({ask: () => send("/api/plan/play", body()), mark: view.mark});
   const controls = el("div");
   const precision = el("p", {class: "note plan-precision"}, "How well the model of this survey is expected to be known.");
@@ -60,7 +60,9 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Export"), exports));
   const missing = el("div", {hidden: true}, el("p", {}, "The settings cannot be read; the line below says why."),
     el("div", {class: "buttons"}, button("Read them again", () => start())));
-  const panel = el("div", {}, missing, content);
+  const waiting = el("p", {class: "note"}, "Planning …");
+  const wait = (on) => { waiting.hidden = !on; };
+  const panel = el("div", {}, waiting, missing, content);
 
   /* ---- Planning in the background ---- */
 
@@ -68,7 +70,10 @@ export function tab(studio) {
     ask: (state, signal) => send("/api/plan/preview", {...state, page: PAGE}, {signal}),
     shown: settled,
     failed: (fault) => say(fault.message, "error"),
-    busy: view.dim,
+    busy(on) {
+      view.dim(on);
+      wait(on && !preview);
+    },
   });
 
   function plan(state, wait) {
@@ -118,6 +123,7 @@ export function tab(studio) {
   }
 
   function step(way) {
+    if (!file) return;
     history = way(history);
     buttons();
     settings.set(body().changes, preview);
@@ -145,7 +151,7 @@ export function tab(studio) {
 
   async function restart(state = AS_IN_FILE) {
     await load();
-    history = startHistory();
+    history = startHistory(AS_IN_FILE);
     if (!same(state, AS_IN_FILE)) history = record(history, state);
     buttons();
     settings.set(body().changes, file.saved);
@@ -240,31 +246,10 @@ export function tab(studio) {
   /* The middle of a file is the datum of a new survey. */
   const moved = (datum) => (same(datum, file.datum) ? {} : {area: datum});
 
-  const side = studio.map.leaflet.getContainer();
-  const dragged = (on) => side.classList.toggle("plan-drop", on);
-  side.addEventListener("dragover", (event) => {
-    if (!active || !event.dataTransfer.types.includes("Files")) return;
-    event.preventDefault();
-    dragged(true);
-  });
-  side.addEventListener("dragleave", () => dragged(false));
-  side.addEventListener("drop", (event) => {
-    dragged(false);
-    if (!active || !event.dataTransfer.files.length) return;
-    event.preventDefault();
-    importFile(event.dataTransfer.files[0]);
-  });
+  fileDrop(studio.map.leaflet.getContainer(), ([first]) => importFile(first), () => active && Boolean(file));
 
   /* ---- The page ---- */
 
-  document.addEventListener("keydown", (event) => {
-    const isText = event.target.closest("textarea, input:not([type=range], [type=checkbox])");
-    if (!active || !file || isText || !(event.ctrlKey || event.metaKey) || event.altKey) return;
-    const way = {z: event.shiftKey ? redo : undo, y: redo}[event.key.toLowerCase()];
-    if (!way) return;
-    event.preventDefault();
-    step(way);
-  });
   window.addEventListener("beforeunload", (event) => { if (isDirty()) event.preventDefault(); });
 
   async function enter() {
@@ -275,8 +260,11 @@ export function tab(studio) {
   }
 
   async function start() {
+    wait(true);
+    missing.hidden = true;
     await attempt(() => restart());
     [content.hidden, missing.hidden] = [!file, Boolean(file)];
+    if (!file || file.saved || !hasArea(body())) wait(false);
   }
 
   function leave() {
@@ -287,5 +275,6 @@ export function tab(studio) {
     view.dim(false);
   }
 
-  return {name: "plan", title: "Plan", panel, enter, leave};
+  const keys = {"Ctrl+z": () => step(undo), "Ctrl+Z": () => step(redo), "Ctrl+y": () => step(redo)};
+  return {name: "plan", title: "Plan", panel, enter, leave, keys};
 }

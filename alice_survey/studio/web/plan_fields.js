@@ -87,7 +87,7 @@ export function choice(title, options, changed, hint = "") {
 }
 
 /* Degrees from north towards a place of the compass, whole, 0 to 359. */
-export const bearing = (right, up) => ((Math.round(Math.atan2(right, up) * 180 / Math.PI) % 360) + 360) % 360;
+const bearing = (right, up) => ((Math.round(Math.atan2(right, up) * 180 / Math.PI) % 360) + 360) % 360;
 
 /* An arrow that points where something flows to, as long as it is strong: drag its tip, or use the
    arrow keys. `most` is the strength at the rim. `changed(strength, towards)`. */

@@ -1,8 +1,8 @@
 /* Playback of a dive on the map: play, pause, scrub, at several speeds. */
 
 import {attempt, button, el, field} from "./core.js";
-import {countUpTo, stateAt} from "./plan_way.js";
-import {clockOf} from "./plan_words.js";
+import {countUpTo, stateAt} from "./way.js";
+import {clock, paceText} from "./words.js";
 
 const SPEEDS = [1, 10, 30, 100];
 const STILL_MS = 1000;  /* between steps where motion is to be reduced */
@@ -13,7 +13,7 @@ export function playback({ask, mark}) {
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   const toggle = button("Play", () => (running ? pause() : play()));
   const scrub = el("input", {type: "range", min: 0, max: 1, step: "any", value: 0, disabled: true});
-  const speed = el("select", {}, SPEEDS.map((times) => el("option", {value: times}, times + " times as fast")));
+  const speed = el("select", {}, SPEEDS.map((times) => el("option", {value: times}, paceText(times))));
   const readout = el("p", {class: "note"}, "The vehicle on its way, as planned, or as flown where it was.");
   speed.selectedIndex = 2;
   let [dive, time, running, before] = [null, 0, false, 0];
@@ -59,11 +59,11 @@ export function playback({ask, mark}) {
   function show() {
     const state = stateAt(dive, time);
     const taken = countUpTo(dive.pictures_s, time);
-    const text = clockOf(time) + " of " + clockOf(Number(scrub.max)) + ", " + dive.what + ": depth " + state.depth.toFixed(2)
+    const text = clock(time) + " of " + clock(Number(scrub.max)) + ", " + dive.what + ": depth " + state.depth.toFixed(2)
       + " m" + (Number.isNaN(state.altitude) ? "" : ", altitude " + state.altitude.toFixed(2) + " m") + ", heading " + Math.round(state.heading) % 360 + "°, "
       + taken.toLocaleString("en") + " of " + dive.pictures_s.length.toLocaleString("en") + " pictures";
     scrub.value = time;
-    scrub.setAttribute("aria-valuetext", clockOf(time));
+    scrub.setAttribute("aria-valuetext", clock(time));
     readout.textContent = text;
     const every = Math.max(1, Math.ceil((state.index + 1) / WAY_POINTS));
     const way = [];

@@ -2,7 +2,7 @@
 
 import {el} from "./core.js";
 import {choice, compass, numberField, slider} from "./plan_fields.js";
-import {valueOf} from "./plan_history.js";
+import {valueOf} from "./plan_changes.js";
 
 const MAIN = [
   ["plan.altitude_m", "Altitude"], ["plan.forward_overlap", "Forward overlap"], ["plan.side_overlap", "Side overlap"],

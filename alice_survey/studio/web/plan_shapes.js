@@ -4,17 +4,19 @@
    [north, east] in metres, a ring's first not repeated. A path {kind, index, ring} names one ring:
    ring 0 is the outer one, ring 1 the first hole; of a corridor it is 0. */
 
+import {PLAN} from "./palette.js";
+
 export const KINDS = {
-  survey: {title: "Survey area", colour: "#c8553d"},
-  no_go: {title: "No-go zone", colour: "#b03a2e"},
-  allowed: {title: "Allowed area", colour: "#566573"},
-  corridors: {title: "Corridor", colour: "#117a65"},
+  survey: {title: "Survey area", colour: PLAN.area},
+  no_go: {title: "No-go zone", colour: PLAN.no_go},
+  allowed: {title: "Allowed area", colour: PLAN.allowed},
+  corridors: {title: "Corridor", colour: PLAN.corridor},
 };
 
 export const noShapes = () => ({survey: [], no_go: [], allowed: [], corridors: []});
 
 export const isClosed = (path) => path.kind !== "corridors";
-export const leastPoints = (path) => (isClosed(path) ? 3 : 2);
+const leastPoints = (path) => (isClosed(path) ? 3 : 2);
 const millimetres = (place) => place.map((value) => Math.round(value * 1000) / 1000);
 const replaced = (list, index, value) => list.map((item, i) => (i === index ? value : item));
 const without = (list, index) => list.filter((_, i) => i !== index);
@@ -41,7 +43,7 @@ function withShape(shapes, {kind, index}, shape) {
   return {...shapes, [kind]: replaced(shapes[kind], index, shape)};
 }
 
-export function withPoints(shapes, path, points) {
+function withPoints(shapes, path, points) {
   if (path.kind === "corridors") return withShape(shapes, path, points);
   const {outer, holes} = shapes[path.kind][path.index];
   return withShape(shapes, path, path.ring === 0
@@ -121,7 +123,7 @@ export function areaOf(points) {
 }
 
 /* Length along points, m. */
-export function lengthOf(points) {
+function lengthOf(points) {
   return points.slice(1).reduce(
     (sum, [n, e], i) => sum + Math.hypot(n - points[i][0], e - points[i][1]), 0,
   );

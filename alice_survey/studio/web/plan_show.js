@@ -1,11 +1,11 @@
 /* A plan on the map: its lines by kind, way, stations, footprints, counts, holes, homes. */
 
+import {COUNTS, PLAN, WHITE} from "./palette.js";
 import {boundsOf} from "./plan_shapes.js";
-import {counted, paintCounts, COUNT_COLOURS, MISSED_COLOUR} from "./plan_words.js";
+import {paintCounts} from "./plan_words.js";
+import {counted} from "./words.js";
 
-/* Kinds of lines with their colours, as on the page of a plan. */
-const LINES = {survey: "#1b4f72", cross: "#6c3483", closing: "#117a65", fill: "#b9770e", tie: "#c0392b"};
-const [WAY, HOME, SWATH, MARK, ALLOWED] = ["#7f8c8d", "#1e8449", "#2e86c1", "#8e44ad", "#566573"];
+const LINES = ["survey", "cross", "closing", "fill", "tie"];
 const GROUP = "The plan";
 const MADE = ["area", "plan"];  /* layers of the shell */
 const eastNorth = ([n, e]) => [e, n];
@@ -22,7 +22,7 @@ export function shown(studio) {
   const off = new Set(["plan-footprints"]);
   const away = new Set();
   const marks = leaflet.featureGroup();
-  let [names, stations, number, active, last, sigmaLayer] = [new Set(), null, 0, false, null, null];
+  let [names, stations, number, active, last, sigmaLayer, whole, fitted] = [new Set(), null, 0, false, null, null, null, ""];
   map.moreAt((place) => (active && stations ? stations.textAt(place) : ""));
 
   function put(about) {
@@ -52,22 +52,22 @@ export function shown(studio) {
   function putLayers(preview) {
     const {totals, holes, homes, routes, outline, area} = preview;
     put({
-      kind: "polygon", name: "plan-allowed", title: "The vehicle may be within", colour: ALLOWED, dashed: true, width: 1.2,
+      kind: "polygon", name: "plan-allowed", title: "The vehicle may be within", colour: PLAN.allowed, dashed: true, width: 1.2,
       shapes: area.allowed.flat().map((ring) => [...ring, ring[0]].map(eastNorth)),
     });
     if (holes.length) {
       put({
-        kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"), colour: MISSED_COLOUR, fill: 0.25,
+        kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"), colour: PLAN.missed, fill: 0.25,
         shapes: holes.map((hole) => hole.outer.map(eastNorth)),
         texts: holes.map((hole) => "Not seen: " + hole.area_m2.toFixed(2) + " m²"),
       });
     }
-    const footprints = put({kind: "polygon", name: "plan-footprints", title: "Footprints", colour: SWATH, shapes: []});
-    putLines("plan-way", "Way between lines", WAY, routes.flatMap(pieces), 1.1);
+    const footprints = put({kind: "polygon", name: "plan-footprints", title: "Footprints", colour: PLAN.footprint, shapes: []});
+    putLines("plan-way", "Way between lines", PLAN.way, routes.flatMap(pieces), 1.1);
     const drawn = lineLayers(preview.lines);
-    const points = put({kind: "point", name: "plan-stations", title: "Stations", colour: LINES.survey, shapes: []});
+    const points = put({kind: "point", name: "plan-stations", title: "Stations", colour: PLAN.survey, shapes: []});
     put({
-      kind: "point", name: "plan-home", title: homes.length > 1 ? "Homes" : "Home", colour: HOME, shapes: homes.map((home) => [eastNorth(home)]),
+      kind: "point", name: "plan-home", title: homes.length > 1 ? "Homes" : "Home", colour: PLAN.home, shapes: homes.map((home) => [eastNorth(home)]),
     });
     const rights = outline.map(([, right]) => right);
     stations = drawStations(map.leaflet, {
@@ -81,7 +81,7 @@ export function shown(studio) {
   /* Lines of one colour with a light rim: two shapes, however many lines there are. */
   function putLines(name, title, colour, lines, weight) {
     const group = put({kind: "line", name, title, colour, shapes: []});
-    const rim = leaflet.polyline(lines, {color: "#fff", weight: 5, opacity: 0.75, interactive: false});
+    const rim = leaflet.polyline(lines, {color: WHITE, weight: 5, opacity: 0.75, interactive: false});
     const drawn = leaflet.polyline(lines, {color: colour, weight, interactive: false});
     drawn.survey = {title, text: ""};
     group.addLayer(rim).addLayer(drawn);
@@ -95,16 +95,16 @@ export function shown(studio) {
       first += line.stations;
       return entry;
     });
-    const kinds = Object.keys(LINES).filter((kind) => lines.some((line) => line.kind === kind));
+    const kinds = LINES.filter((kind) => lines.some((line) => line.kind === kind));
     const groups = [];
     const drawn = kinds.flatMap((kind) => {
       const own = numbered.filter((line) => line.kind === kind);
       const ends = own.map(({from, to}) => [from, to]);
-      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), LINES[kind], ends, 1.7);
+      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), PLAN[kind], ends, 1.7);
       groups.push(group);
       return own.map((line) => {
         const made = stationLine(line.from, line.to, {
-          group, index: line.index, first: line.first, stations: line.stations, colour: LINES[kind],
+          group, index: line.index, first: line.first, stations: line.stations, colour: PLAN[kind],
         });
         const heading = ((made.heading * 180 / Math.PI) + 360) % 360;
         made.text = "Line " + line.index + ", dive " + line.dive + ": " + made.length.toFixed(2) + " m, heading "
@@ -125,7 +125,7 @@ export function shown(studio) {
     canvas.getContext("2d").putImageData(pixels, 0, 0);
     putPicture("plan-counts", "Pictures that see a place", canvas.toDataURL(), {...counts, ...size(pixels)}, {
       about: "Orange: below the requested overlap.",
-      scale: {label: "pictures that see a place", low: 0, high: most, colours: COUNT_COLOURS},
+      scale: {label: "pictures that see a place", low: 0, high: most, colours: COUNTS},
     });
   }
 
@@ -158,8 +158,8 @@ export function shown(studio) {
   function mark(place, heading = null, way = []) {
     marks.clearLayers();
     if (!place) return;
-    const style = {color: "#fff", weight: 2, fillColor: MARK, fillOpacity: 1, interactive: false};
-    if (way.length > 1) marks.addLayer(leaflet.polyline(way, {color: MARK, weight: 3, opacity: 0.8, interactive: false}));
+    const style = {color: WHITE, weight: 2, fillColor: PLAN.mark, fillOpacity: 1, interactive: false};
+    if (way.length > 1) marks.addLayer(leaflet.polyline(way, {color: PLAN.mark, weight: 3, opacity: 0.8, interactive: false}));
     if (heading === null) marks.addLayer(leaflet.circleMarker(place, {...style, radius: 6}));
     else {
       const px = 1 / 2 ** map.leaflet.getZoom();
@@ -176,9 +176,12 @@ export function shown(studio) {
     if (!bounds) return;
     const [south, west, north, east] = bounds;
     const margin = 0.04 * Math.max(north - south, east - west, 1);
-    map.extend([west - margin, south - margin, east + margin, north + margin]);
-    map.fit();
+    whole = [west - margin, south - margin, east + margin, north + margin];
+    map.extend(whole);
+    map.fit(false);
+    fitted = viewOf();
   }
+  const viewOf = () => [map.leaflet.getZoom(), ...Object.values(map.leaflet.getCenter())].join();
 
   /* The plan as it was made is put away while the one in work is shown. */
   function alone() {
@@ -190,6 +193,7 @@ export function shown(studio) {
 
   function enter() {
     active = true;
+    if (whole) map.extend(whole);
     marks.addTo(map.leaflet);
     alone();
     show(last);
@@ -206,6 +210,9 @@ export function shown(studio) {
     stations?.remove();
     stations = null;
     active = false;
+    const isMoved = viewOf() !== fitted;
+    map.extend(map.data.extent);
+    if (!isMoved) map.fit(false);
     marks.remove();
     away.forEach((name) => map.show(name, true));
     away.clear();

@@ -1,40 +1,17 @@
 /* The figures of a plan as words. */
 
+import {COUNTS, PLAN} from "./palette.js";
+import {counted, duration, share} from "./words.js";
+
 const known = (value) => value !== null && value !== undefined && !Number.isNaN(value);
-const plain = (value) => value.toString().replace("-", "−");
-const rounded = (value, digits) => plain(Number(value.toPrecision(digits)));
-
-/* "1 dive", "3 dives". */
-export const counted = (count, word) => count.toLocaleString("en") + " " + word + (count === 1 ? "" : "s");
-
-/* "48 s", "12 min", "3.4 h". */
-export function durationOf(seconds) {
-  if (seconds < 99.5) return Math.round(seconds) + " s";
-  if (seconds < 180 * 60) return Math.round(seconds / 60) + " min";
-  return (seconds / 3600).toFixed(1) + " h";
-}
-
-/* "0:48", "12:03", "1:02:03". */
-export function clockOf(seconds) {
-  const whole = Math.max(0, Math.floor(seconds));
-  const pair = (value) => String(value).padStart(2, "0");
-  const [hours, minutes] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60];
-  return (hours ? hours + ":" + pair(minutes) : minutes) + ":" + pair(whole % 60);
-}
-
-/* All of it is only what is all of it: 0.99996 is 99.99 %. */
-export function shareOf(share, decimals = 2) {
-  if (share >= 1) return "100 %";
-  const scale = 10 ** decimals;
-  return (Math.min(Math.round(100 * share * scale), 100 * scale - 1) / scale).toString() + " %";
-}
+const rounded = (value, digits) => Number(value.toPrecision(digits)).toString().replace("-", "−");
 
 const ROWS = [
   ["Area", (t) => known(t.area_m2) && rounded(t.area_m2, 4) + " m²"],
-  ["Covered", (t) => known(t.covered) && shareOf(t.covered)],
-  ["In stereo", (t) => known(t.stereo) && shareOf(t.stereo)],
-  ["At the requested overlap", (t) => known(t.at_overlap) && shareOf(t.at_overlap)],
-  ["Time", (t) => known(t.duration_s) && durationOf(t.duration_s)],
+  ["Covered", (t) => known(t.covered) && share(t.covered)],
+  ["In stereo", (t) => known(t.stereo) && share(t.stereo)],
+  ["At the requested overlap", (t) => known(t.at_overlap) && share(t.at_overlap)],
+  ["Time", (t) => known(t.duration_s) && duration(t.duration_s)],
   ["Dives", (t) => known(t.dives) && String(t.dives)],
   ["Energy", (t) => known(t.energy_wh) && Math.round(t.energy_wh) + " Wh"],
   ["Longest dive", (t) => known(t.longest_dive_wh) && known(t.usable_wh)
@@ -63,8 +40,8 @@ export function totalRows(totals) {
 /* [name, text] of the six that say most. */
 export function keyFigures(t) {
   return [
-    ["Time", durationOf(t.duration_s)], ["Dives", String(t.dives)], ["Energy", Math.round(t.energy_wh) + " Wh"],
-    ["Pictures", t.pictures.toLocaleString("en")], ["Data", rounded(t.data_gb, 3) + " GB"], ["Covered", shareOf(t.covered)],
+    ["Time", duration(t.duration_s)], ["Dives", String(t.dives)], ["Energy", Math.round(t.energy_wh) + " Wh"],
+    ["Pictures", t.pictures.toLocaleString("en")], ["Data", rounded(t.data_gb, 3) + " GB"], ["Covered", share(t.covered)],
   ];
 }
 
@@ -73,17 +50,14 @@ export function summaryOf(preview) {
   if (!preview.ok) return "No plan: " + preview.error;
   const {totals: t, warnings, holes} = preview;
   return [
-    counted(t.lines, "line") + ", " + durationOf(t.duration_s) + ", " + counted(t.dives, "dive"),
+    counted(t.lines, "line") + ", " + duration(t.duration_s) + ", " + counted(t.dives, "dive"),
     counted(t.pictures, "picture"),
-    shareOf(t.covered) + " covered",
+    share(t.covered) + " covered",
     ...(holes.length ? [counted(holes.length, "hole")] : []),
     ...(warnings.length ? [counted(warnings.length, "warning")] : []),
   ].join(", ");
 }
 
-/* The colour of a number of pictures, light to dark, and of what lacks overlap. */
-const RAMP = ["#f7fcf0", "#ddf1d9", "#bfe6c4", "#93d3c0", "#60bbc8", "#3597c1", "#1474b0", "#084c8d"];
-const MISSED = "#d35400";
 const OUTSIDE = 255;
 
 /* Pixels of the picture of counts as they are shown: red pictures, green lines, blue 1 at the
@@ -94,15 +68,12 @@ export function paintCounts(data) {
   counts.sort((a, b) => a - b);
   const most = Math.max(1, counts[Math.round(0.99 * (counts.length - 1))] || 1);
   const channels = (colour) => [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
-  const [ramp, missed] = [RAMP.map(channels), channels(MISSED)];
+  const [ramp, missed] = [COUNTS.map(channels), channels(PLAN.missed)];
   for (let i = 0; i < data.length; i += 4) {
     const outside = data[i] === OUTSIDE;
-    const step = Math.min(RAMP.length - 1, Math.floor(data[i] / most * (RAMP.length - 1)));
+    const step = Math.min(COUNTS.length - 1, Math.floor(data[i] / most * (COUNTS.length - 1)));
     const colour = data[i + 2] ? ramp[step] : missed;
     data.set([...colour, outside ? 0 : data[i + 2] ? 215 : 190], i);
   }
   return most;
 }
-
-export const COUNT_COLOURS = RAMP;
-export const MISSED_COLOUR = MISSED;

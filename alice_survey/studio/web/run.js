@@ -1,8 +1,9 @@
 /* The Run tab: what is made, what is left and what it takes; the job that runs, its log, its end. */
 
-import {attempt, button, el, field, get, mayWrite, number, on, say, send, table} from "./core.js";
+import {attempt, button, el, field, get, mayWrite, on, say, send, table} from "./core.js";
+import {showSteps} from "./job_progress.js";
 import {startPage} from "./start.js";
-import {ago, duration, gigabytes, styled} from "./run_words.js";
+import {ago, counted, duration, gigabytes, number} from "./words.js";
 
 const STATES = {
   "up to date": ["✓", "good", "made"],
@@ -22,7 +23,6 @@ const LOUD_EVERY_S = 60;
 const SILENT_MS = 6000;
 
 export function tab(studio) {
-  styled();
   const job = el("section", {class: "job", "aria-label": "Running now", hidden: true});
   const last = el("section", {class: "job", "aria-label": "Last run", hidden: true});
   const begin = el("section", {"aria-label": "Start"});
@@ -97,7 +97,7 @@ export function tab(studio) {
     showSteps(job.querySelector(".bars"), running);
     const warned = job.querySelector(".warn");
     warned.hidden = !running.warned;
-    warned.textContent = running.warned ? `${running.warned} warning${running.warned > 1 ? "s" : ""}; the last: ${running.warnings.at(-1)}` : "";
+    warned.textContent = running.warned ? `${counted(running.warned, "warning")}; the last: ${running.warnings.at(-1)}` : "";
     job.querySelector(".stop").disabled = stopping || !mayWrite();
     speak();
   }
@@ -158,7 +158,7 @@ export function tab(studio) {
   /* ---- What is left ---- */
 
   function costText(cost) {
-    return cost ? `about ${duration(cost.time_s)} on ${known.cores} core${known.cores > 1 ? "s" : ""}, ${gigabytes(cost.disk_mb)} of disk` : "";
+    return cost ? `About ${duration(cost.time_s)} on ${counted(known.cores, "core")}, ${gigabytes(cost.disk_mb)} of disk` : "";
   }
 
   function showBegin() {
@@ -254,7 +254,6 @@ export function tab(studio) {
   }
 
   function moreView() {
-    const against = el("input", {type: "text", spellcheck: "false", autocomplete: "off"});
     const rows = [
       ["quality", "Judge the pictures: sharpness, exposure, overlap", "image"],
       ["control", "Find coded markers in the pictures", "image"],
@@ -263,17 +262,14 @@ export function tab(studio) {
       ["plan export", "Write the plan for vehicles again", "plan"],
     ];
     const list = el("div", {class: "buttons column"});
-    const compare = el("div", {}, field("Folder of an earlier survey of the place", against, "its whole path"),
-      el("div", {class: "buttons"}, button("Find what has changed", () => start("evaluate", {against: against.value.trim()}), {class: "needs"})));
     return {
-      element: el("details", {}, el("summary", {}, "Further commands"), list, compare),
+      element: el("details", {}, el("summary", {}, "Further commands"), list),
       show(state, busy) {
         const made = (name) => state.stages.some((stage) => stage.name === name && stage.made_utc);
         list.replaceChildren(...rows.filter((one) => made(one[2])).map(([name, title]) =>
           button(title, () => start(name), {disabled: Boolean(busy) || Boolean(state.elsewhere) || !mayWrite()})));
-        compare.hidden = !made("dense");
-        compare.querySelector(".needs").disabled = Boolean(busy) || Boolean(state.elsewhere) || !mayWrite();
-        this.element.hidden = !list.firstChild && compare.hidden;
+        if (made("dense")) list.append(button("Compare with another survey", () => studio.open("compare")));
+        this.element.hidden = !list.firstChild;
       },
     };
   }
@@ -343,29 +339,6 @@ export function tab(studio) {
       timer = null;
     },
   };
-}
-
-/* ---- Bars of the steps, made once and changed in place ---- */
-
-function showSteps(place, job) {
-  job.steps.forEach((step, i) => {
-    let bar = place.children[i];
-    if (!bar) {
-      bar = el("div", {class: "step"}, el("span", {id: "step-" + i}), el("progress", {"aria-labelledby": "step-" + i}));
-      place.append(bar);
-    }
-    const count = step.done === null ? "" : step.total ? ` ${step.done} of ${step.total}` : ` ${step.done}`;
-    const left = step.remaining_s === null ? `, for ${duration(step.elapsed_s)}` : `, about ${duration(step.remaining_s)} left`;
-    bar.firstChild.textContent = step.step + count + left;
-    const meter = bar.lastChild;
-    if (step.total) {
-      meter.max = step.total;
-      meter.value = step.done;
-    } else {
-      meter.removeAttribute("value");
-    }
-  });
-  while (place.children.length > job.steps.length) place.lastChild.remove();
 }
 
 /* ---- The log: fetched while it is open ---- */

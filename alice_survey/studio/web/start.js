@@ -1,7 +1,8 @@
 /* The first start: what shall become of this folder, a survey to plan or a model of pictures. */
 
-import {attempt, button, el, field, mayWrite, number, say, send} from "./core.js";
-import {duration, gigabytes} from "./run_words.js";
+import {attempt, button, el, field, mayWrite, say, send} from "./core.js";
+import {fileDrop} from "./file_drop.js";
+import {counted, duration, gigabytes, number} from "./words.js";
 
 const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt,.plan";
 
@@ -43,20 +44,16 @@ function planForm(studio) {
     el("small", {}, "Left empty, it lies at the example's place, off Haifa; all lengths are right there too."),
     el("p", {}, "or a file of the area from a map program: choose it, or drop it here"),
     field("Map file", file, "GeoJSON, KML, KMZ, GeoPackage, zipped shapefile, WKT or QGroundControl plan; its outline is then the area"));
-  ["dragover", "dragleave", "drop"].forEach((kind) => place.addEventListener(kind, (event) => {
-    event.preventDefault();
-    place.classList.toggle("over", kind === "dragover");
-    if (kind === "drop" && event.dataTransfer.files.length) {
-      file.files = event.dataTransfer.files;
-      taken();
-    }
-  }));
   const taken = () => {
     const has = Boolean(file.files.length);
     [latitude, longitude, along, across].forEach((input) => { input.disabled = has; });
     if (has) say(`${file.files[0].name}: the area is taken from it`);
   };
   file.addEventListener("change", taken);
+  fileDrop(place, (files) => {
+    file.files = files;
+    taken();
+  });
   const make = button("Make the survey", null, {class: "primary", type: "submit", disabled: !mayWrite()});
   const form = el("form", {hidden: true, onsubmit: save},
     el("h2", {}, "Plan a survey"),
@@ -230,9 +227,9 @@ function picturesForm(started, disk) {
 
   function showFound(seen) {
     const size = seen.size_mb / 1000;
-    const times = seen.first_utc ? `from ${clock(seen.first_utc)} to ${clock(seen.last_utc)} UTC` : "no times";
+    const times = seen.first_utc ? `from ${minuteOf(seen.first_utc)} to ${minuteOf(seen.last_utc)} UTC` : "no times";
     const gps = seen.with_gps ? `GPS in ${Math.round(100 * seen.with_gps / seen.looked_at)} % of them` : "no GPS";
-    const what = [seen.pictures ? `${seen.pictures} pictures` : null, seen.videos ? `${seen.videos} video${seen.videos > 1 ? "s" : ""}, ${duration(seen.video_s)}` : null].filter(Boolean).join(" and ");
+    const what = [seen.pictures ? counted(seen.pictures, "picture") : null, seen.videos ? `${counted(seen.videos, "video")}, ${duration(seen.video_s)}` : null].filter(Boolean).join(" and ");
     found.replaceChildren(...[
       el("h3", {}, `Found: ${what}`),
       el("ul", {}, seen.cameras.map((one) => el("li", {}, el("strong", {}, one.name), ` ${one.pictures} pictures${one.width_px ? ` of ${one.width_px} × ${one.height_px} pixels` : ""}${one.device ? ", " + one.device : ""}`)),
@@ -268,4 +265,4 @@ function held(folder) {
   return [count(folder.pictures, "picture"), count(folder.videos, "video"), count(folder.folders, "folder")].filter(Boolean).join(", ") || "empty";
 }
 
-const clock = (utc) => utc.slice(0, 19).replace("T", " ");
+const minuteOf = (utc) => utc.slice(0, 19).replace("T", " ");

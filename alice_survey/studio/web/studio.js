@@ -78,7 +78,8 @@ function show(name, on) {
 }
 
 const map = {...core, put, remove, show};
-described.forEach(put);
+const isLine = (about) => ["flown", "plan", "footprints"].includes(about.name);
+described.forEach((about) => put({...about, shown: about.shown && !(state.has.mosaic && isLine(about))}));
 if (state.background && state.datum) {
   const tiles = background(state.datum, state.background).addTo(core.leaflet);
   const input = el("input", {type: "checkbox", value: "background", checked: true});
@@ -87,6 +88,21 @@ if (state.background && state.datum) {
   groupOf("Under it").append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
     el("small", {}, "From the network, as --background says; its terms are those of " + host + ".")));
 }
+
+/* The list is open where it leaves two thirds of the map free, until it is closed by hand. */
+const layersKey = "alice-survey layers";
+const layers = document.getElementById("layers");
+layers.firstElementChild.addEventListener("click", () => sessionStorage.setItem(layersKey, layers.open ? "closed" : "open"));
+const fits = () => layers.offsetWidth * layers.offsetHeight < core.leaflet.getSize().x * core.leaflet.getSize().y / 3;
+function fold() {
+  const wanted = sessionStorage.getItem(layersKey);
+  layers.open = wanted ? wanted === "open" : window.innerWidth > 900 && Boolean(list.firstChild);
+  if (layers.open && !wanted && !fits()) layers.open = false;
+}
+new ResizeObserver(() => { if (layers.open && !sessionStorage.getItem(layersKey) && !fits()) layers.open = false; }).observe(list);
+fold();
+mapData.room = () => (layers.open && fits() ? {paddingTopLeft: [56, 24], paddingBottomRight: [layers.offsetWidth + 32, 40]} : {});
+core.fit(false);
 
 /* ---- Tabs ---- */
 
@@ -100,6 +116,7 @@ let current = null;
 async function refresh() {
   Object.assign(state, await get("/api/state"));
   const now = await get("/api/map");
+  mapData.extent = now.extent;
   core.extend(now.extent);
   now.layers.forEach(put);
 }
@@ -153,9 +170,11 @@ async function begin() {
     next.click();
   });
   document.addEventListener("keydown", (event) => {
-    const typing = event.target.closest("input, textarea, select, [role=application]");
-    if (typing && event.target.id !== "map-canvas") return;
-    const name = (event.ctrlKey || event.metaKey ? "Ctrl+" : "") + (event.shiftKey && event.key.length > 1 ? "Shift+" : "") + event.key;
+    const withCtrl = event.ctrlKey || event.metaKey;
+    const typing = event.target.closest(withCtrl ? "input:not([type=range], [type=checkbox], [type=radio]), textarea"
+      : "input, textarea, select, [role=application]");
+    if (event.altKey || (typing && event.target.id !== "map-canvas")) return;
+    const name = (withCtrl ? "Ctrl+" : "") + (event.shiftKey && event.key.length > 1 ? "Shift+" : "") + event.key;
     const act = current?.keys?.[name];
     if (!act) return;
     event.preventDefault();

@@ -12,6 +12,9 @@ from typing import Any
 
 from alice_survey.studio.server import Server
 
+FOLDED = "sessionStorage.setItem('alice-survey layers', 'closed')"
+"""Script of a page that keeps the list of layers from what is clicked on the map."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:

@@ -128,7 +128,7 @@ def test_tiles_are_shown_and_taken_away(tmp_path: Path, tiles: tuple[str, list[s
         )
         assert min(left for left, *_ in covered) <= box["x"]
         assert max(right for _, right, *_ in covered) >= box["x"] + box["width"]
-        page.get_by_text("Layers", exact=True).click()
+        page.locator("#layers summary").click()
         page.get_by_label("Map of 127.0.0.1").uncheck()
         assert page.locator(under).count() == 0
         assert heard.complaints == []

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 from tests.alice_survey.studio.test_model_browser import click, kept
 from tests.alice_survey.studio.test_model_browser import named as figures
 from tests.alice_survey.studio.test_pictures_browser import moved_to, said
@@ -33,6 +33,7 @@ def journey() -> Iterator[tuple[Any, Heard]]:
         page.set_default_timeout(WAIT_MS)
         heard = Heard()
         heard.listen(page)
+        page.add_init_script(FOLDED)
         yield page, heard
         page.close()
 
@@ -198,7 +199,7 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
         corners = [(east - 0.2, north - 0.15), (east + 0.2, north - 0.15), (east, north + 0.2)]
         button(page, "Area").click()
         click(page, *corners)
-        button(page, "Finish (D)").click()
+        button(page, "Finish").click()
         page.wait_for_selector("tr[data-measure]")
         (measure,) = kept(page)
         places = np.array(measure["places"])

@@ -19,7 +19,7 @@ from alice_survey.base.artefacts import write_json
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import sketch_mesh
 from tests.alice_survey.report.tiny import SLOPE, tiny_workspace
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
@@ -46,6 +46,7 @@ def opened(folder: Path, width: int = 1280) -> Iterator[tuple[Any, Heard]]:
         page = browser.new_page(viewport={"width": width, "height": 900}, reduced_motion="reduce")
         heard = Heard()
         heard.listen(page)
+        page.add_init_script(FOLDED)
         page.goto(server.address + "#model")
         page.wait_for_selector("body[data-ready]", timeout=20_000)
         page.wait_for_selector("#panel-model:visible")
@@ -103,16 +104,16 @@ def test_lengths_areas_and_exports(tmp_path: Path) -> None:
         true = math.dist(*length["places"])
         assert true == pytest.approx(0.4, abs=0.01)
         assert named(length)["length"]["value"] == pytest.approx(true * RISE, rel=1e-3)
-        page.wait_for_selector(".profile svg polyline")
-        page.locator(".profile").focus()
+        page.wait_for_selector(".model .profile-chart path.of")
+        page.get_by_role("slider", name="Place along the profile").focus()
         page.keyboard.press("End")
-        assert "along: −9.8" in page.locator(".profile + p").inner_text()
+        assert "along: −9.8" in page.locator(".model .profile-chart p").inner_text()
 
         page.get_by_role("button", name="Volume", exact=True).click()
         page.get_by_label("Plane of the volume").select_option("level")
         page.get_by_label("Height of the plane, m").fill("-10")
         click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
-        page.get_by_role("button", name="Finish (D)").click()
+        page.get_by_role("button", name="Finish", exact=True).click()
         volume = measured(page, 2)[1]
         assert named(volume)["volume"]["value"] == pytest.approx(0.2 * 0.5 * SLOPE, rel=0.05)
         assert named(volume)["aspect"]["value"] == pytest.approx(270.0, abs=1.0)
@@ -145,7 +146,7 @@ def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
             page.wait_for_timeout(400)
         page.keyboard.press("Enter")
         page.keyboard.press("Backspace")
-        page.keyboard.press("d")
+        page.keyboard.press("f")
         (line,) = measured(page, 1)
         assert len(line["places"]) == 3
         page.keyboard.press("r")
@@ -191,12 +192,12 @@ def test_it_is_accessible(width: int, tmp_path: Path) -> None:
         page.get_by_label("Side of quadrats, m").fill("0.2")
         click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
         assert Axe().run(page).violations_count == 0
-        page.keyboard.press("d")
+        page.keyboard.press("f")
         (area,) = measured(page, 1)
         assert 4 <= len(area["quadrats"]) <= 6  # a row that is half outside
         page.get_by_role("button", name="Profile", exact=True).click()
         click(page, (0.2, 0.5), (0.6, 0.5), (0.6, 0.9))
-        page.keyboard.press("d")
+        page.keyboard.press("f")
         measured(page, 2)
         page.get_by_text("Mesh", exact=True).click()
         page.wait_for_selector(".mesh[data-ready]", timeout=30_000)

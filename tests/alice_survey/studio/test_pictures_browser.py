@@ -10,7 +10,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from reconstruct.placing.control_file import read_control, read_picks
 from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 from tests.alice_survey.studio.test_pictures import Truth
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -67,6 +67,7 @@ def test_points_are_picked_measured_and_made_control(small_survey: Path, tmp_pat
         page = browser.new_page(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
         heard = Heard()
         heard.listen(page)
+        page.add_init_script(FOLDED)
         page.goto(f"{server.url.split('?')[0]}?token={server.studio.token}#pictures")
         page.wait_for_selector("body[data-ready]", timeout=WAIT_MS)
         marked = []

@@ -13,7 +13,7 @@ from axe_playwright_python.sync_playwright import Axe
 from alice_survey.base.config import SurveyConfig, load_config
 from missions.plan.preview import preview
 from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.client import FOLDED, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 800), "phone": (400, 800)}
@@ -73,7 +73,7 @@ class PlanPage:
         self.settled(before)
 
     def corner(self, number: int) -> Any:
-        return self.page.locator(".plan-handle.corner").nth(number)
+        return self.page.locator(".vertex.corner").nth(number)
 
     def drag(self, handle: Any, right: float, down: float) -> None:
         before = self.plans
@@ -117,6 +117,7 @@ def opened(browser: Any, address: str, size: str = "desk") -> PlanPage:
     page.set_default_timeout(15_000)
     heard = Heard()
     heard.listen(page)
+    page.add_init_script(FOLDED)
     page.goto(f"{address}#plan")
     page.wait_for_selector("#panel-plan[data-read]")
     return PlanPage(page=page, heard=heard)
@@ -142,16 +143,16 @@ def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: 
         assert plan.text() != drawn
         plan.press("Control+z")
 
-        plan.drag(page.locator(".plan-handle.middle").first, -10, 0)
-        assert page.locator(".plan-handle.corner").count() == 5
+        plan.drag(page.locator(".vertex.middle").first, -10, 0)
+        assert page.locator(".vertex.corner").count() == 5
         plan.press("Delete")
-        assert page.locator(".plan-handle.corner").count() == 4
+        assert page.locator(".vertex.corner").count() == 4
         plan.corner(1).focus()
         plan.press("ArrowUp")
         plan.press("Control+z")
         if size == "phone":
             _press_long(plan, plan.corner(1))
-            assert page.locator(".plan-handle.corner").count() == 3
+            assert page.locator(".vertex.corner").count() == 3
             plan.press("Control+z")
         for _ in range(2):  # what was removed, and what was inserted
             plan.press("Control+z")
@@ -310,7 +311,7 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
         assert "current_mps = 0.06" in plan.text()
 
         before = plan.plans
-        page.locator("input[type=file]").set_input_files(
+        page.locator("#panel-plan input[type=file]").set_input_files(
             {
                 "name": "reef.geojson",
                 "mimeType": "application/json",
@@ -332,7 +333,7 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
         page.keyboard.press("End")
         words = profile.get_attribute("aria-valuetext")
         assert "dive 1" in words and "over the sea floor" in words
-        assert words == page.locator(".plan-profile .note").inner_text()
+        assert words == page.locator("#panel-plan .profile-chart .note").inner_text()
 
         page.get_by_text("Play the dive").click()
         page.get_by_role("button", name="Play", exact=True).click()
@@ -351,7 +352,8 @@ def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
             "() => /\\d mm/.test(document.querySelector('.plan-precision').textContent)",
             timeout=120_000,
         )
-        page.get_by_text("Layers").click()
+        if not page.locator("#layers").evaluate("(layers) => layers.open"):
+            page.locator("#layers summary").click()
         expected = page.locator("[data-layer=plan-sigma]")
         expected.wait_for()
         assert expected.get_by_role("checkbox").is_checked()

@@ -66,8 +66,8 @@ def test_a_survey_from_an_empty_folder_is_planned_and_flown(page: Any, tmp_path:
         page.get_by_label("Longitude, degrees").fill("5.92")
         page.get_by_label("Depth of the sea floor, m").fill("12")
         page.get_by_text("Size and camera").click()
-        page.get_by_label("Length, m").fill("1.3")
-        page.get_by_label("Width, m").fill("1.5")
+        page.get_by_label("Length, m", exact=True).fill("1.3")
+        page.get_by_label("Width, m", exact=True).fill("1.5")
         is_accessible(page)
         assert not (reef / "survey.toml").exists()
         with page.expect_navigation():
@@ -161,12 +161,12 @@ def test_pictures_are_looked_at_and_imported(page: Any, tmp_path: Path) -> None:
         is_accessible(page)
         named(page, "left").click()
         page.get_by_text("Found: 5 pictures").wait_for()
-        page.get_by_label("Navigation").fill(str(tmp_path / "none.csv"))
-        page.get_by_label("Navigation").blur()
+        page.locator("#panel-run").get_by_label("Navigation").fill(str(tmp_path / "none.csv"))
+        page.locator("#panel-run").get_by_label("Navigation").blur()
         page.locator(".found .error").wait_for()
         assert named(page, "Import them").is_disabled()
-        page.get_by_label("Navigation").fill(str(log))
-        page.get_by_label("Navigation").blur()
+        page.locator("#panel-run").get_by_label("Navigation").fill(str(log))
+        page.locator("#panel-run").get_by_label("Navigation").blur()
         page.get_by_text("5 of 5 picture times").wait_for()
         named(page, "Import them").click()
         page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
@@ -190,9 +190,11 @@ def test_a_fault_and_the_report_inside(page: Any, tmp_path: Path) -> None:
         is_accessible(page)
         page.keyboard.press("Escape")
         page.wait_for_selector("dialog.report", state="detached")
-        page.get_by_text("Further commands").click()
-        page.get_by_label("Folder of an earlier survey").fill(str(workspace / "dense"))
-        named(page, "Find what has changed").click()
+        page.evaluate(
+            "(against) => import('/app/core.js').then(({send}) =>"
+            " send('/api/run/start', {name: 'evaluate', arguments: {against}}))",
+            str(workspace / "dense"),
+        )
         page.get_by_role("heading", name="Score the survey: failed").wait_for(timeout=LONG_MS)
         line = page.locator("section[aria-label='Last run'] .error").inner_text()
         assert line and "Traceback" not in line

@@ -77,7 +77,6 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         assert int(page.locator(MAP).get_attribute("data-level")) == 3 > first
         assert all(width > 0 for _, width in all_loaded(page, 3))
 
-        page.get_by_text("Layers", exact=True).click()
         page.get_by_label("Height", exact=True).check()
         page.wait_for_function(
             "() => document.querySelector('img[src*=\"/tiles/height/\"]')?.naturalWidth > 0",

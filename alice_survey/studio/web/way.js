@@ -85,3 +85,13 @@ export function pathData(xs, ys) {
     return text;
   }).join("");
 }
+
+/* Round values within limits, at most about so many, and the decimals that they need. */
+export function ticks(low, high, most) {
+  const rough = (high - low) / most;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((n) => n * power).find((n) => n >= rough * (1 - 1e-9));
+  const found = [];
+  for (let at = Math.ceil(low / step - 1e-9) * step; at <= high + 1e-9 * step; at += step) found.push(at);
+  return [found, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))];
+}

@@ -1,4 +1,4 @@
-"""Pure functions of the Plan tab, run with node: shapes, history, requests, words."""
+"""Pure functions of the studio's tabs, run with node: shapes, undo, requests, words."""
 
 import json
 import math
@@ -138,7 +138,7 @@ def test_undoing_all_of_random_edits_returns_to_the_start(
     start, end, again, states = run(
         tmp_path_factory.mktemp("undo"), "plan_shapes",
         """(async () => {
-          const h = await import("./plan_history.js");
+          const h = await import("./undo.js");
           let history = h.startHistory({changes: {}, shapes: s});
           let count = 1;
           edits.forEach(([what, a, b, x]) => {
@@ -179,10 +179,10 @@ def test_undoing_all_of_random_edits_returns_to_the_start(
 
 def test_edits_of_one_tag_within_a_second_are_one_step(tmp_path: Path) -> None:
     sizes = run(
-        tmp_path, "plan_history",
+        tmp_path, "undo",
         """(() => {
           const state = (v) => ({changes: {plan: {altitude_m: v}}, shapes: null});
-          let h = m.startHistory();
+          let h = m.startHistory(state(0));
           h = m.record(h, state(1), "altitude", 0);
           h = m.record(h, state(2), "altitude", 900);
           h = m.record(h, state(3), "altitude", 1800);
@@ -204,7 +204,7 @@ def test_a_value_that_the_file_has_is_no_change(tmp_path: Path) -> None:
         "written": {"plan": ["line_spacing_m"]},
     }
     changed = run(
-        tmp_path, "plan_history",
+        tmp_path, "plan_changes",
         """[
           m.withChange({}, f, "plan", "altitude_m", 2.5),
           m.withChange({plan: {altitude_m: 2.5}}, f, "plan", "altitude_m", 2.0),
@@ -267,7 +267,8 @@ def test_totals_as_words(tmp_path: Path) -> None:
         tmp_path, "plan_words",
         """[m.totalRows(t), m.summaryOf({ok: true, totals: t, warnings: [], holes: [1]}),
             m.summaryOf({ok: false, error: "too steep"}),
-            [...[98, 3600, 14400].map(m.durationOf), m.clockOf(3723), m.clockOf(48)]]""",
+            await import("./words.js").then(
+              (w) => [...[98, 3600, 14400].map(w.duration), w.clock(3723), w.clock(48)])]""",
         t=totals,
     )  # fmt: skip
     assert dict(rows)["Covered"] == "99.99 %"
@@ -300,7 +301,7 @@ def test_places_along_a_way_agree_with_shapely(tmp_path: Path) -> None:
     line = shapely.LineString(way)
     lengths = rng.uniform(0, line.length, 60)
     found, beyond = run(
-        tmp_path, "plan_way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
+        tmp_path, "way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
         p=way.tolist(), s=lengths.tolist(),
     )  # fmt: skip
     expected = shapely.get_coordinates(shapely.line_interpolate_point(line, lengths))
@@ -317,7 +318,7 @@ def test_a_profile_leads_to_its_place_whether_or_not_dives_begin_at_zero(tmp_pat
     }  # fmt: skip
     goes_on = {**ends, "s_m": [0, 10, 10, 30]}
     found, along = run(
-        tmp_path, "plan_way",
+        tmp_path, "way",
         "[both.map((p) => s.map((x) => m.profileAt(p, routes, m.growing(p.s_m), x))),"
         " both.map((p) => m.growing(p.s_m))]",
         both=[ends, goes_on], routes=routes, s=[0, 5, 20, 30, 99],
@@ -336,7 +337,7 @@ def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> N
         "altitude_m": [12, 2, 2, 2], "heading_deg": [350, 10, 10, 190],
     }  # fmt: skip
     states, counts = run(
-        tmp_path, "plan_way",
+        tmp_path, "way",
         "[[0, 1, 2, 3.5, 9, -1].map((t) => m.stateAt(d, t)),"
         " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t))]",
         d=dive,
@@ -349,5 +350,79 @@ def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> N
 
 
 def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
-    path = run(tmp_path, "plan_way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
+    path = run(tmp_path, "way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
     assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
+
+
+def test_ticks_are_round_and_within_their_limits(tmp_path: Path) -> None:
+    limits = [(-12.31, -11.87, 5), (0.0, 1234.0, 5), (0.0, 4.0, 4), (-5.0, 0.0, 5)]
+    found = run(tmp_path, "way", "l.map(([a, b, n]) => m.ticks(a, b, n))", l=limits)
+    for (low, high, most), (values, digits) in zip(limits, found, strict=True):
+        assert 2 <= len(values) <= most + 1
+        assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
+        assert np.allclose(values, np.round(values, digits), atol=1e-9)
+
+
+def test_words_of_figures(tmp_path: Path) -> None:
+    words = run(
+        tmp_path, "words",
+        """[m.number(-1234.56, "m", 4), m.number(null), m.withSigma(-1.23456, 0.0123, "m"),
+            m.withSigma(2, 0), m.clock(-20.5), m.clock(null), m.share(0.9996, 1), m.share(null),
+            m.counted(1, "line"), m.counted(1200, "pass", "passes"), m.fixed(-0.256, 2, "m"),
+            m.csv(["a", "b"], [['x"y', null], ["1,2", 3]])]""",
+    )  # fmt: skip
+    assert words == [
+        "−1,235 m", "unknown", "−1.235 ± 0.012 m", "2.000", "−0:20", "–", "99.9 %", "–",
+        "1 line", "1,200 passes", "−0.26 m", 'a,b\n"x""y",\n"1,2",3\n',
+    ]  # fmt: skip
+
+
+def annotation(kind: str, points: list[list[float]], **more: Any) -> dict[str, Any]:
+    return {"id": "a", "shape": {"kind": kind, "points": points, "holes": [], **more}}
+
+
+def test_vertices_of_annotations_come_and_go(tmp_path: Path) -> None:
+    """Handles have places [north, east], annotations [east, north]."""
+    outer, hole = [[0, 0], [4, 0], [4, 3]], [[2, 1], [3, 1], [3, 2]]
+    shape = annotation("polygon", outer, holes=[hole])
+    rings, moved, more, fewer, none, shifted = run(
+        tmp_path, "annotate_shapes",
+        """(() => {
+          const t = m.targetOf(s);
+          return [t.rings, t.move(1, 0, [9, 8]).shape, t.insert(0, 2, null).shape,
+                  t.remove(1, 0).shape, t.remove(0, 0), t.shift(1, 10).shape];
+        })()""",
+        s=shape,
+    )  # fmt: skip
+    assert [ring["closed"] for ring in rings] == [True, True]
+    assert rings[0]["points"] == [[0, 0], [0, 4], [3, 4]]
+    assert moved["points"] == outer and moved["holes"][0][0] == [8, 9]
+    assert more["points"] == [*outer, [2, 1.5]]
+    assert fewer["holes"] == [] and fewer["points"] == outer
+    assert none is None
+    assert shifted["points"][0] == [10, 1] and shifted["holes"][0][0] == [12, 2]
+
+
+@settings(max_examples=8, deadline=None)
+@given(corner=st.integers(0, 3), turn=st.floats(0, 3), place=st.tuples(*[st.floats(-9, 9)] * 2))
+def test_a_rectangle_stays_one(
+    corner: int,
+    turn: float,
+    place: tuple[float, float],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Whichever corner moves anywhere, the opposite one stays and all angles are right."""
+    c, s = math.cos(turn), math.sin(turn)
+    points = [[c * x - s * y, s * x + c * y] for x, y in ((0, 0), (4, 0), (4, 3), (0, 3))]
+    moved = run(
+        tmp_path_factory.mktemp("rectangle"), "annotate_shapes",
+        "m.targetOf(a).move(0, corner, place).shape.points",
+        a=annotation("rectangle", points), corner=corner, place=place,
+    )  # fmt: skip
+    got = np.array(moved)
+    opposite = (corner + 2) % 4
+    assert np.allclose(got[opposite], points[opposite])
+    assert np.allclose(got[corner], place[::-1])
+    assert np.allclose(got[0] + got[2], got[1] + got[3], atol=1e-9)
+    sides = np.roll(got, -1, axis=0) - got
+    assert np.allclose((sides * np.roll(sides, -1, axis=0)).sum(axis=1), 0, atol=1e-8)
