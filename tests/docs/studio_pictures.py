@@ -34,13 +34,12 @@ def main() -> None:
             page.set_default_timeout(WAIT_MS)
             page.goto(server.address)
             page.wait_for_selector("body[data-ready]")
-            for name in ("plan", "model", "pictures", "run"):
+            for name in ("model", "pictures", "run", "plan"):
                 page.locator(f"#tab-{name}").click()
                 page.wait_for_timeout(4000)
                 {"model": measure, "pictures": open_pictures}.get(name, lambda _: None)(page)
                 photograph(page, out / f"{name}.jpg")
             page.set_viewport_size(NARROW)
-            page.locator("#tab-plan").click()
             page.wait_for_timeout(1500)
             photograph(page, out / "narrow.jpg")
 
@@ -49,16 +48,18 @@ def measure(page: Any) -> None:
     """A profile over the middle of the map, and an area beside it."""
     box = page.locator("#map-canvas")
     east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
-    size = 130 / 2 ** float(box.get_attribute("data-zoom"))
+    pixel = 1 / 2 ** float(box.get_attribute("data-zoom"))
+    east, size = east - 110 * pixel, 130 * pixel  # the list of layers takes the right of the map
     page.get_by_role("button", name="Area", exact=True).click()
     corners = ((-1, -1), (0.2, -1.3), (0.6, 0.1), (-0.5, 0.5))
     click(page, *((east + size * e, north + size * n) for e, n in corners))
-    page.get_by_role("button", name="Finish (D)").click()
+    page.get_by_role("button", name="Finish", exact=True).click()
     page.wait_for_selector("tr[data-measure]")
     page.get_by_role("button", name="Profile", exact=True).click()
-    click(page, (east - 1.2 * size, north + size), (east + 1.2 * size, north + 0.6 * size))
-    page.get_by_role("button", name="Finish (D)").click()
-    page.wait_for_selector(".profile svg polyline")
+    click(page, (east - 0.8 * size, north + 0.9 * size), (east + 0.9 * size, north + 0.6 * size))
+    page.get_by_role("button", name="Finish", exact=True).click()
+    page.wait_for_selector(".model .profile-chart:not([hidden])")
+    page.locator(".model .profile-chart").scroll_into_view_if_needed()
     page.wait_for_timeout(1000)
 
 
