@@ -118,7 +118,8 @@ def test_points_are_picked_measured_and_made_control(small_survey: Path, tmp_pat
         said(page, "Saved to control.csv")
         known = read_control(workspace / "control.csv").points[0]
         assert (known.name, known.north_m, known.use) == ("spot 0", 0.5, "control")
-        assert page.get_by_text("sigmas").count() == 1  # it is far off, and said in words
+        far_off = page.locator("#panel-pictures").get_by_text("sigmas")  # in words too
+        assert far_off.count() == 1
         assert page.locator("#status.error").count() == 0
         assert Axe().run(page).response["violations"] == []
         page.get_by_role("button", name="Open spot 1").click()
