@@ -65,7 +65,7 @@ def measure(page: Any) -> None:
 
 def open_pictures(page: Any) -> None:
     """The pictures that see the middle of the map."""
-    page.get_by_role("button", name="Choose it on the map").click()
+    page.get_by_role("button", name="Choose on the map").click()
     page.locator("#map-canvas").focus()
     page.keyboard.press("Enter")
     page.locator(".picture-view[data-ready]").nth(3).wait_for(timeout=WAIT_MS)

@@ -205,12 +205,13 @@ def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
     from reconstruct.placing.scale import find_point
 
     model, pictures = read_model(drone / "sparse"), Pictures.open(drone)
+    warps = read_warps(drone / "sparse" / "cameras.json")
     view = model.views[1]
     seen = model.observations[model.observations[:, 1] == 1, 0]
     misses = []
     for point in model.points_world[seen[::10]]:
         pixel = pictures.warp(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
-        found = find_point(f"{view.image}:{pixel[0]},{pixel[1]}", model, pictures)
+        found = find_point(f"{view.image}:{pixel[0]},{pixel[1]}", model, warps)
         misses.append(np.linalg.norm(found - point))
     height = np.median(view.world_from_cam.inv().apply(model.points_world[seen])[:, 2])
     assert np.median(misses) < 0.02 * height
