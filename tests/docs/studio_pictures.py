@@ -39,8 +39,10 @@ def main() -> None:
                 page.wait_for_timeout(4000)
                 {"model": measure, "pictures": open_pictures}.get(name, lambda _: None)(page)
                 photograph(page, out / f"{name}.jpg")
-            page.set_viewport_size(NARROW)
-            page.wait_for_timeout(1500)
+            page = browser.new_page(viewport=NARROW, reduced_motion="reduce")
+            page.goto(f"{server.address}#plan")
+            page.wait_for_selector("#panel-plan[data-read]", timeout=WAIT_MS)
+            page.wait_for_timeout(3000)
             photograph(page, out / "narrow.jpg")
 
 
