@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import read_stage
-from alice_survey.base.errors import ImageError
 from alice_survey.base.manifest import ImageRecord, read_manifest
 from alice_survey.studio.paths import Workspace
 from reconstruct.pictures.undistorted import Colour, read_colour
@@ -119,28 +118,6 @@ class TakenPictures:
         if halvings:
             size = tuple(-(-length >> halvings) if length else 0 for length in part.shape[1::-1])
             part = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
-        return _webp(part)
-
-    def part(self, name: str, box: tuple[int, int, int, int], longest: int) -> bytes:
-        """A part of a picture as WebP, shrunk until its longer side is so many pixels at most.
-
-        Args:
-            name: of the picture.
-            box: left, top, width and height.
-            longest: pixels.
-
-        Raises:
-            ImageError: it goes beyond the picture, or that cannot be decoded.
-            FileNotFoundError: see `path`.
-        """
-        picture, (left, top, width, height) = self.colour(name), box
-        high, wide = picture.shape[:2]
-        if not (0 <= left < left + width <= wide and 0 <= top < top + height <= high):
-            raise ImageError(f"a part of {name} beyond its {wide} x {high} pixels")
-        part, shrink = picture[top : top + height, left : left + width], longest / max(box[2:])
-        if shrink < 1.0:
-            size = max(1, round(width * shrink)), max(1, round(height * shrink))
-            part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
         return _webp(part)
 
 

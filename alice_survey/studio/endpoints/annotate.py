@@ -34,8 +34,6 @@ from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, L
 
 _MOST_BYTES = 64 << 20
 _MOST_PICTURES = 8
-_CROP_PX = 420
-"""Longer side of a part of a picture that is sent."""
 _AROUND = 0.6
 """Of an outline's extent that is shown around it."""
 _LEAST_AROUND_PX = 40
@@ -171,14 +169,6 @@ class _Annotate:
             raise FileNotFoundError(name)
         return found
 
-    def crop(self, call: Call) -> Content:
-        """A part of a picture as taken."""
-        name, taken = call.query.get("image", ""), self._studio.taken
-        left, top, width, height = (int(call.number(n)) for n in ("x", "y", "width", "height"))
-        tag = f"{taken.token(name)}-{left}-{top}-{width}-{height}"
-        data = taken.part(name, (left, top, width, height), _CROP_PX)
-        return Content(data=data, kind="image/webp", tag=tag)
-
 
 def _mark(mark: MeasuredMark) -> dict[str, Any]:
     middle = mark.geometry.centroid
@@ -222,7 +212,6 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/annotations", answer=tab.all),
         Endpoint(path="/api/annotations/table", answer=tab.table),
-        Endpoint(path="/api/annotations/crop", answer=tab.crop),
         Endpoint(path="/api/annotations/export/{format}", answer=tab.give),
         Endpoint(path="/api/annotations/{id}/pictures", answer=tab.pictures),
         Endpoint(

@@ -7,8 +7,6 @@ nobody can guess.
 
 import os
 import secrets
-import subprocess
-import sys
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +17,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-import alice_survey
 from alice_survey.base.config import Config
 from alice_survey.base.contents import shown
 from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import AliceError
 from alice_survey.base.frames import Datum
-from alice_survey.base.run.interrupts import for_other_programs
 from alice_survey.kit.document import PictureLayer
 from alice_survey.kit.map import picture_json
 from alice_survey.report.colours import change_rasters
@@ -39,7 +35,6 @@ from reconstruct.views.model import datum_of
 _MOST_OPEN = 4
 _MOST_SIBLINGS = 200
 _MOST_SHOWN = 100
-_ROOT = Path(alice_survey.__file__).parents[1]
 """Where a program that is started finds the package."""
 _CHANGED = "the survey was worked on meanwhile: choose it again"
 
@@ -62,7 +57,6 @@ class _Compare:
         self._studio, self._folder = studio, studio.workspace.folder
         self._lock = threading.Lock()
         self._others: dict[str, _Other] = {}
-        self._process: subprocess.Popen[bytes] | None = None
         self._results = lru_cache(_MOST_OPEN)(self._layers_of)
 
     def near(self, call: Call) -> dict[str, Any]:
@@ -137,9 +131,7 @@ class _Compare:
                 "regions": _regions(change),
                 "layers": [_picture(layer, (0.0, 0.0)) for layer in layers.picture_layers()],
             })  # fmt: skip
-        with self._lock:
-            running = self._process is not None
-        return {"results": found, "running": running}
+        return {"results": found}
 
     def _layers_of(self, name: str) -> Layers:
         return Layers(
@@ -154,44 +146,6 @@ class _Compare:
         with self._lock:
             layers = self._results(name)
         return _tile(layers, call)
-
-    def evaluate(self, call: Call) -> dict[str, Any]:
-        """Begin to find what has changed since another survey."""
-        other = self._other(call)
-        command = [
-            sys.executable, "-m", "alice_survey", "evaluate", "-w", str(self._folder), "--against",
-            str(other.workspace.folder), "--quiet",
-        ]  # fmt: skip
-        with self._lock:
-            if self._process is not None:
-                raise StaleError("a comparison is being made already: wait for it")
-            with for_other_programs():
-                self._process = subprocess.Popen(  # noqa: S603 (of a fixed list)
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE, start_new_session=True, cwd=_ROOT,
-                )  # fmt: skip
-        threading.Thread(target=self._wait, args=(other.name,), daemon=True).start()
-        return {"running": True}
-
-    def _wait(self, name: str) -> None:
-        """Wait for the comparison, or for the studio's end; publish how it went."""
-        process = self._process
-        assert process is not None  # noqa: S101 - set before this thread starts
-        while True:
-            try:
-                output, errors = process.communicate(timeout=0.5)
-                break
-            except subprocess.TimeoutExpired:
-                if self._studio.ending.is_set():
-                    process.terminate()
-        with self._lock:
-            self._process = None
-        lines = errors.decode("utf-8", "replace").splitlines()
-        fault = next((one for one in reversed(lines) if one.startswith("error: ")), "")
-        ok = process.returncode == 0
-        text = output.decode("utf-8", "replace").splitlines()[:1] if ok else [fault or "it ended"]
-        line = " ".join(text).removeprefix("error: ")
-        self._studio.publish("compare", {"ok": ok, "name": name, "text": shown(line)})
 
 
 def _is_survey(folder: Path) -> bool:
@@ -261,5 +215,4 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
             answer=tab.change_tile,
         ),
         Endpoint(path="/api/compare/{id}/tiles/{layer}/{level}/{x}/{y}.webp", answer=tab.tile),
-        Endpoint(path="/api/compare/{id}/evaluate", answer=tab.evaluate, **post),
     )

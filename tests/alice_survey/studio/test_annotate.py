@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -144,17 +143,7 @@ def test_an_annotation_is_shown_in_the_pictures_that_see_it(
             ring = np.array(shown["rings"][0])
             inside = (ring >= [left, top]) & (ring <= [left + width, top + height])
             assert inside.all(axis=1).mean() >= 0.5 and 0 < shown["sigma_px"] < 3
-            query = f"image={shown['image']}&x={left}&y={top}&width={width}&height={height}"
-            crop = ask(server, f"/api/annotations/crop?{query}")
-            assert crop.headers["content-type"] == "image/webp"
-            picture = cv2.imdecode(np.frombuffer(crop.body, np.uint8), cv2.IMREAD_COLOR)
-            assert picture.shape[1] / picture.shape[0] == pytest.approx(width / height, rel=0.02)
         assert ask(server, "/api/annotations/nothing/pictures").status == 404
-        for image in ("../survey.toml", "left/none.png", "%2e%2e/sparse/frame.json"):
-            reply = ask(server, f"/api/annotations/crop?image={image}&x=0&y=0&width=9&height=9")
-            assert reply.status == 404
-        wide = f"image={found['pictures'][0]['image']}&x=0&y=0&width=99999&height=9"
-        assert ask(server, f"/api/annotations/crop?{wide}").status == 400
 
 
 def test_a_survey_without_a_mosaic_says_so(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """The Compare tab's endpoints: another survey is looked at where a page with the token said."""
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 import rasterio
 
 from alice_survey.studio.server import Server
+from reconstruct.evaluate.against import evaluate_against
 from tests.alice_survey.report.tiny import tiny_workspace
 from tests.alice_survey.studio.client import ask, call, serving
 
@@ -93,14 +93,8 @@ def test_what_has_changed_is_found_and_mapped(small_survey: Path, tmp_path: Path
     with serving(tmp_path / "now") as server:
         opened = call(server, "/api/compare/open", {"path": "before"}).json
         assert ask(server, "/api/compare/results").json["results"] == []
-        assert call(server, f"/api/compare/{opened['id']}/evaluate").json == {"running": True}
-        assert call(server, f"/api/compare/{opened['id']}/evaluate").status == 409
-        for _ in range(600):
-            found = ask(server, "/api/compare/results").json
-            if not found["running"]:
-                break
-            time.sleep(0.2)
-        (result,) = found["results"]
+        evaluate_against(tmp_path / "now", Path(opened["path"]))
+        (result,) = ask(server, "/api/compare/results").json["results"]
         assert result["gained"]["volume_l"] == pytest.approx(litres, rel=0.1)
         region = result["regions"][0]
         assert (region["east_m"], region["north_m"]) == pytest.approx((east, north), abs=0.05)

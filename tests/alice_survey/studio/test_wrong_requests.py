@@ -15,7 +15,7 @@ from alice_survey.studio.server import Server
 from tests.alice_survey.report.tiny import tiny_workspace
 from tests.alice_survey.studio.client import Reply, ask, call, serving
 
-STARTS = {"/api/run/start", "/api/compare/{id}/evaluate", "/api/start/pictures"}
+STARTS = {"/api/run/start", "/api/start/pictures"}
 """Endpoints that start a program."""
 LONGEST = 200
 NAMES = (
