@@ -1,6 +1,7 @@
 """A chart of the user's own under a survey: how its values are coloured, and where it lies."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,18 @@ from alice_survey.base.contents import one_line
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.records import PlaceRecord
+from alice_survey.kit.document import ShapeLayer
 from alice_survey.report.colours import Numbers
-from missions.areas.bathymetry import check_raster
+from missions.areas.bathymetry import check_raster, read_bathymetry
+from missions.plan.page_map import contour_layer
 from reconstruct.raster import local_crs
 from reconstruct.views.model import datum_of
 
 CHART = "chart"
 """Name of its layer."""
 CHART_TITLE = "Chart"
+_CONTOUR_DETAIL = 1000
+"""Parts of the width of a survey below which a bend of a contour is left out."""
 
 
 def check_chart(path: Path) -> Path:
@@ -74,6 +79,28 @@ def chart_numbers(path: Path) -> Numbers | None:
 def _middle(values: Array) -> tuple[float, float]:
     low, high = np.percentile(values, [2, 98])
     return float(low), float(max(high, low + 1e-9))
+
+
+def contours_of(
+    path: Path, place: PlaceRecord, extent: tuple[float, float, float, float]
+) -> Iterator[ShapeLayer]:
+    """Lines of equal depth of a chart around a survey; none of a picture.
+
+    Args:
+        path: of the chart.
+        place: datum of the survey.
+        extent: west, south, east and north of the survey, m.
+
+    Raises:
+        PlanError: its values cannot be taken for depths; the line says why.
+    """
+    if chart_numbers(path) is None:
+        return
+    west, south, east, north = extent
+    around = max(east - west, north - south)
+    box = south - around, west - around, north + around, east + around
+    bathymetry = read_bathymetry(path, datum_of(place), bounds_ne=box)
+    yield from contour_layer(bathymetry, box, around / _CONTOUR_DETAIL)
 
 
 def chart_crs(place: PlaceRecord) -> CRS:

@@ -200,7 +200,7 @@ class Layers:
             overlays: rasters to show over a map, in place of those of the stages.
             address: where their tiles are.
         """
-        self._workspace, self._chart, self._address = workspace, chart, address
+        self._workspace, self.chart, self._address = workspace, chart, address
         self._overlays = {one.name: one for one in overlays}
         self._files = {name: one.file for name, one in self._overlays.items()} or FILES
         self._most_renderers = min(_MOST_RENDERERS, os.cpu_count() or 1)
@@ -230,11 +230,11 @@ class Layers:
             return self._workspace.file(self._files[name].split("/"))
         if (
             name != CHART
-            or self._chart is None
+            or self.chart is None
             or Held.of(self._workspace.folder).frame.datum is None
         ):
             raise FileNotFoundError(name)
-        return self._chart
+        return self.chart
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
         with self._unchanged(name, None) as token:

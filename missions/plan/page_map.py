@@ -76,7 +76,7 @@ def plan_map(
     detail_m = max(_FINEST_M, max(extent[2] - extent[0], extent[3] - extent[1]) * _DETAIL)
     layers = [*_coverage_layers(certificate), *more, *_area_layers(plan, detail_m)]
     if bathymetry is not None:
-        layers += _contour_layer(bathymetry, extent, detail_m)
+        layers += contour_layer(bathymetry, extent, detail_m)
     camera = f"Footprints ({rig.reference} camera)"
     layers.append(_derived("footprints", camera, "polygon", "footprint", shown=False))
     layers += _dive_layers(plan, detail_m)
@@ -263,7 +263,7 @@ def _simplified(points_ne: Array, detail_m: float) -> Array:
     return np.asarray(LineString(points_ne).simplify(detail_m).coords)
 
 
-def _contour_layer(bathymetry: Bathymetry, extent: Extent, detail_m: float) -> Iterator[ShapeLayer]:
+def contour_layer(bathymetry: Bathymetry, extent: Extent, detail_m: float) -> Iterator[ShapeLayer]:
     """Lines of equal depth over the map, at round depths."""
     from contourpy import contour_generator  # here, as few maps need it
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
+from alice_survey.base.errors import PlanError, warn
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 from alice_survey.report.held import Held
 from alice_survey.report.run import survey_map
 from alice_survey.report.shapes import shape_layers
-from alice_survey.studio.chart import CHART
+from alice_survey.studio.chart import CHART, contours_of
 from alice_survey.studio.endpoints.base import Call, Endpoint, Studio, scale_json
 
 TABS = ("plan", "model", "pictures", "annotate", "compare", "follow", "run")
@@ -65,13 +66,20 @@ class _Shell:
         held = Held.of(self.studio.workspace.folder)
         pictures = self.studio.layers.picture_layers()
         layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
+        surveyed = [layer for layer in layers if layer.name != CHART]
+        extent = (-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M)
+        if surveyed:
+            extent = map_extent(survey_map(held, surveyed))
+        chart, place = self.studio.layers.chart, held.frame.datum
+        if chart is not None and place is not None:
+            try:
+                layers += contours_of(chart, place, extent)
+            except PlanError as fault:
+                warn(f"the chart has no contours: {fault}")
         found: dict[str, Any] = {"layers": []}
         if layers:
             found = json.loads(map_data(survey_map(held, layers))[0])
-        surveyed = [layer for layer in layers if layer.name != CHART]
-        found["extent"] = [-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M]
-        if surveyed:
-            found["extent"] = map_extent(survey_map(held, surveyed))
+        found["extent"] = extent
         for described, layer in zip(found["layers"], layers, strict=True):
             described |= _listed(layer)
         return found
@@ -80,11 +88,14 @@ class _Shell:
 def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     """What the list of layers says of one."""
     is_base = isinstance(layer, PictureLayer) and layer.base
+    group = "Under it" if layer.name in (CHART, "contours") else layer.group
+    if is_base:
+        group = "Picture"
     return {
         "title": layer.title,
         "about": layer.about,
         "shown": layer.shown,
-        "group": "Picture" if is_base else "Under it" if layer.name == CHART else layer.group,
+        "group": group,
         "under": layer.name == CHART,
         "scale": scale_json(layer) if isinstance(layer, PictureLayer) else None,
     }

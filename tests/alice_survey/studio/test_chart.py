@@ -18,6 +18,7 @@ from tests.alice_survey.studio.client import ask, serving
 
 SPOT_M = (30.0, -20.0)
 """North and east of the datum, where the chart has a hill of 4 m."""
+RADIUS_M = 36.0
 
 
 def written_chart(path: Path, workspace: Path, *, bands: int = 1, crs: str = "EPSG:32636") -> Path:
@@ -31,7 +32,7 @@ def written_chart(path: Path, workspace: Path, *, bands: int = 1, crs: str = "EP
     transform = Affine(1, 0, middle[0] - 200, 0, -1, middle[1] + 200)
     rows, columns = np.mgrid[:400, :400] + 0.5
     x, y = transform.c + columns, transform.f - rows
-    spot = np.hypot(x - at[0], y - at[1]) < 40
+    spot = np.hypot(x - at[0], y - at[1]) < RADIUS_M
     values = np.where(spot, -6.0, -10.0 - 0.001 * rows).astype(np.float32)
     if bands == 3:
         values = np.where(spot, 250, 20).astype(np.uint8)
@@ -64,6 +65,22 @@ def test_a_chart_lies_where_it_belongs(tmp_path: Path, bands: int) -> None:
         layer["north"] - (rows.mean() + 0.5) * high, layer["west"] + (columns.mean() + 0.5) * wide,
     )  # fmt: skip
     assert place == pytest.approx(SPOT_M, abs=1.0)
+
+
+def test_contours_lie_round_the_hill(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path / "reef")
+    chart = written_chart(tmp_path / "chart.tif", workspace)
+    with serving(workspace, chart=chart) as server:
+        found = ask(server, "/api/map").json
+    extent = found["extent"]
+    (contours,) = (one for one in found["layers"] if one["name"] == "contours")
+    reach = max(extent[2] - extent[0], extent[3] - extent[1])
+    places = np.vstack([np.array(shape) for shape in contours["shapes"]])
+    assert np.abs(places - [[extent[0], extent[1]]]).max() <= 2 * reach + 1  # around the survey
+    away = np.hypot(places[:, 0] - SPOT_M[1], places[:, 1] - SPOT_M[0])
+    assert abs(away.mean() - RADIUS_M) < 1.0  # a cell
+    assert np.abs(away - RADIUS_M).max() < 3.0
+    assert all(text.endswith(" m") for text in contours["texts"])
 
 
 def test_charts_that_cannot_be_shown(tmp_path: Path) -> None:

@@ -173,5 +173,5 @@ def test_pages_hear_of_it_twice_a_second_at_most(dive: tuple[Server, Path]) -> N
         heard.append(time.monotonic()), publish(event, data))[1]  # fmt: skip
     assert call(server, "/api/follow/open", {"log": "nav.csv", "replay": 50}).status == 200
     wait_for(server, lambda found: found["lines"]["done"] >= 2)
-    assert len(heard) >= 3
+    assert len(heard) >= 2
     assert len(heard) <= 2.0 * (heard[-1] - heard[0]) + 2

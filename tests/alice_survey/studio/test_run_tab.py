@@ -260,8 +260,10 @@ def test_a_failed_import_may_be_begun_again(home: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_survey_is_planned_stopped_resumed_and_flown(tmp_path: Path) -> None:
-    settings_in(tmp_path / "reef")
-    with serving(tmp_path / "reef") as server:
+    file = settings_in(tmp_path / "reef") / "survey.toml"
+    small = file.read_text()
+    file.write_text(small.replace("_m = 1.3", "_m = 150.0").replace("_m = 1.5", "_m = 150.0"))
+    with serving(tmp_path / "reef") as server:  # a plan that takes long enough to be stopped
         assert started(server, "plan").status == 200
         until(lambda: (run_state(server)["job"] or {}).get("steps"), 60.0)
         assert started(server, "fly").status == 409
@@ -269,6 +271,7 @@ def test_a_survey_is_planned_stopped_resumed_and_flown(tmp_path: Path) -> None:
         assert ended(server)["state"] == "stopped"
         states = {one["name"]: one["state"] for one in run_state(server)["stages"]}
         assert states["plan"] == "interrupted"
+        file.write_text(small)
         assert started(server, "fly").status == 200
         failed = ended(server)
         assert failed["state"] == "failed" and failed["ways"][0]["name"] == "plan"

@@ -181,7 +181,7 @@ def test_no_method_but_get_and_head(server: Server, method: str) -> None:
 )
 def test_requests_out_of_form_get_nothing(server: Server, request_text: bytes) -> None:
     port = server.port
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", port), timeout=40) as connection:
         connection.sendall(request_text.replace(b"HOST", f"127.0.0.1:{port}".encode()))
         answer = b""
         with contextlib.suppress(ConnectionResetError):  # it was closed before all was read
