@@ -41,7 +41,7 @@ _MOST_INLINE = 100
 _DECIMALS, _DEGREE_DECIMALS = 4, 11
 """A tenth of a millimetre; about a micrometre."""
 _SAME_M = 6e-4
-"""Corners this near are the same: whoever draws may round to a millimetre."""
+"""Corners this near are the same: what is drawn may be rounded to a millimetre."""
 _MOST_CORNERS = 200_000
 
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]

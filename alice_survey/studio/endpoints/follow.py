@@ -1,5 +1,6 @@
 """The tab that follows a dive: its state, coverage, track, holes, and lines that close these."""
 
+import logging
 import math
 import tempfile
 import threading
@@ -13,14 +14,17 @@ import numpy as np
 from pydantic import Field
 
 from alice_survey.base.config import Config
+from alice_survey.base.contents import one_line
 from alice_survey.base.edited_files import StaleError
-from alice_survey.base.errors import AliceError, NavigationError
+from alice_survey.base.errors import AliceError, NavigationError, known_fault
 from alice_survey.studio.endpoints.base import Call, Content, Endpoint, Studio, zipped
 from missions.exports.options import options_of
 from missions.exports.registry import format_names
 from missions.exports.write import write_exports
 from missions.follow.session import DiveSession
 
+_LOG = logging.getLogger("uvicorn.error")
+"""Where the server reports its bugs too."""
 _POLL_S, _PUBLISH_S, _ALIVE_S = 0.2, 0.5, 5.0
 """A source is asked five times a second; pages hear of it twice a second at most, and of a silent
 one every few seconds."""
@@ -33,7 +37,8 @@ _LOG_FOLDERS = ("", "flight", "logs")
 _MOST_LOGS = 50
 _HEAD = 4096
 _COLOURS = np.zeros((256, 4), np.uint8)
-"""Colour and opacity of what a cell of the coverage is; dark to light as it is seen more often."""
+"""Colour and opacity of a cell of the coverage: grey not seen, orange in a picture, blue in stereo,
+green at the requested overlap."""
 _COLOURS[0] = (60, 60, 60, 60)
 for _bits in range(1, 8):
     _COLOURS[_bits] = (0, 158, 115, 150) if _bits & 4 else (
@@ -119,8 +124,10 @@ class FollowTab:
                 came = session.step()
                 self._news = self._news or came > 0 or session.fault is not None
                 self._propose_if_new(session)
-            except Exception as error:  # a thread's bug must be seen on the page
-                session.fault = f"{type(error).__name__}: {error}"
+            except Exception as error:  # libraries raise known faults as all kinds; a bug is logged
+                session.fault = known_fault(error) or f"{type(error).__name__}: {one_line(error)}"
+                if known_fault(error) is None:
+                    _LOG.exception("following a dive has failed")
                 self._news = True
             now_s = time.monotonic()
             due_s = self._sent_s + (_PUBLISH_S if self._news else _ALIVE_S)

@@ -59,7 +59,7 @@ tell(event="run_finished", exit_code=0, elapsed_s=1.0)
 """
 
 
-class Told(list[tuple[str, Any]]):
+class Published(list[tuple[str, Any]]):
     """What is published."""
 
     def __call__(self, event: str, data: Any) -> None:
@@ -67,8 +67,8 @@ class Told(list[tuple[str, Any]]):
 
 
 @contextlib.contextmanager
-def jobs_in(folder: Path, told: Told | None = None) -> Iterator[Jobs]:
-    jobs = Jobs(folder, Told() if told is None else told, [sys.executable, "-c", PROGRAM])
+def jobs_in(folder: Path, told: Published | None = None) -> Iterator[Jobs]:
+    jobs = Jobs(folder, Published() if told is None else told, [sys.executable, "-c", PROGRAM])
     try:
         yield jobs
     finally:
@@ -91,7 +91,7 @@ def until(happened: Callable[[], object], within_s: float = 20.0) -> None:
 
 
 def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
-    told = Told()
+    told = Published()
     with jobs_in(tmp_path, told) as jobs:
         jobs.start("quality")
         until(lambda: jobs.running() is None)
@@ -108,7 +108,7 @@ def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
 
 
 def test_at_most_four_are_published_in_a_second(tmp_path: Path) -> None:
-    told = Told()
+    told = Published()
     with jobs_in(tmp_path, told) as jobs:
         jobs.start("plan")
         until(lambda: any(data["job"] and data["job"]["steps"] for _, data in told))
@@ -205,7 +205,7 @@ def test_a_later_studio_finds_the_job_and_can_stop_it(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as killed:  # its threads go on; those of a killed studio would not
         killed.start("plan")
         until(lambda: killed.log(1)["total"] > 2)
-        told = Told()
+        told = Published()
         with jobs_in(tmp_path, told) as later:
             job = later.running()
             assert job is not None and job["name"] == "plan" and job["state"] == "running"
