@@ -103,7 +103,7 @@ def adjusted(
         raise ReconstructionError(f"only {len(rows)} stations are left")
     poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
     stations = [int(np.flatnonzero(found.shape.stations == row.station)[0]) for row in rows]
-    moved = found.shape.moved(place.scale, place.rotation)
+    moved = found.shape.moved(place.scale, place.rotation, place.translation)
     down = moved.modes.stations[stations, 5]
     spreads = sag_weights(poses.translation[:, :2]) @ down
     scaling = _scale_weights(poses.translation) @ moved.modes.stations[stations, 3:].reshape(
@@ -114,7 +114,9 @@ def adjusted(
         ned_from_cam=poses,
         covariances=pose_covariances(rows, fit, found.shape, place),
         shape=_positions_first(
-            found.shape.knowing(left).moved(place.scale, place.rotation).frame_cov[stations]
+            found.shape.knowing(left)
+            .moved(place.scale, place.rotation, place.translation)
+            .frame_cov[stations]
         ),
         bend_sigmas_m=np.sqrt(np.einsum("ik,kl,il->i", spreads, left, spreads)),
         scale_sigma=float(np.sqrt(scaling @ left @ scaling)),

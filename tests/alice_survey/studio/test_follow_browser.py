@@ -87,7 +87,7 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, width: int, heig
 
         writer = written(log, kept[kept[:, 0] < until_s], 0.5)
         page.wait_for_selector("#panel-follow .now:has-text('On line 1')", timeout=60_000)
-        page.wait_for_selector("img.follow-block", timeout=20_000)
+        page.wait_for_selector("img.follow-block", timeout=60_000)
         early = opaque(page)
         page.wait_for_selector("#panel-follow .now:has-text('On line 4')", timeout=60_000)
         assert writer.wait(30) == 0
@@ -96,11 +96,11 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, width: int, heig
             "() => parseFloat(document.querySelector('[data-figure=holes]').textContent) > 2"
         )
         assert figure(page, "lines") == f"{len(PLAN.lines) - 3} of {len(PLAN.lines)}"
-        page.wait_for_selector("#panel-follow p:has-text('for 2.')", timeout=20_000)
+        page.wait_for_selector("#panel-follow p:has-text('for 2.')", timeout=90_000)
         assert violations(page) == []
         page.screenshot(path=str(tmp_path / f"hole-{width}.png"), full_page=width < 700)
         # Nothing comes any more.
-        page.wait_for_selector("#panel-follow .now.bad:has-text('No news for')", timeout=20_000)
+        page.wait_for_selector("#panel-follow .now.bad:has-text('No news for')", timeout=60_000)
         page.screenshot(path=str(tmp_path / f"silent-{width}.png"), full_page=width < 700)
         assert violations(page) == []
 
@@ -113,11 +113,11 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, width: int, heig
         rest = kept[kept[:, 0] >= until_s]
         again = rows_along(offered["route_ne"], PLAN, float(rest[-1, 0]) + 0.5)
         writer = written(log, np.concatenate([rest, again]), 0.1)
-        page.wait_for_selector("#panel-follow .now:has-text('On line')", timeout=20_000)
+        page.wait_for_selector("#panel-follow .now:has-text('On line')", timeout=60_000)
         assert writer.wait(60) == 0
         page.wait_for_function(
             "() => document.querySelector('[data-figure=lines]').textContent.startsWith('0 ')",
-            timeout=30_000,
+            timeout=60_000,
         )
         assert float(figure(page, "overlap").split()[0]) > 99.0
         assert page.evaluate(HOLES_LEFT)
@@ -131,7 +131,7 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, width: int, heig
         assert violations(page) == []
         page.select_option("#panel-follow select >> nth=-1", "50")
         page.click("#panel-follow button:has-text('Replay it')")
-        page.wait_for_selector("#panel-follow .now:has-text('On line 2')", timeout=30_000)
+        page.wait_for_selector("#panel-follow .now:has-text('On line 2')", timeout=60_000)
         overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")
         assert overflow <= 0
     assert heard.complaints == []

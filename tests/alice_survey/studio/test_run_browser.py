@@ -72,6 +72,7 @@ def test_a_survey_from_an_empty_folder_is_planned_and_flown(page: Any, tmp_path:
         assert not (reef / "survey.toml").exists()
         with page.expect_navigation():
             named(page, "Make the survey").click()
+        page.wait_for_selector("#panel-plan[data-read]", timeout=LONG_MS)
         page.goto(server.url + "#run")
         page.wait_for_selector("[data-stage=plan][data-state=missing]")
         assert page.get_by_label("Start: Fly the plan").count() == 0

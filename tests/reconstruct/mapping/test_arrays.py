@@ -47,15 +47,16 @@ def test_a_copy_for_which_there_was_no_room_is_named(tmp_path: Path) -> None:
     model = block_mapped().model
     model.write_binary(tmp_path)
     for name, read in (
-        ("images.bin", lambda path: dict(model_files._all_keypoints(path))),
-        ("points3D.bin", model_files._all_points),
+        ("images.bin", lambda folder: dict(model_files._all_keypoints(folder / "images.bin"))),
+        ("points3D.bin", model_files.all_points),
     ):
-        read(tmp_path / name)
+        read(tmp_path)
         whole = (tmp_path / name).read_bytes()
         for length in (0, 4, 30, len(whole) // 2, len(whole) - 1):
             (tmp_path / name).write_bytes(whole[:length])
             with pytest.raises(OSError):
-                read(tmp_path / name)
+                read(tmp_path)
+        (tmp_path / name).write_bytes(whole)
 
 
 def test_groups_are_the_stations_that_points_link() -> None:
