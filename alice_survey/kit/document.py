@@ -123,7 +123,7 @@ class PictureLayer:
     """Whether it is shown at first; only one base layer can be."""
     base: bool = True
     """Base layers exclude one another; others lie over them."""
-    group: str = "Over it"
+    group: str = "Overlays"
     """Heading in the list of layers of one that is not a base layer."""
 
     def size(self, level: int) -> tuple[int, int, float, float]:
@@ -155,7 +155,7 @@ class ShapeLayer:
     """Opacity of the inside of an outline."""
     width: float | None = None
     """Width of its lines, px; None is the default of its kind."""
-    group: str = "Over it"
+    group: str = "Overlays"
     """Heading in the list of layers."""
     extends: bool = True
     """Whether the map's first view has to hold it."""

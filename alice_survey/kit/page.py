@@ -151,10 +151,10 @@ def _anchor(section: Section) -> str:
 
 def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
     """Heading, kind of control and layers of each group in the map's list."""
-    groups: dict[tuple[str, str], list[Any]] = {("Picture", "radio"): []}
+    groups: dict[tuple[str, str], list[Any]] = {("Base layer", "radio"): []}
     for layer in survey_map.layers:
         if isinstance(layer, PictureLayer):
-            key = ("Picture", "radio") if layer.base else (layer.group, "checkbox")
+            key = ("Base layer", "radio") if layer.base else (layer.group, "checkbox")
         else:
             key = (layer.group, "checkbox")
         groups.setdefault(key, []).append(layer)

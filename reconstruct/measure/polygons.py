@@ -198,10 +198,7 @@ def measure_polygon(
         ReconstructionError: it crosses itself, is too large, or no surface is known in it.
     """
     places = as_places(vertices)
-    region = _PolygonOnGrid(surface, polygon_of(places))
-    moments = _moments(region)
-    if not moments.area > 0:
-        raise ReconstructionError("no surface is known within the polygon: draw it on the surface")
+    region, moments = _known_part(surface, polygon_of(places))
     notes = []
     if moments.share < 0.999:
         notes.append(
@@ -213,8 +210,7 @@ def measure_polygon(
     sums = _PolygonSums(region, moments, rim)
     figures = [
         of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
-        figure(surface, "surface_area", "Area of the surface", sums.surface, sums.by_surface, 2),
-        sums.rugosity,
+        *sums.roughness,
         *sums.slope,
         figure(surface, "mean_height", "Mean height", sums.mean, sums.by_mean, 1),
         of_points(surface, ring, "perimeter", "Perimeter in plan", _outline, 1),
@@ -226,6 +222,24 @@ def measure_polygon(
             "about as large a share of that: it is large for such small cells"
         )
     return tuple(figures), tuple(notes)
+
+
+def roughness(surface: MeasuredSurface, polygon: shapely.Polygon) -> tuple[Measured, Measured]:
+    """Area of the surface within a polygon that may have holes, and its rugosity.
+
+    Raises:
+        ReconstructionError: it is too large, or no surface is known in it.
+    """
+    region, moments = _known_part(surface, polygon)
+    return _PolygonSums(region, moments, None).roughness
+
+
+def _known_part(surface: MeasuredSurface, polygon: Any) -> tuple[_PolygonOnGrid, _PolygonMoments]:
+    region = _PolygonOnGrid(surface, polygon)
+    moments = _moments(region)
+    if not moments.area > 0:
+        raise ReconstructionError("no surface is known within the polygon: draw it on the surface")
+    return region, moments
 
 
 def _outline(points: Array) -> float:
@@ -354,12 +368,17 @@ class _PolygonSums:
         self.noise = added / moments.area
 
     @property
-    def rugosity(self) -> Measured:
-        """Surface over plan area."""
-        ratio, both = self.surface / self._moments.area, FigureSlopes(self._surface.errors)
-        both.add_times(1.0 / self._moments.area, self.by_surface)
-        both.add_times(-ratio / self._moments.area, self.by_area)
-        return figure(self._surface, "rugosity", "Rugosity, surface over plan", ratio, both, 0)
+    def roughness(self) -> tuple[Measured, Measured]:
+        """Area of the surface, and that over the area in plan."""
+        surface, plan = self._surface, self._moments.area
+        ratio, both = self.surface / plan, FigureSlopes(surface.errors)
+        both.add_times(1.0 / plan, self.by_surface)
+        both.add_times(-ratio / plan, self.by_area)
+        return (
+            figure(surface, "surface_area", "Area of the surface", self.surface,
+                   self.by_surface, 2),
+            figure(surface, "rugosity", "Rugosity, surface over plan", ratio, both, 0),
+        )  # fmt: skip
 
     @property
     def slope(self) -> tuple[Measured, Measured]:

@@ -31,6 +31,8 @@ from reconstruct.annotations.table import (
 )
 from reconstruct.annotations.transfer import GEOJSON, exported, frame_of, import_data
 from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, Label, with_labels
+from reconstruct.measure.polygons import roughness
+from reconstruct.measure.surface import MeasuredSurface
 
 _MOST_BYTES = 64 << 20
 _MOST_PICTURES = 8
@@ -54,6 +56,7 @@ class _Annotate:
         self._studio, self._folder = studio, studio.workspace.folder
         self._projector = KeptValue(lambda: Projector(self._folder))
         self._ground = KeptValue(lambda: ground_of(self._folder))
+        self._surface = KeptValue(lambda: MeasuredSurface.of(self._folder))
 
     def projector(self) -> Projector:
         """The model as it is now."""
@@ -145,6 +148,16 @@ class _Annotate:
             "sigma_px": PIXEL_SIGMA_PX,
         }
 
+    def surface(self, call: Call) -> dict[str, Any]:
+        """Area of the surface within an annotation, and its rugosity."""
+        one = self._annotation(call.path["id"])
+        marks, lost = measured([one], self.ground().pixel, self.projector)
+        if lost or not marks[0].shape.is_area:
+            raise AliceError(lost[0] if lost else f"a {one.shape.kind} has no area")
+        surface = self._surface.of(self._studio.workspace.state(()))
+        found = roughness(surface, marks[0].geometry)
+        return {"figures": [figure.to_json() for figure in found]}
+
     def pictures(self, call: Call) -> dict[str, Any]:
         """The pictures that show an annotation, with its outline in a part of each."""
         one = self._annotation(call.path["id"])
@@ -214,6 +227,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/annotations/table", answer=tab.table),
         Endpoint(path="/api/annotations/export/{format}", answer=tab.give),
         Endpoint(path="/api/annotations/{id}/pictures", answer=tab.pictures),
+        Endpoint(path="/api/annotations/{id}/surface", answer=tab.surface),
         Endpoint(
             path="/api/annotations/change", answer=tab.change, method="POST", writes=True,
             most_bytes=_MOST_BYTES,

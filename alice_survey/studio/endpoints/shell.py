@@ -90,7 +90,7 @@ def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     is_base = isinstance(layer, PictureLayer) and layer.base
     group = "Under it" if layer.name in (CHART, "contours") else layer.group
     if is_base:
-        group = "Picture"
+        group = "Base layer"
     return {
         "title": layer.title,
         "about": layer.about,

@@ -241,12 +241,22 @@ export function tab(studio) {
     Object.entries(one.attributes).forEach(([key, value]) => facts.push([key, String(value)]));
     return [
       el("h2", {}, "Chosen"), field("Label", choice), field("Note", note), table("What is known of it", [], facts),
+      mark && mark.area !== null && studio.state.has.dem ? roughnessOf(one) : "",
       el("p", {class: "buttons"},
         button("Show in pictures", () => attempt(() => showPictures(one)), {disabled: !studio.state.has.dem}),
         button("Go there", () => go(one)),
         button("Delete", () => remove(one.id)),
         button("Close", () => choose(null))),
     ];
+  }
+
+  /* Found while the card is there already. */
+  function roughnessOf(one) {
+    const line = el("p", {class: "note"}, "Measuring the surface …");
+    get("/api/annotations/" + one.id + "/surface").then(({figures}) => {
+      line.textContent = figures.map((part) => part.title + " " + withSigma(part.value, part.sigma, part.unit)).join("; ");
+    }, (fault) => { line.textContent = fault.message; });
+    return line;
   }
 
   const shapeOf = (one) => (one.image === null ? one.shape : marks.get(one.id)?.shape || null);

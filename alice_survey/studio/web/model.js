@@ -17,6 +17,7 @@ const TOOLS = {
   volume: {title: "Volume", key: "v", kind: "polygon", main: "volume"},
   rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity"},
 };
+const LAYERS = ["measured-line", "measured-polygon", "quadrats"];
 const FILES = [
   ["report/report.html", "The report"], ["mosaic/mosaic.tif", "The mosaic, cloud-optimised GeoTIFF"],
   ["dense/dem.tif", "The elevation model, GeoTIFF"], ["dense/sigma.tif", "Its sigma, GeoTIFF"],
@@ -321,6 +322,7 @@ export function tab(studio) {
     },
     leave() {
       active = false;
+      LAYERS.forEach((name) => map.remove(name));
       profile.clear();
       mesh.leave();
     },

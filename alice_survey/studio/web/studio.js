@@ -56,7 +56,7 @@ function put(about) {
       about.about ? el("small", {}, about.about) : null, about.scale ? legendOf(about) : null);
     const old = list.querySelector(`[data-layer="${CSS.escape(about.name)}"]`);
     if (old) old.replaceWith(choice);
-    else groupOf(about.group || "Over it").append(choice);
+    else groupOf(about.group || "Overlays").append(choice);
   }
   core.show(about.name, shown);
   return layer;

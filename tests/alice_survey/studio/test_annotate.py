@@ -144,6 +144,15 @@ def test_an_annotation_is_shown_in_the_pictures_that_see_it(
             inside = (ring >= [left, top]) & (ring <= [left + width, top + height])
             assert inside.all(axis=1).mean() >= 0.5 and 0 < shown["sigma_px"] < 3
         assert ask(server, "/api/annotations/nothing/pictures").status == 404
+        surface, ratio = ask(server, "/api/annotations/a/surface").json["figures"]
+        asked = call(server, "/api/model/measure", {"kind": "polygon", "places": box}).json
+        assert [surface, ratio] == asked["figures"][1:3]
+        assert 0.04 < surface["value"] < 0.08 and 0 < surface["sigma"] < 0.004
+        point = {**mark, "id": "p", "shape": {"kind": "point", "points": box[:1]}}
+        token = ask(server, "/api/annotations").json["token"]
+        assert change(server, token, put=[point]).status == 200
+        for name, status in (("nothing", 404), ("p", 400)):
+            assert ask(server, f"/api/annotations/{name}/surface").status == status
 
 
 def test_a_survey_without_a_mosaic_says_so(tmp_path: Path) -> None:

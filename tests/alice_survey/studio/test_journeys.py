@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -21,15 +22,17 @@ from tests.alice_survey.studio.test_plan_browser import PlanPage
 from tests.docs import given_divers as dive
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+WIDE, NARROW = {"width": 1280, "height": 900}, {"width": 400, "height": 850}
 LONG_MS = 400_000
 WAIT_MS = 60_000
 
 
 @pytest.fixture
-def journey() -> Iterator[tuple[Any, Heard]]:
-    """A page, and what it complains about."""
+def journey(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Heard]]:
+    """A page, 1280 px wide unless a test says otherwise, and what it complains about."""
+    size = getattr(request, "param", WIDE)
     with chromium() as browser:
-        page = browser.new_page(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
+        page = browser.new_page(viewport=size, reduced_motion="reduce")
         page.set_default_timeout(WAIT_MS)
         heard = Heard()
         heard.listen(page)
@@ -47,6 +50,15 @@ def made(page: Any, stage: str) -> None:
     page.wait_for_selector(f"[data-stage={stage}][data-state='up to date']", timeout=LONG_MS)
 
 
+def is_accessible(page: Any) -> None:
+    """No violations that axe knows, and nothing wider than the screen."""
+    found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
+    assert [(one["id"], one["nodes"][0]["target"]) for one in found] == []
+    width = page.viewport_size["width"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize("journey", [WIDE, NARROW], indirect=True, ids=["1280", "400"])
 def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path: Path) -> None:
     page, heard = journey
     reef = tmp_path / "reef"
@@ -64,6 +76,7 @@ def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path:
         page.get_by_role("button", name=re.compile("^Delete")).first.click()
         page.wait_for_timeout(500)
         plan.draw("Survey area", ((2.0, 2.0), (2.0, 5.0), (4.5, 5.0), (4.5, 2.0)))
+        is_accessible(page)
         button(page, "Save").click()
         page.wait_for_function(
             "() => document.getElementById('status').textContent.startsWith('Saved')",
@@ -73,6 +86,7 @@ def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path:
         made(page, "plan")
         page.get_by_label("Start: Fly the plan").click()
         made(page, "fly")
+        is_accessible(page)
         assert heard.complaints == []
     with (reef / "flight" / "triggers.csv").open(newline="") as rows:
         assert len(list(csv.DictReader(rows))) > 10
@@ -181,32 +195,45 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
         button(page, "Reconstruct the sea floor").click()
         made(page, "mesh")
 
+        page.set_viewport_size(NARROW)
         page.reload()
         page.get_by_role("tab", name="Pictures").click()
-        for number in (2, 3):
-            page.get_by_label(f"end {number}", exact=True).check()
-        page.wait_for_selector("[data-value]", timeout=WAIT_MS)
-        shown = page.locator("[data-value]")
         true = float(np.linalg.norm(coral[1] - coral[0]))
+        for size in (NARROW, WIDE):
+            page.set_viewport_size(size)
+            for number in (2, 3):
+                page.get_by_label(f"end {number}", exact=True).check()
+            page.wait_for_selector("[data-value]", timeout=WAIT_MS)
+            is_accessible(page)
+        shown = page.locator("[data-value]")
         off = float(shown.get_attribute("data-value")) - true
         assert abs(off) < 4.0 * float(shown.get_attribute("data-sigma"))
         assert abs(off) < 0.01 * true
 
         page.get_by_role("tab", name="Model").click()
-        page.wait_for_timeout(1500)
-        box = page.locator("#map-canvas")
-        east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
-        corners = [(east - 0.2, north - 0.15), (east + 0.2, north - 0.15), (east, north + 0.2)]
-        button(page, "Area").click()
-        click(page, *corners)
-        button(page, "Finish").click()
-        page.wait_for_selector("tr[data-measure]")
-        (measure,) = kept(page)
-        places = np.array(measure["places"])
-        (a, b), (c, d) = places[1:] - places[0]
-        plan = 0.5 * abs(a * d - b * c)
-        found = figures(measure)
-        assert found["plan_area"]["value"] == pytest.approx(plan, rel=0.01)
-        assert found["plan_area"]["value"] < found["surface_area"]["value"] < 2.0 * plan
-        assert 0 < found["surface_area"]["sigma"] < 0.1 * plan
+        for number, size in enumerate((NARROW, WIDE), start=1):
+            page.set_viewport_size(size)
+            measured_coral(page, number)
+            is_accessible(page)
         assert heard.complaints == []
+
+
+def measured_coral(page: Any, number: int) -> None:
+    """Measure a triangle in the middle of the map, and look at its figures."""
+    page.wait_for_timeout(1500)
+    box = page.locator("#map-canvas")
+    box.scroll_into_view_if_needed()
+    east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
+    corners = [(east - 0.2, north - 0.15), (east + 0.2, north - 0.15), (east, north + 0.2)]
+    button(page, "Area").click()
+    click(page, *corners)
+    button(page, "Finish").click()
+    page.wait_for_selector(f"tr[data-measure='{number}']")
+    measure = kept(page)[-1]
+    places = np.array(measure["places"])
+    (a, b), (c, d) = places[1:] - places[0]
+    plan = 0.5 * abs(a * d - b * c)
+    found = figures(measure)
+    assert found["plan_area"]["value"] == pytest.approx(plan, rel=0.01)
+    assert found["plan_area"]["value"] < found["surface_area"]["value"] < 2.0 * plan
+    assert 0 < found["surface_area"]["sigma"] < 0.1 * plan

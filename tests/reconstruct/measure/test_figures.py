@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from rasterio.windows import Window
 from scipy.special import ellipe
 
@@ -16,7 +17,7 @@ from alice_survey.base.frames import Array
 from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, profile
-from reconstruct.measure.polygons import measure_polygon, quadrats
+from reconstruct.measure.polygons import measure_polygon, quadrats, roughness
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import DemGrid, tiled_raster
 from tests.reconstruct.measure.synthetic import (
@@ -73,6 +74,22 @@ def test_a_tilted_plane_has_the_figures_of_geometry(tmp_path: Path) -> None:
     assert line["slope"].value == pytest.approx(-np.degrees(np.arctan(0.4)), abs=1e-3)
     for name in ("length", "surface_length"):
         assert line[name].value == pytest.approx(0.5 * np.sqrt(1.16), rel=1e-5)
+
+
+def test_a_hole_has_no_surface(tmp_path: Path) -> None:
+    """Of a tilted plane, and of hills: the whole is the part without the hole and the hole."""
+    hole = shapely.Polygon([(-0.1, -0.13), (0.2, -0.05), (0.04, 0.17)])
+    whole = shapely.Polygon(SLANTED)
+    ring = shapely.Polygon(SLANTED, [hole.exterior.coords])
+    surface, ratio = roughness(without_errors(tmp_path, grid(1.0, 0.01), ramp), ring)
+    assert surface.value == pytest.approx(np.sqrt(1.25) * (whole.area - hole.area), rel=1e-6)
+    assert ratio.value == pytest.approx(np.sqrt(1.25), rel=1e-6)
+    hilly = without_errors(tmp_path, grid(1.0, 0.01), hills)
+    outer, inner, left = (roughness(hilly, one)[0].value for one in (whole, hole, ring))
+    assert left == pytest.approx(outer - inner, rel=1e-9)
+    assert outer == named(measure_polygon(hilly, SLANTED)[0])["surface_area"].value
+    with pytest.raises(ReconstructionError, match="no surface"):
+        roughness(hilly, shapely.box(5, 5, 6, 6))
 
 
 def test_a_hemisphere_has_its_area_and_volume(tmp_path: Path) -> None:
