@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from rasterio.features import rasterize
 from rasterio.transform import Affine
+from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
@@ -224,7 +225,7 @@ def measure_polygon(
     return tuple(figures), tuple(notes)
 
 
-def roughness(surface: MeasuredSurface, polygon: shapely.Polygon) -> tuple[Measured, Measured]:
+def roughness(surface: MeasuredSurface, polygon: BaseGeometry) -> tuple[Measured, Measured]:
     """Area of the surface within a polygon that may have holes, and its rugosity.
 
     Raises:

@@ -10,6 +10,7 @@ import {annotationsOn} from "./annotate_map.js";
 import {isArea, targetOf} from "./annotate_shapes.js";
 import {drawingTool} from "./drawing.js";
 import {missing} from "./missing.js";
+import {pictureDrawing} from "./picture_drawing.js";
 
 const MOST_ROWS = 100;
 const NOTHING = {labels: [], annotations: new Map()};
@@ -169,26 +170,52 @@ export function tab(studio) {
     return made;
   });
 
+  function putNew(image, kind, points) {
+    const id = Array.from(crypto.getRandomValues(new Uint8Array(6)), (v) => v.toString(16).padStart(2, "0")).join("");
+    chosen = id;
+    return put({
+      id, label, shape: {kind, points, holes: [], radius: null}, image,
+      author: author.value.trim(), time_utc: new Date().toISOString().replace(/\.\d+/, ""), note: "", attributes: {},
+    });
+  }
+
+  function hasLabel() {
+    if (!label) say("Add a label first: what is drawn carries it", "warn");
+    return Boolean(label);
+  }
+
+  const colourNow = () => now().labels.find((one) => one.id === label).colour;
+
+  /* In the pictures that show the middle of the map. */
+  let inPictures = null;
+  const kindInPictures = el("select", {}, Object.entries(KINDS).map(([kind, text]) => el("option", {value: kind}, text)));
+  kindInPictures.value = "polygon";
+  const toPictures = button("Show the pictures of the map's middle", () => attempt(drawInPictures));
+  async function drawInPictures() {
+    if (!hasLabel()) return;
+    studio.map.release();
+    const {lat, lng} = studio.map.leaflet.getCenter();
+    const {pictures, total} = await get("/api/pictures/seeing", {n: lat, e: lng, count: 40});
+    if (!pictures.length) throw new Error("no picture shows the middle of the map");
+    inPictures = inPictures || pictureDrawing({
+      done: (image, kind, points) => {
+        putNew(image, kind, points);
+        say(KINDS[kind] + " drawn in " + image);
+      },
+    });
+    wall?.hide();
+    inPictures.begin(counted(total, "picture shows", "pictures show") + " the middle of the map", pictures, {kind: kindInPictures.value, colour: colourNow()});
+  }
+
   function take(kind) {
     const isSame = tool === kind;
     studio.map.release();
     if (isSame) return;
-    if (!label) {
-      say("Add a label first: what is drawn carries it", "warn");
-      return;
-    }
+    if (!hasLabel()) return;
     choose(null);
-    const {colour: of} = now().labels.find((one) => one.id === label);
     drawing.begin({
-      kind: kind === "polyline" ? "line" : kind, colour: of, again: true,
-      done(points) {
-        const id = Array.from(crypto.getRandomValues(new Uint8Array(6)), (v) => v.toString(16).padStart(2, "0")).join("");
-        chosen = id;
-        put({
-          id, label, shape: {kind, points: points.map(([n, e]) => [e, n]), holes: [], radius: null}, image: null,
-          author: author.value.trim(), time_utc: new Date().toISOString().replace(/\.\d+/, ""), note: "", attributes: {},
-        });
-      },
+      kind: kind === "polyline" ? "line" : kind, colour: colourNow(), again: true,
+      done: (points) => putNew(null, kind, points.map(([n, e]) => [e, n])),
       ended() {
         tool = null;
         press();
@@ -218,6 +245,7 @@ export function tab(studio) {
   async function showPictures(one) {
     const {pictures} = await get("/api/annotations/" + one.id + "/pictures");
     if (!pictures.length) throw new Error("no registered picture shows it");
+    inPictures?.hide();
     wall = wall || new Wall();
     wall.show(counted(pictures.length, "picture that shows it best", "pictures that show it best"), pictures.map(({image, rings, sigma_px}) => ({
       name: image, rings, closed: isArea(one.shape), x: 0, y: 0, about: "outline known to " + number(sigma_px, "px", 2),
@@ -342,6 +370,7 @@ export function tab(studio) {
   const content = el("div", {},
     el("h2", {}, "Labels"), labelList, el("details", {}, el("summary", {}, "Add a label"), addLabel),
     el("h2", {}, "Draw"), el("p", {class: "buttons"}, tools, back, forth), drawing.element,
+    el("details", {}, el("summary", {}, "Draw in pictures"), field("Shape", kindInPictures), el("p", {class: "buttons"}, toPictures)),
     el("details", {}, el("summary", {}, "Your name"), field("Goes with what you draw", author)),
     card,
     el("h2", {}, "Annotations"), field("Filter", words, "Labels, notes, names, pictures"), rows,
@@ -378,7 +407,7 @@ export function tab(studio) {
     save.replaceChildren(...[...formats, {name: "geojson", title: "GeoJSON"}].map((one) => button(one.title, () => attempt(() => saveFile("/api/annotations/export/" + one.name, "annotations")), {"data-export": one.name, disabled: !annotations.size})));
     [back.disabled, forth.disabled] = [!canUndo(history), !canRedo(history)];
     const writes = studio.mayWrite();
-    [...tools, bring, ...addLabel.querySelectorAll("button")].forEach((one) => { one.disabled = !writes; });
+    [...tools, toPictures, bring, ...addLabel.querySelectorAll("button")].forEach((one) => { one.disabled = !writes; });
     if (focused) labelList.querySelector(`input[type=radio][value="${CSS.escape(focused)}"]`)?.focus();
     redraw();
   }
@@ -397,6 +426,7 @@ export function tab(studio) {
       drawn.show(false);
       handles.show(null);
       wall?.hide();
+      inPictures?.hide();
     },
     keys: {
       "Ctrl+z": () => step(undo, "Undone"), "Ctrl+y": () => step(redo, "Done again"), "Ctrl+Z": () => step(redo, "Done again"),

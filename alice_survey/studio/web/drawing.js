@@ -5,7 +5,8 @@ import {button, el, say} from "./core.js";
 import {WHITE} from "./palette.js";
 
 const REACH_PX = 9;
-const LEAST = {point: 1, line: 2, polygon: 3, rectangle: 2};
+/* Places that each kind of shape needs. */
+export const LEAST = {point: 1, line: 2, polyline: 2, polygon: 3, rectangle: 2};
 const FIRST = {
   point: "Click on the map, or press Enter to take its middle.",
   rectangle: "Click two opposite corners, or press Enter to take the map's middle.",

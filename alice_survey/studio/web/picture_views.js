@@ -21,7 +21,7 @@ function cross(kind) {
 class PictureView {
   /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the `rings` that are
      seen in it. `changed(view)` is called where a person picks, if one may, `used(view)` where one takes
-     or drops its pick. */
+     or drops a pick that stays. */
   constructor(seen, {changed, used, chosen}) {
     this.name = seen.name;
     this.seen = seen;
@@ -34,7 +34,7 @@ class PictureView {
       onkeydown: (event) => this.key(event), onfocus: () => chosen(this),
     });
     this.about = el("p", {}, seen.about || (seen.off_nadir_deg === undefined ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal"));
-    this.text = el("p", {class: "note"}, changed ? "not picked" : "");
+    this.text = el("p", {class: "note"}, used ? "not picked" : "");
     this.check = el("input", {type: "checkbox", checked: true, onchange: () => {
       this.use = this.check.checked;
       used(this);
@@ -74,9 +74,9 @@ class PictureView {
     this.box.dataset.ready = "";
   }
 
-  /* Rings of pixels, of which those that are not known are null. */
+  /* Rings of pixels from the outer corner of the first, of which those that are not known are null. */
   outline({rings, closed}) {
-    const places = rings.map((ring) => ring.filter(([x]) => x !== null).map(([x, y]) => place(x, y)));
+    const places = rings.map((ring) => ring.filter(([x]) => x !== null).map(([x, y]) => [-y, x]));
     const many = closed ? leaflet.polygon : leaflet.polyline;
     [[INK, 6], [WHITE, 2.5]].forEach(([color, weight]) => (places[0].length > 1
       ? many(places, {color, weight, fill: false, interactive: false})

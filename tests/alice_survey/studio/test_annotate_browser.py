@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.report.tiny import tiny_workspace
-from tests.alice_survey.studio.client import FOLDED, serving
+from tests.alice_survey.studio.client import FOLDED, ask, serving
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
@@ -135,6 +136,59 @@ def test_points_are_set_by_the_keyboard_alone_at_400_px(folder: Path) -> None:
         assert second[0] - first[0] > 0.05
         assert second[1] == pytest.approx(first[1], abs=0.1)
         assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        accessible(page)
+        assert heard.complaints == []
+        page.close()
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path: Path) -> None:
+    """Clicks beside the middle of a view, four of the screen's pixels to one of the picture's."""
+    folder = tmp_path / "survey"
+    shutil.copytree(small_survey, folder)
+    clicked = np.array([[0, 0], [80, 0], [40, 60]])
+    with serving(folder) as server, chromium() as browser:
+        page, heard = opened(browser, server, "Annotate", width)
+        add_label(page, "Porites")
+        page.get_by_text("Draw in pictures", exact=True).click()
+        with page.expect_request("**/api/pictures/seeing?*") as asking:
+            page.get_by_role("button", name="Show the pictures of the map's middle").click()
+        asked = parse_qs(urlsplit(asking.value.url).query)
+        north, east = (float(asked[axis][0]) for axis in "ne")
+        view = page.locator(".picture-view[data-ready]").first
+        view.wait_for(timeout=60_000)
+        page.wait_for_timeout(500)
+        box = view.bounding_box()
+        middle = np.array([box["width"], box["height"]]) / 2
+        for right, down in clicked:
+            view.click(position={"x": middle[0] + right, "y": middle[1] + down})
+            page.wait_for_timeout(350)
+        page.keyboard.press("Enter")  # once more the middle, and not
+        page.keyboard.press("Backspace")
+        accessible(page)
+        page.screenshot(path=str(tmp_path / f"drawn-{width}.png"))
+        page.keyboard.press("f")
+        page.locator("#status", has_text="Polygon drawn in").wait_for()
+        page.get_by_role("button", name="Back to the map").first.click()
+        page.get_by_text("Area of the surface").wait_for(timeout=60_000)
+        (one,) = stored(folder)
+        seen = ask(server, f"/api/pictures/seeing?n={north}&e={east}&count=1").json["pictures"][0]
+        assert one["image"] == seen["name"]
+        points = np.array(one["shape"]["points"])
+        np.testing.assert_allclose(points - points[0], clicked / 4.0, atol=0.15)
+        expected = np.array([seen["x"], seen["y"]]) + 0.5
+        np.testing.assert_allclose(points[0], expected, atol=0.3)
+        (mark,) = ask(server, "/api/annotations/table").json["marks"]
+        corner = np.array(mark["shape"]["points"])[0]
+        np.testing.assert_allclose(corner, [east, north], atol=0.5 / seen["resolution"])
+        area = 0.5 * 20 * 15 / seen["resolution"] ** 2
+        assert mark["area"] == pytest.approx(area, rel=0.15)
+        assert 0 < mark["sigma"] < 0.2 * area
+        page.screenshot(path=str(tmp_path / f"kept-{width}.png"))
+        page.get_by_role("button", name="Undo", exact=True).click()
+        page.get_by_text("Nothing is annotated yet.").wait_for()
+        assert stored(folder) == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
         accessible(page)
         assert heard.complaints == []
         page.close()
