@@ -7,8 +7,10 @@ const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west
 
 /* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where it
    is seen from, `lost` is called when the browser takes its graphics memory back. Returns `pick`,
-   which gives the point under a pixel of the canvas or null, and `mark`, which shows some points and
-   the lines between. */
+   which gives the point under a pixel of the canvas or null, `mark`, which shows some points and the
+   lines between, and `show`, which draws another model, in the same axes, that is brought up to date
+   before each frame, or the first one again; `dress` makes a model ready for it, `forget` gives its
+   memory back. */
 async function startMesh(root, canvas, bytes, {told, lost}) {
   const view = canvas.parentElement;
   const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
@@ -24,13 +26,39 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   const ball = box.getBoundingSphere(new three.Sphere());
   lamp.position.copy(ball.center).add(new three.Vector3(-1, 0.7, -0.5).multiplyScalar(ball.radius));
   lamp.target.position.copy(ball.center);
-  const surfaces = [];
+  const dressed = new Set();
+  let isRelief = false;
   const grey = new three.MeshLambertMaterial({color: 0xc9c4b8, side: 2});
-  model.traverse((part) => {
-    if (!part.isMesh) return;
-    if (!part.geometry.attributes.normal) part.geometry.computeVertexNormals();
-    surfaces.push([part, part.material]);
-  });
+  let current = {group: model, update() {}, moved() {}};
+  const first = current;
+  dress(model);
+
+  function dress(some) {
+    some.traverse((part) => {
+      if (!part.isMesh) return;
+      if (!part.geometry.attributes.normal) part.geometry.computeVertexNormals();
+      part.userData.own = part.material;
+      if (isRelief) part.material = grey;
+      dressed.add(part);
+    });
+    return some;
+  }
+
+  function forget(some) {
+    some.traverse((part) => {
+      if (!dressed.delete(part)) return;
+      part.geometry.dispose();
+      part.userData.own.map?.dispose();
+      part.userData.own.dispose();
+    });
+  }
+
+  function show(other) {
+    scene.remove(current.group);
+    current = other || first;
+    scene.add(current.group);
+    draw();
+  }
 
   const camera = new three.PerspectiveCamera(40, 1, ball.radius / 500, ball.radius * 40);
   const controls = new three.OrbitControls(camera, canvas);
@@ -50,6 +78,7 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     asked = true;
     requestAnimationFrame(() => {
       asked = false;
+      current.update();
       renderer.render(scene, camera);
     });
   }
@@ -101,9 +130,9 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   }
 
   function relief(button) {
-    const on = button.getAttribute("aria-pressed") !== "true";
-    button.setAttribute("aria-pressed", String(on));
-    surfaces.forEach(([part, material]) => { part.material = on ? grey : material; });
+    isRelief = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(isRelief));
+    dressed.forEach((part) => { part.material = isRelief ? grey : part.userData.own; });
     draw();
   }
 
@@ -111,7 +140,8 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   function pick(x, y) {
     const {clientWidth: width, clientHeight: height} = canvas;
     caster.setFromCamera(new three.Vector2(2 * x / width - 1, 1 - 2 * y / height), camera);
-    return caster.intersectObject(model, true)[0]?.point || null;
+    const seen = current.group === model ? [model] : current.group.children.filter((part) => part.visible);
+    return caster.intersectObjects(seen, true)[0]?.point || null;
   }
 
   /* Seen through what is before them. */
@@ -153,7 +183,10 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     event.preventDefault();
     acts[keys[event.key]]();
   });
-  controls.addEventListener("change", draw);
+  controls.addEventListener("change", () => {
+    current.moved();
+    draw();
+  });
   let placed = false;
   new ResizeObserver(() => {
     const {clientWidth: width, clientHeight: height} = view;
@@ -169,7 +202,7 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     reset();
   }).observe(view);
   canvas.addEventListener("webglcontextlost", lost);
-  return {pick, mark};
+  return {pick, mark, show, dress, forget, draw, camera, canvas};
 }
 
 /* What the page holds, or its server gives. */

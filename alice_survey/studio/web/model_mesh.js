@@ -1,6 +1,7 @@
 /* The mesh in the tab Model: it turns, a click picks a place on it, two picks give a length. */
 
 import {attempt, button, bytes, el, get, say} from "./core.js";
+import {startTiles} from "./model_tiles.js";
 import {WHITE} from "./palette.js";
 import {number} from "./words.js";
 
@@ -43,7 +44,10 @@ export function meshPart(studio, {colour, measured}) {
   const picked = el("p", {class: "note", role: "status"}, "Click a place on the mesh, then another: their distance is measured.");
   const large = button("Larger, over the map", () => enlarge(large.getAttribute("aria-pressed") !== "true"), {"aria-pressed": "false"});
   const about = el("p", {class: "note"});
-  const body = el("div", {}, el("div", {class: "buttons"}, large), home, picked, about);
+  const detail = el("select", {}, el("option", {value: "light"}, "Light copy"), el("option", {value: "tiles"}, "Full detail (3D Tiles)"));
+  const choice = el("label", {class: "field", hidden: true}, "Detail of the mesh ", detail);
+  const streamed = el("p", {class: "note"});
+  const body = el("div", {}, choice, el("div", {class: "buttons"}, large), home, streamed, picked, about);
   home.append(root);
   const element = el("details", {hidden: true}, el("summary", {}, "Mesh"), body);
   const spots = leaflet.featureGroup();
@@ -51,6 +55,32 @@ export function meshPart(studio, {colour, measured}) {
   let lies = null;
   let begun = false;
   let picks = [];
+  let tiles = null;
+
+  async function draw() {
+    drop();
+    streamed.textContent = "";
+    if (detail.value === "light") {
+      scene.show(null);
+      return;
+    }
+    detail.disabled = true;
+    try {
+      tiles = tiles || await startTiles(scene, lies.tiles, {
+        told({drawn, coming, bytes: held}) {
+          Object.assign(canvas.dataset, {tiles: drawn, coming});
+          if (detail.value === "tiles") streamed.textContent = drawn + " tiles drawn, " + coming + " on the way, " + Math.round(held / 2 ** 20) + " MB held";
+        },
+        failed: (fault) => say("A tile did not come: " + fault.message, "error"),
+      });
+      scene.show(tiles);
+    } catch (fault) {
+      detail.value = "light";
+      throw fault;
+    } finally {
+      detail.disabled = false;
+    }
+  }
 
   function enlarge(on) {
     large.setAttribute("aria-pressed", String(on));
@@ -89,7 +119,8 @@ export function meshPart(studio, {colour, measured}) {
   async function begin() {
     begun = true;
     lies = await get("/api/model/mesh");
-    about.textContent = lies.about + (lies.tiles ? " At full detail in viewers of 3D Tiles: " + window.location.origin + lies.tiles : "");
+    about.textContent = lies.about + (lies.tiles ? " Other viewers of 3D Tiles: " + window.location.origin + lies.tiles
+      : " There are no 3D Tiles of it, to draw it at full detail: mesh_tiles = \"on\" under [reconstruct] makes them with the mesh.");
     const context = document.createElement("canvas").getContext("webgl2");
     if (!context) {
       still("This browser has no WebGL, which turning the mesh needs");
@@ -104,16 +135,19 @@ export function meshPart(studio, {colour, measured}) {
       told: (text) => { told.textContent = text; },
       lost: () => still("The browser took its graphics memory back"),
     });
+    choice.hidden = !lies.tiles;
     root.dataset.ready = "";
   }
 
   function still(why) {
     root.hidden = true;
     large.hidden = true;
+    choice.hidden = true;
     picked.textContent = why + ": this is a still picture.";
     if (lies.still) home.append(el("img", {src: lies.still, alt: "The mesh seen from above and from the side"}));
   }
 
+  detail.addEventListener("change", () => attempt(draw));
   let down = null;
   canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
   canvas.addEventListener("pointerup", (event) => {

@@ -185,6 +185,83 @@ def test_two_picks_on_the_mesh_are_a_length(tmp_path: Path) -> None:
         assert canvas.bounding_box()["width"] > 800
 
 
+LIFT = 0.05
+"""Height of the finest tiles over the coarse one, so that a pick tells which it hit."""
+
+
+def with_tiles(folder: Path) -> Path:
+    """The workspace with a mesh, and tiles: a coarse one, a link, and two finest ones."""
+    workspace = with_mesh(folder)
+    tiles = workspace / "mesh" / "tiles"
+    tiles.mkdir()
+    coarse = (workspace / "mesh" / "mesh.glb").read_bytes()
+    (tiles / "top.glb").write_bytes(coarse)
+    boxes = []
+    for side, name in ((-1, "west"), (1, "east")):
+        (sheet,) = trimesh.load_scene(io.BytesIO(coarse), file_type="glb").geometry.values()
+        sheet.update_faces(sheet.triangles_center[:, 0] * side > 0)
+        sheet.apply_translation([0.0, LIFT, 0.0])
+        (tiles / f"{name}.glb").write_bytes(sheet.export(file_type="glb"))
+        box = {"box": [side, 0, 0.05, 1.04, 0, 0, 0, 1.6, 0, 0, 0, 0.3]}
+        content = {"uri": f"{name}.glb"}
+        boxes.append({"boundingVolume": box, "geometricError": 0.0, "content": content})
+    whole = {"box": [0, 0, 0.02, 2.1, 0, 0, 0, 1.6, 0, 0, 0, 0.3]}
+    link = {"boundingVolume": whole, "geometricError": 0.0, "content": {"uri": "west.json"}}
+    inner = {"asset": {"version": "1.1"}, "geometricError": 0.0, "root": boxes[0]}
+    write_json(tiles / "west.json", inner)
+    root = {"boundingVolume": whole, "geometricError": 0.5, "refine": "REPLACE"}
+    root |= {"content": {"uri": "top.glb"}, "children": [link, boxes[1]]}
+    write_json(tiles / "tileset.json", {"asset": {"version": "1.1"}, "root": root})
+    return workspace
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_tiles_are_drawn_as_the_view_needs_them_and_picked(width: int, tmp_path: Path) -> None:
+    import open3d as o3d
+
+    with opened(with_tiles(tmp_path / "reef"), width) as (page, heard):
+        page.get_by_text("Mesh", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        canvas = page.locator("#mesh-canvas")
+
+        def loaded() -> set[str]:
+            return {url.split("/")[-1] for url in heard.requests if "/mesh/tiles/" in url}
+
+        assert loaded() == set()
+        canvas.focus()
+        for _ in range(16):
+            page.keyboard.press("-")
+        page.get_by_label("Detail of the mesh").select_option("tiles")
+        page.wait_for_selector("#mesh-canvas[data-tiles='1'][data-coming='0']", timeout=10_000)
+        assert loaded() == {"tileset.json", "top.glb"}
+        canvas.focus()
+        page.keyboard.press("0")
+        page.wait_for_selector("#mesh-canvas[data-tiles='2'][data-coming='0']", timeout=10_000)
+        assert loaded() == {"tileset.json", "top.glb", "west.json", "west.glb", "east.glb"}
+        shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB"), float)
+        assert 0.1 < (np.abs(shot - [243, 246, 248]).max(axis=2) > 30).mean() < 0.95
+        assert Axe().run(page).violations_count == 0
+
+        box = canvas.bounding_box()
+        canvas.click(position={"x": box["width"] * 0.42, "y": box["height"] * 0.5})
+        page.get_by_text("click another place").wait_for()
+        canvas.focus()
+        page.keyboard.press("Enter")
+        (length,) = measured(page, 1)
+        mesh = trimesh.load_scene(tmp_path / "reef" / "mesh" / "mesh.glb").to_mesh()
+        scene = o3d.t.geometry.RaycastingScene()
+        lifted = (mesh.vertices + np.array([0.0, LIFT, 0.0])).astype(np.float32)
+        scene.add_triangles(lifted, mesh.faces.astype(np.uint32))
+        points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
+        assert scene.compute_distance(points.astype(np.float32)).numpy().max() < 1e-4
+        assert math.dist(*length["places"]) > 1e-3
+
+        page.get_by_label("Detail of the mesh").select_option("light")
+        canvas.focus()
+        page.keyboard.press("Enter")
+        page.get_by_text("click another place").wait_for()
+
+
 @pytest.mark.parametrize("width", [1280, 400])
 def test_it_is_accessible(width: int, tmp_path: Path) -> None:
     with opened(with_mesh(tmp_path / "reef"), width) as (page, _):
