@@ -226,7 +226,7 @@ export function tab(studio) {
     points.replaceChildren(table("Points", ["Point", "Views", "Sigma N, E, D, " + unit, "Worst, px", "Change"], held.points.map((point) => {
       const worst = worstOf(point);
       const bad = point.picks.some((pick) => pick.left_out) || worst.size > BAD_PX;
-      const box = el("input", {type: "checkbox", checked: chosen.includes(point.name), onchange: (event) => choose(point.name, event.target.checked)});
+      const box = el("input", {type: "checkbox", "data-point": point.name, checked: chosen.includes(point.name), onchange: (event) => choose(point.name, event.target.checked)});
       return [
         el("label", {}, box, " " + point.name),
         point.spot ? String(point.spot.views) : String(point.picks.length),
@@ -254,6 +254,7 @@ export function tab(studio) {
     chosen = chosen.filter((one) => one !== point);
     if (isOn) chosen = [...chosen, point].slice(-2);
     drawPoints();
+    [...points.querySelectorAll("[data-point]")].find((box) => box.dataset.point === point)?.focus({preventScroll: true});
     attempt(measure);
   }
 
@@ -269,7 +270,10 @@ export function tab(studio) {
       return;
     }
     lengthText.textContent = "Measuring…";
-    const found = await send("/api/picks/length", {first: picksOf(chosen[0]), second: picksOf(chosen[1])});
+    const found = await send("/api/picks/length", {first: picksOf(chosen[0]), second: picksOf(chosen[1])}).catch((fault) => {
+      lengthText.textContent = "No length between these two.";
+      throw fault;
+    });
     const part = (value) => (found.unit === "m" ? mm(value) + " mm" : number(value, found.unit, 2));
     lengthText.replaceChildren(el("strong", {}, chosen.join(" to ") + ": " + withSigma(found.value, found.sigma, found.unit)),
       ". Of the sigma, picks " + part(found.sigma_picks) + ", poses " + part(found.sigma_poses) + ", scale " + part(found.sigma_scale) + ".");
