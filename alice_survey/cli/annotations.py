@@ -73,7 +73,9 @@ def export(
 
 @app.command(
     epilog=examples(
-        "annotations table -w reef", "annotations table -w reef --quadrat 1 --csv cover.csv"
+        "annotations table -w reef",
+        "annotations table -w reef --quadrat 1 --csv cover.csv",
+        "annotations table -w reef --each --csv colonies.csv",
     )
 )
 def table(
@@ -84,15 +86,17 @@ def table(
     pick_sigma: Annotated[
         float, typer.Option(min=0, help="Sigma of a vertex, pixels of mosaic or picture.")
     ] = 0.5,
+    each: Annotated[bool, typer.Option("--each", help="List annotations, not labels.")] = False,
     csv: Annotated[Path | None, typer.Option(help="Write the rows as CSV.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what labels cover.
 
-    Count, area and share of the known ground of each label, with sigmas. Annotations in pictures
-    are projected onto the mosaic.
+    Count, area in plan, share of the known ground, area of the surface and rugosity of each label,
+    with sigmas; or the same of each annotation. Annotations in pictures are projected onto the
+    mosaic.
     """
     from reconstruct.annotations.table import table as measured
 
-    result = measured(workspace, side=quadrat, sigma_px=pick_sigma, csv_file=csv)
+    result = measured(workspace, side=quadrat, sigma_px=pick_sigma, each=each, csv_file=csv)
     print_result(*result, as_json)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
-from reconstruct.annotations.values import Annotation, DrawnShape, Kind, Place
+from reconstruct.annotations.values import DrawnShape, Kind, Place
 from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.measure.errors import shared_errors
 from reconstruct.picking.registered import RegisteredPictures
@@ -203,12 +203,13 @@ class Projector:
         return found
 
     def on_plane(
-        self, annotation: Annotation, sigma_px: float = PIXEL_SIGMA_PX
+        self, shape: DrawnShape, image: str, sigma_px: float = PIXEL_SIGMA_PX
     ) -> tuple[DrawnShape, list[OnPlane]]:
-        """An annotation in a picture on the mosaic.
+        """A shape in a picture on the mosaic.
 
         Args:
-            annotation: in a picture.
+            shape: in pixels of the picture.
+            image: name of the picture.
             sigma_px: with which its vertices were set.
 
         Returns:
@@ -217,7 +218,6 @@ class Projector:
         Raises:
             ReconstructionError: a vertex meets no known surface, or the picture is not registered.
         """
-        shape, image = annotation.shape, annotation.image or ""
         rings = [np.array(ring, dtype=np.float64) for ring in shape.rings]
         lengths, whole = [len(ring) for ring in rings], np.concatenate(rings)
         spots = self.to_plane(image, whole, sigma_px)
@@ -225,14 +225,13 @@ class Projector:
         if len(lost):
             x, y = whole[lost[0]]
             raise ReconstructionError(
-                f"annotation {annotation.id}: {len(lost)} of {len(whole)} vertices meet no known "
-                f"surface, the first at {image}:{x:.1f},{y:.1f}: draw it within what the model "
-                "knows, or on the mosaic"
+                f"{len(lost)} of {len(whole)} vertices meet no known surface, the first at "
+                f"{image}:{x:.1f},{y:.1f}: draw it within what the model knows, or on the mosaic"
             )
-        outer, *holes = (_places(part.places) for part in spots.parts(lengths))
+        parts = spots.parts(lengths)
+        outer, *holes = (_places(part.places) for part in parts)
         kind: Kind = "polygon" if shape.is_area else shape.kind
-        moved = DrawnShape(kind=kind, points=outer, holes=tuple(holes))
-        return moved, spots.parts(lengths)
+        return DrawnShape(kind=kind, points=outer, holes=tuple(holes)), parts
 
     def _moves(self, places: Array) -> Array:
         """How (N, 3, K) the model at places (N, 2) moves with errors of sigma 1, in the world."""

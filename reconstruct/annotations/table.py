@@ -1,14 +1,10 @@
-"""Areas of annotations with their sigmas, and what a label covers: of all, or by quadrats.
+"""Tables of annotations, and of what labels cover: of all, or by quadrats."""
 
-A vertex that a person sets errs by itself; what errors of the pose and of the surface do to all
-vertices of an annotation is carried along together, so that a shift leaves its area as it is.
-Areas are those of the plan, as the mosaic shows them.
-"""
-
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,44 +16,38 @@ from rasterio.transform import Affine
 from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.artefacts import write_csv
-from alice_survey.base.errors import ConfigError, ReconstructionError, WorkspaceError
-from alice_survey.base.frames import Array
-from reconstruct.annotations.projection import PIXEL_SIGMA_PX, OnPlane, Projector
+from alice_survey.base.errors import ConfigError, WorkspaceError
+from alice_survey.base.run import progress
+from reconstruct.annotations.marks import MarkMeasures, MeasuredMark
+from reconstruct.annotations.projection import PIXEL_SIGMA_PX, Projector
 from reconstruct.annotations.store import read_annotations
+from reconstruct.annotations.surfaces import MarkPart, MarkSurfaces, SurfaceFigures
 from reconstruct.annotations.transfer import frame_of
-from reconstruct.annotations.values import Annotation, AnnotationSet, DrawnShape, Label, area_only
+from reconstruct.annotations.values import AnnotationSet, Label, area_only
+from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import opened_raster
 
 _LONGEST_PX = 2000
 _MOST_QUADRATS = 100_000
 _OPAQUE = 128
+_WHOLE = 0.999
+"""Share of a known surface from which on it counts as all."""
 INSTANCE = "instance"
 """Attribute that parts of one thing share; they count once."""
+_SURFACE = ("surface", "surface_sigma", "rugosity", "rugosity_sigma", "surface_known")
 HEADER = (
     "quadrat", "west", "south", "side", "known", "label", "aphia_id", "count", "area", "sigma",
-    "cover", "cover_sigma", "unit",
+    "cover", "cover_sigma", *_SURFACE, "unit",
 )  # fmt: skip
+"""Columns of what labels cover."""
+EACH = (
+    "id", "label", "aphia_id", "image", "kind", "east", "north", "length", "area", "sigma",
+    *_SURFACE, "unit",
+)  # fmt: skip
+"""Columns of single annotations."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MeasuredMark:
-    """An annotation on the mosaic."""
-
-    annotation: Annotation
-    shape: DrawnShape
-    area: float
-    """Of its plan, in squares of the unit; NaN of points and lines."""
-    sigma: float
-    length: float
-    """Of a line; NaN of others."""
-
-    @cached_property
-    def geometry(self) -> BaseGeometry:
-        """As shapely has it."""
-        return self.shape.geometry
-
-
-@dataclass(frozen=True, kw_only=True)
 class Row:
     """What one label has in one place."""
 
@@ -68,9 +58,11 @@ class Row:
     cover: float
     """Share of the known ground that it covers; overlaps of one label count once."""
     cover_sigma: float
+    parts: tuple[MarkPart, ...]
+    """What its area is of."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LabelledQuadrat:
     """A square, or all of the mosaic, and what is in it."""
 
@@ -135,71 +127,6 @@ def ground_of(workspace: Path) -> KnownGround:
         )  # fmt: skip
 
 
-def measured(
-    annotations: Sequence[Annotation],
-    pixel: float,
-    projector: Callable[[], Projector],
-    sigma_px: float = PIXEL_SIGMA_PX,
-) -> tuple[list[MeasuredMark], list[str]]:
-    """Annotations on the mosaic with their areas, and why others are not.
-
-    Args:
-        annotations: on the mosaic and in pictures.
-        pixel: side of a pixel of the mosaic.
-        projector: of the workspace; used where annotations are in pictures.
-        sigma_px: with which vertices were set, in pixels of the mosaic or of the picture.
-    """
-    found, lost = [], []
-    for one in annotations:
-        shape, rings = one.shape, []
-        if one.image is None:
-            rings = [OnPlane.drawn(ring, sigma_px * pixel) for ring in shape.rings]
-        else:
-            try:
-                shape, rings = projector().on_plane(one, sigma_px)
-            except ReconstructionError as error:
-                lost.append(str(error))
-                continue
-        area, sigma, length = math.nan, math.nan, math.nan
-        if shape.is_area:
-            area, sigma = shape.area, sigma_of_area(one.shape, rings)
-        elif shape.kind == "polyline":
-            length = float(shape.geometry.length)
-        found.append(
-            MeasuredMark(annotation=one, shape=shape, area=area, sigma=sigma, length=length)
-        )
-    return found, lost
-
-
-def sigma_of_area(drawn: DrawnShape, rings: Sequence[OnPlane]) -> float:
-    """Standard deviation of the area of a shape.
-
-    Args:
-        drawn: as it was drawn: a circle by its middle and radius, a rectangle by two corners.
-        rings: its vertices on the plane, outer ring first.
-    """
-    own, shared = 0.0, np.zeros(rings[0].shared.shape[2])
-    for ring in rings:  # holes turn the other way round, so that signed areas add up
-        slopes = _slopes(ring.places)
-        own += float(np.einsum("ni,nij,nj->", slopes, ring.own, slopes))
-        shared = shared + np.einsum("ni,nik->k", slopes, ring.shared)
-    if drawn.kind == "circle":  # of one radius: all vertices move outwards by the same
-        outer = rings[0]
-        out = _slopes(outer.places)
-        along = np.linalg.norm(out, axis=1)
-        sigma = math.sqrt(float(np.trace(outer.own.mean(axis=0)))) * float(along.sum())
-        own = sigma**2
-    elif drawn.kind == "rectangle":  # of two corners, which set four
-        own *= 2.0
-    return math.sqrt(own + float(shared @ shared))
-
-
-def _slopes(ring: Array) -> Array:
-    """Derivatives (N, 2) of a ring's signed area by its vertices."""
-    chord = np.roll(ring, -1, axis=0) - np.roll(ring, 1, axis=0)
-    return 0.5 * np.column_stack([chord[:, 1], -chord[:, 0]])
-
-
 def quadrats(
     values: AnnotationSet,
     marks: Sequence[MeasuredMark],
@@ -256,27 +183,33 @@ def _rows(
         mine = [mark for mark in marks if mark.annotation.label == label.id]
         counted = [mark for mark in mine if box is None or _is_in(mark.geometry.centroid, box)]
         names = {m.annotation.attributes.get(INSTANCE) or m.annotation.id for m in counted}
-        parts, variance = [], 0.0
-        for mark in mine:
-            if not mark.shape.is_area or mark.area <= 0:
-                continue
-            part = mark.geometry if box is None else area_only(mark.geometry.intersection(box))
-            if part.area > 0:
-                parts.append(part)
-                # the share of the outline within the square sets the share of the variance
-                variance += mark.sigma**2 * min(1.0, part.area / mark.area)
+        parts = [part for mark in mine if (part := part_in(mark, box)) is not None]
         if not names and not parts:
             continue
-        covered = shapely.union_all(parts).area if parts else 0.0
-        sigma = math.sqrt(variance)
+        shapes = [part.geometry for part in parts]
+        covered = shapely.union_all(shapes).area if parts else 0.0
+        sigma = math.sqrt(math.fsum(part.mark.sigma**2 * part.share for part in parts))
         share = max(known, 1e-300)
         rows.append(
             Row(
-                label=label, count=len(names), area=math.fsum(part.area for part in parts),
-                sigma=sigma, cover=covered / share, cover_sigma=sigma / share,
+                label=label, count=len(names), area=math.fsum(shape.area for shape in shapes),
+                sigma=sigma, cover=covered / share, cover_sigma=sigma / share, parts=tuple(parts),
             )
         )  # fmt: skip
     return tuple(rows)
+
+
+def part_in(mark: MeasuredMark, box: BaseGeometry | None = None) -> MarkPart | None:
+    """The part of an annotation in a square, or all of it; None where it has no area there."""
+    if not mark.shape.is_area or mark.area <= 0:
+        return None
+    if box is None or box.covers(mark.geometry):
+        return MarkPart(mark=mark, geometry=mark.geometry)
+    shape = area_only(mark.geometry.intersection(box))
+    if not shape.area > 0:
+        return None
+    west, south, east, north = box.bounds
+    return MarkPart(mark=mark, geometry=shape, square=(west, south, east, north))
 
 
 def _is_in(middle: shapely.Point, box: BaseGeometry) -> bool:
@@ -285,65 +218,181 @@ def _is_in(middle: shapely.Point, box: BaseGeometry) -> bool:
     return bool(west <= middle.x < east and south <= middle.y < north)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AnnotationTable:
+    """All that the tables of a workspace's annotations are made of."""
+
+    values: AnnotationSet
+    marks: Sequence[MeasuredMark]
+    lost: Sequence[str]
+    """Why others are not on the mosaic."""
+    ground: KnownGround
+    quadrats: Sequence[LabelledQuadrat]
+    unit: str
+
+    @property
+    def parts(self) -> list[MarkPart]:
+        """All of which a surface can be measured: annotations, and what squares cut off them."""
+        cut = (part for one in self.quadrats for row in one.rows for part in row.parts)
+        every = itertools.chain(filter(None, map(part_in, self.marks)), cut)
+        return list({part.key: part for part in every}.values())
+
+    def rows(self, surfaces: MarkSurfaces | None) -> list[tuple[Any, ...]]:
+        """What labels cover, in the columns of `HEADER`.
+
+        Args:
+            surfaces: where all parts are measured; None where no surface is to be given.
+        """
+        return [
+            (
+                one.name, round(one.west, 6), round(one.south, 6), one.side, round(one.known, 6),
+                row.label.id, row.label.aphia_id, row.count, round(row.area, 9),
+                round(row.sigma, 9), round(row.cover, 9), round(row.cover_sigma, 9),
+                *_surface_cells(None if surfaces is None else surfaces.figures(row.parts)),
+                self.unit,
+            )
+            for one in self.quadrats
+            for row in one.rows
+        ]  # fmt: skip
+
+    def each(self, surfaces: MarkSurfaces | None) -> list[tuple[Any, ...]]:
+        """Single annotations, in the columns of `EACH`; see `rows`."""
+        found, of = [], self.values.by_label
+        for mark in self.marks:
+            one, label, part = mark.annotation, of[mark.annotation.label], part_in(mark)
+            figures = None if surfaces is None or part is None else surfaces.figures([part])
+            middle = mark.geometry.centroid
+            found.append((
+                one.id, label.id, label.aphia_id, one.image, one.shape.kind, round(middle.x, 6),
+                round(middle.y, 6), _rounded(mark.length), _rounded(mark.area),
+                _rounded(mark.sigma), *_surface_cells(figures), self.unit,
+            ))  # fmt: skip
+        return found
+
+    def not_measured(self, surfaces: MarkSurfaces) -> list[str]:
+        """Why surfaces within annotations are not."""
+        found = []
+        for mark in self.marks:
+            part = part_in(mark)
+            fault = None if part is None else surfaces.fault(part)
+            if fault is not None:
+                found.append(f"annotation {mark.annotation.id}: {fault}")
+        return found
+
+
+def _rounded(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 9)
+
+
+def _surface_cells(figures: SurfaceFigures | None) -> tuple[float | None, ...]:
+    if figures is None:
+        return (None,) * len(_SURFACE)
+    return (
+        round(figures.area, 9), round(figures.area_sigma, 9), round(figures.rugosity, 6),
+        round(figures.rugosity_sigma, 6), round(figures.known, 6),
+    )  # fmt: skip
+
+
+def annotation_table(
+    workspace: Path, measures: MarkMeasures, ground: KnownGround, side: float | None = None
+) -> AnnotationTable:
+    """The annotations of a workspace on its mosaic, and what labels cover.
+
+    Args:
+        workspace: with a mosaic.
+        measures: of its annotations.
+        ground: of its mosaic.
+        side: of quadrats; None for all of the mosaic.
+    """
+    frame = frame_of(workspace)
+    values = read_annotations(workspace, frame)
+    marks, lost = measures.of(values.annotations)
+    return AnnotationTable(
+        values=values, marks=marks, lost=lost, ground=ground,
+        quadrats=quadrats(values, marks, ground, side), unit="m" if frame is None else frame.unit,
+    )  # fmt: skip
+
+
+def surfaces_of(workspace: Path) -> MarkSurfaces | None:
+    """The surface of a workspace to measure annotations on; None where there is none."""
+    if not (workspace / "dense" / "dem.tif").is_file():
+        return None
+    return MarkSurfaces(MeasuredSurface.of(workspace))
+
+
 def table(
     workspace: Path,
     *,
     side: float | None = None,
     sigma_px: float = PIXEL_SIGMA_PX,
+    each: bool = False,
     csv_file: Path | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """What each label has and covers in a workspace.
+    """What each label has and covers in a workspace, or its annotations one by one.
 
     Args:
         workspace: with annotations, a surface and a mosaic.
         side: of quadrats; None for all of the mosaic.
         sigma_px: with which vertices were set.
-        csv_file: to write rows to, in the columns of `HEADER`.
+        each: whether to list annotations instead of labels.
+        csv_file: to write rows to, in the columns of `HEADER` or `EACH`.
 
     Returns:
         A table as text, and the rows as JSON values.
 
     Raises:
+        ConfigError: both quadrats and single annotations are wanted.
         WorkspaceError: there are no annotations, or no mosaic.
     """
-    frame = frame_of(workspace)
-    values = read_annotations(workspace, frame)
-    if not values.annotations:
+    if each and side is not None:
+        raise ConfigError("annotations are listed one by one or summed by quadrats: choose one")
+    ground = ground_of(workspace)
+    opened = cache(lambda: Projector(workspace))
+    measures = MarkMeasures(ground.pixel, opened, sigma_px)
+    found = annotation_table(workspace, measures, ground, side)
+    if not found.values.annotations:
         raise WorkspaceError(
             f"{workspace} has no annotations: draw some in the studio, or 'annotations import'"
         )
-    ground = ground_of(workspace)
-    unit = "m" if frame is None else frame.unit
-    opened = cache(lambda: Projector(workspace))
-    marks, lost = measured(values.annotations, ground.pixel, opened, sigma_px)
-    found = quadrats(values, marks, ground, side)
-    rows = [cells(one, row, unit) for one in found for row in one.rows]
+    surfaces, missed = surfaces_of(workspace), ["there is no elevation model"]
+    if surfaces is not None:
+        parts = found.parts
+        with progress.step("measure surfaces", len(parts)) as step:
+            for part in parts:
+                surfaces.measure(part)
+                step.advance()
+        missed = found.not_measured(surfaces)
+    header = EACH if each else HEADER
+    rows = found.each(surfaces) if each else found.rows(surfaces)
     if csv_file is not None:
-        write_csv(csv_file, HEADER, rows)
-    lines = [_line(row) for row in rows]
-    lines += [f"not counted: {line}" for line in lost]
+        write_csv(csv_file, header, rows)
+    named = [dict(zip(header, row, strict=True)) for row in rows]
+    lines = [_line(row) for row in named]
+    lines += [f"not counted: {line}" for line in found.lost]
+    lines += [f"without a surface: {line}" for line in missed]
     data = {
-        "rows": [dict(zip(HEADER, row, strict=True)) for row in rows],
-        "not_counted": lost,
+        "rows": named, "not_counted": list(found.lost), "without_surface": missed,
         "sigma_px": sigma_px,
-    }
+    }  # fmt: skip
     return "\n".join(lines), data
 
 
-def cells(quadrat: LabelledQuadrat, row: Row, unit: str) -> tuple[Any, ...]:
-    """A row of the table, in the columns of `HEADER`."""
-    return (
-        quadrat.name, round(quadrat.west, 6), round(quadrat.south, 6), quadrat.side,
-        round(quadrat.known, 6), row.label.id, row.label.aphia_id, row.count, round(row.area, 9),
-        round(row.sigma, 9), round(row.cover, 9), round(row.cover_sigma, 9), unit,
-    )  # fmt: skip
-
-
-def _line(row: tuple[Any, ...]) -> str:
-    values = dict(zip(HEADER, row, strict=True))
-    unit = "m2" if values["unit"] == "m" else "units2"
-    place = "" if values["side"] is None else f"quadrat {values['quadrat']}: "
-    return (
-        f"{place}{values['label']}: {values['count']}, {values['area']:.6f} +/- "
-        f"{values['sigma']:.6f} {unit}, {values['cover']:.3%} of the known ground"
-    )
+def _line(row: dict[str, Any]) -> str:
+    unit = "m2" if row["unit"] == "m" else "units2"
+    what, size = row["label"], []
+    if "id" in row:
+        what = f"{row['label']} {row['id']} ({row['image'] or 'mosaic'})"
+        if row["length"] is not None:
+            size.append(f"{row['length']:.6f} {row['unit']}")
+    else:
+        what = row["label"] if row["side"] is None else f"quadrat {row['quadrat']}: {row['label']}"
+        size.append(f"{row['count']}")
+    if row["area"] is not None:
+        size.append(f"{row['area']:.6f} +/- {row['sigma']:.6f} {unit}")
+    if "cover" in row:
+        size.append(f"{row['cover']:.3%} of the known ground")
+    if row["surface"] is not None:
+        part = "" if row["surface_known"] > _WHOLE else f" of {row['surface_known']:.1%} of it"
+        size.append(f"surface {row['surface']:.6f} +/- {row['surface_sigma']:.6f} {unit}{part}")
+        size.append(f"rugosity {row['rugosity']:.4f} +/- {row['rugosity_sigma']:.4f}")
+    return f"{what}: {', '.join(size) or 'a point'}"

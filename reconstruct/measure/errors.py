@@ -11,7 +11,7 @@ them (`dense.dem.cells_over`), whose variance is a sixth of a cell. Noise under 
 s² correlates by exp(-d² / 4s²), here 4s² = 4 (1/4 + 1/6) cells².
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -146,6 +146,44 @@ class Variance:
         return float(np.sqrt(self.own + self.shared))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PackedSlopes:
+    """Derivatives of a figure by the motions of the few nodes that move it."""
+
+    errors: SharedErrors
+    nodes: NDArray[np.int64]
+    """(N,) their numbers."""
+    smooth: Array
+    """(N, 3) by motions that change from node to node."""
+    near: Array
+    """(N, 3) by what the places around a node share."""
+    own: float
+    """Variance by own errors."""
+
+    @property
+    def variance(self) -> Variance:
+        """Of the figure."""
+        errors, nodes = self.errors, self.nodes
+        motions = errors.motions.reshape(errors.nodes, 3, -1)[nodes]
+        by_motion = np.einsum("ni,nik->k", self.smooth, motions)
+        rest = np.einsum("ni,nij,nj->", self.near, errors.rest.reshape(-1, 3, 3)[nodes], self.near)
+        shared = float(by_motion @ errors.covariance @ by_motion) + float(rest)
+        return Variance(own=max(self.own, 0.0), shared=max(shared, 0.0))
+
+
+def summed(terms: Sequence[tuple[float, PackedSlopes]]) -> PackedSlopes:
+    """A sum of figures, each times a factor, which know different own errors."""
+    slopes = [one for _, one in terms]
+    nodes, at = np.unique(np.concatenate([one.nodes for one in slopes]), return_inverse=True)
+    smooth, near = (np.zeros((len(nodes), 3)) for _ in range(2))
+    np.add.at(smooth, at, np.concatenate([factor * one.smooth for factor, one in terms]))
+    np.add.at(near, at, np.concatenate([factor * one.near for factor, one in terms]))
+    return PackedSlopes(
+        errors=slopes[0].errors, nodes=nodes, smooth=smooth, near=near,
+        own=sum(factor**2 * one.own for factor, one in terms),
+    )  # fmt: skip
+
+
 class FigureSlopes:
     """Derivatives of a figure with respect to the surface's motions, gathered part by part."""
 
@@ -191,22 +229,14 @@ class FigureSlopes:
         """
         self._own = max(self._own - scatter, scatter)
 
-    def add_times(self, factor: float, other: "FigureSlopes") -> None:
-        """Add a figure times a factor; both know different own errors."""
-        self._smooth += factor * other._smooth
-        self._near += factor * other._near
-        self._own += factor**2 * other._own
-
     @property
-    def variance(self) -> Variance:
-        """Of the figure."""
-        errors = self._errors
-        by_motion = np.einsum(
-            "ni,nik->k", self._smooth, errors.motions.reshape(errors.nodes, 3, -1)
-        )
-        rest = np.einsum("ni,nij,nj->", self._near, errors.rest.reshape(-1, 3, 3), self._near)
-        shared = float(by_motion @ errors.covariance @ by_motion) + float(rest)
-        return Variance(own=max(self._own, 0.0), shared=max(shared, 0.0))
+    def packed(self) -> PackedSlopes:
+        """Those that are not zero: a small polygon is moved by few nodes."""
+        nodes = np.flatnonzero((self._smooth != 0.0).any(axis=1) | (self._near != 0.0).any(axis=1))
+        return PackedSlopes(
+            errors=self._errors, nodes=nodes, smooth=self._smooth[nodes], near=self._near[nodes],
+            own=self._own,
+        )  # fmt: skip
 
 
 def shared_errors(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.frames import Array
-from reconstruct.measure.errors import FigureSlopes
+from reconstruct.measure.errors import FigureSlopes, PackedSlopes
 from reconstruct.measure.surface import MeasuredSurface, Samples
 
 
@@ -37,7 +37,7 @@ class Measured:
 
 
 def figure(
-    surface: MeasuredSurface, name: str, title: str, value: float, slopes: FigureSlopes, power: int,
+    surface: MeasuredSurface, name: str, title: str, value: float, slopes: PackedSlopes, power: int,
     unit: str | None = None,
 ) -> Measured:  # fmt: skip
     """A figure of a surface.
@@ -83,7 +83,7 @@ def of_points(
     centred = samples.points - samples.points.mean(axis=0)
     slopes, gathered = slopes_of(value, centred), FigureSlopes(surface.errors)
     gathered.add(samples.places, slopes, samples.own_variance(slopes))
-    return figure(surface, name, title, value(centred), gathered, power, unit)
+    return figure(surface, name, title, value(centred), gathered.packed, power, unit)
 
 
 def polyline(points: Array) -> float:

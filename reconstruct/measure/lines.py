@@ -159,7 +159,7 @@ def surface_length(surface: MeasuredSurface, line: SurfaceProfile) -> Measured:
     gathered = FigureSlopes(surface.errors)
     gathered.add(samples.places, slopes, samples.own_variance(slopes))
     gathered.count_once(2.0 * float((added**2).sum()))
-    return figure(surface, name, title, value, gathered, 1)
+    return figure(surface, name, title, value, gathered.packed, 1)
 
 
 def _plan_length(points: Array) -> float:

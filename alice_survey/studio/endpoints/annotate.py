@@ -1,6 +1,8 @@
 """The Annotate tab: labels and annotations, their areas, other tools' files, and pictures."""
 
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,31 +16,32 @@ from alice_survey.report.colours import MOSAIC_FILE
 from alice_survey.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio, zipped
 from reconstruct.annotations.backdrops import backdrops_of
 from reconstruct.annotations.formats.registry import FORMATS
+from reconstruct.annotations.marks import MarkMeasures, MeasuredMark
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, InPicture, OnPlane, Projector
 from reconstruct.annotations.store import (
     change_annotations,
     read_annotations,
     token_of,
 )
-from reconstruct.annotations.table import HEADER as COLUMNS
 from reconstruct.annotations.table import (
+    EACH,
+    HEADER,
+    AnnotationTable,
     KnownGround,
-    MeasuredMark,
-    cells,
+    annotation_table,
     ground_of,
-    measured,
-    quadrats,
+    surfaces_of,
 )
 from reconstruct.annotations.transfer import GEOJSON, exported, frame_of, import_data
 from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, Label, with_labels
-from reconstruct.measure.polygons import roughness
-from reconstruct.measure.surface import MeasuredSurface
 
 _MOST_BYTES = 64 << 20
 _MOST_PICTURES = 8
 _AROUND = 0.6
 """Of an outline's extent that is shown around it."""
 _LEAST_AROUND_PX = 40
+_TURN_S = 0.7
+"""Time in which surfaces are measured for one request."""
 _KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8"}
 
 
@@ -56,7 +59,10 @@ class _Annotate:
         self._studio, self._folder = studio, studio.workspace.folder
         self._projector = KeptValue(lambda: Projector(self._folder))
         self._ground = KeptValue(lambda: ground_of(self._folder))
-        self._surface = KeptValue(lambda: MeasuredSurface.of(self._folder))
+        self._measures = KeptValue(lambda: MarkMeasures(self.ground().pixel, self.projector))
+        self._surfaces = KeptValue(lambda: surfaces_of(self._folder))
+        self._made: tuple[Hashable, AnnotationTable] | None = None
+        self._measuring = threading.Lock()
 
     def projector(self) -> Projector:
         """The model as it is now."""
@@ -130,33 +136,55 @@ class _Annotate:
         ((file, data),) = texts.items()
         return Content(data=data, kind=_KINDS[suffix], name=file)
 
+    def _table(self, side: float | None) -> AnnotationTable:
+        """The tables as files are now; those that were made last are kept. The lock is held."""
+        state = self._studio.workspace.state(())
+        key = (state, token_of(self._folder), side)
+        if self._made is None or self._made[0] != key:
+            ground, measures = self.ground(), self._measures.of(state)
+            self._made = (key, annotation_table(self._folder, measures, ground, side))
+        return self._made[1]
+
     def table(self, call: Call) -> dict[str, Any]:
-        """Area of each annotation, and what labels cover."""
-        side = call.number("quadrat") if call.query.get("quadrat") else None
-        values, ground = self._values(), self.ground()
-        marks, lost = measured(values.annotations, ground.pixel, self.projector)
-        frame = frame_of(self._folder)
-        unit = "m" if frame is None else frame.unit
-        rows = [
-            cells(q, row, unit) for q in quadrats(values, marks, ground, side) for row in q.rows
-        ]
+        """Area of each annotation in plan, and what labels cover."""
+        with self._measuring:
+            found = self._table(_side(call))
         return {
-            "marks": [_mark(mark) for mark in marks],
-            "rows": [dict(zip(COLUMNS, row, strict=True)) for row in rows],
-            "known": ground.area,
-            "not_counted": lost,
+            "marks": [_mark(mark) for mark in found.marks],
+            "rows": [dict(zip(HEADER, row, strict=True)) for row in found.rows(None)],
+            "known": found.ground.area,
+            "not_counted": found.lost,
             "sigma_px": PIXEL_SIGMA_PX,
         }
 
-    def surface(self, call: Call) -> dict[str, Any]:
-        """Area of the surface within an annotation, and its rugosity."""
-        one = self._annotation(call.path["id"])
-        marks, lost = measured([one], self.ground().pixel, self.projector)
-        if lost or not marks[0].shape.is_area:
-            raise AliceError(lost[0] if lost else f"a {one.shape.kind} has no area")
-        surface = self._surface.of(self._studio.workspace.state(()))
-        found = roughness(surface, marks[0].geometry)
-        return {"figures": [figure.to_json() for figure in found]}
+    def surfaces(self, call: Call) -> dict[str, Any]:
+        """Areas of the surface and rugosity, once all are measured; some more of them until then.
+
+        `done` of `total` are; the page asks again until these are the same.
+        """
+        with self._measuring:
+            surfaces = self._surfaces.of(self._studio.workspace.state(()))
+            if surfaces is None:
+                raise AliceError("there is no elevation model to measure surfaces on")
+            found = self._table(_side(call))
+            parts = found.parts
+            waiting = surfaces.waiting(parts)
+            until, left = time.monotonic() + _TURN_S, len(waiting)
+            for part in waiting:
+                surfaces.measure(part)
+                left -= 1
+                if time.monotonic() > until:
+                    break
+            answer = {"done": len(parts) - left, "total": len(parts)}
+            if left:
+                return answer
+            surfaces.keep(parts)
+            return {
+                **answer,
+                "each": [dict(zip(EACH, row, strict=True)) for row in found.each(surfaces)],
+                "rows": [dict(zip(HEADER, row, strict=True)) for row in found.rows(surfaces)],
+                "without_surface": found.not_measured(surfaces),
+            }
 
     def pictures(self, call: Call) -> dict[str, Any]:
         """The pictures that show an annotation, with its outline in a part of each."""
@@ -181,6 +209,10 @@ class _Annotate:
         if found is None:
             raise FileNotFoundError(name)
         return found
+
+
+def _side(call: Call) -> float | None:
+    return call.number("quadrat") if call.query.get("quadrat") else None
 
 
 def _mark(mark: MeasuredMark) -> dict[str, Any]:
@@ -225,9 +257,9 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/annotations", answer=tab.all),
         Endpoint(path="/api/annotations/table", answer=tab.table),
+        Endpoint(path="/api/annotations/surfaces", answer=tab.surfaces),
         Endpoint(path="/api/annotations/export/{format}", answer=tab.give),
         Endpoint(path="/api/annotations/{id}/pictures", answer=tab.pictures),
-        Endpoint(path="/api/annotations/{id}/surface", answer=tab.surface),
         Endpoint(
             path="/api/annotations/change", answer=tab.change, method="POST", writes=True,
             most_bytes=_MOST_BYTES,

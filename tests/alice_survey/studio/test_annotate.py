@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alice_survey.studio.endpoints import annotate
 from alice_survey.studio.server import Server
-from tests.alice_survey.report.tiny import tiny_workspace
+from tests.alice_survey.report.tiny import SLOPE, tiny_workspace
 from tests.alice_survey.studio.client import ask, call, serving
 
 LABELS = [
@@ -30,6 +31,15 @@ def square(name: str, side: float = 0.1, label: str = "coral") -> dict[str, Any]
 def server(tmp_path: Path) -> Iterator[Server]:
     with serving(tiny_workspace(tmp_path / "reef")) as started:
         yield started
+
+
+def measured(server: Server, query: str = "") -> dict[str, Any]:
+    """Surfaces, asked for until all are there."""
+    for _ in range(100):
+        found: dict[str, Any] = ask(server, f"/api/annotations/surfaces{query}").json
+        if found["done"] == found["total"]:
+            return found
+    raise AssertionError(found)
 
 
 def change(server: Server, token: str, **values: Any) -> Any:
@@ -93,6 +103,34 @@ def test_areas_are_those_of_the_squares(server: Server) -> None:
     assert ask(server, "/api/annotations/table?quadrat=1e-6").status == 400
 
 
+def test_surfaces_are_those_of_the_tilted_plane_and_follow_changes(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(annotate, "_TURN_S", 0.0)  # one for each request
+    point = {**square("p"), "shape": {"kind": "point", "points": [[0.5, 0.5]]}}
+    put = [square("a"), square("b", 0.3, "sand"), square("c", 0.2), point]
+    token = change(server, "", labels=LABELS, put=put).json["token"]
+    first = ask(server, "/api/annotations/surfaces").json
+    assert (first["done"], first["total"]) == (1, 3) and "each" not in first
+    found = measured(server)
+    slant = np.sqrt(1 + SLOPE**2)
+    surfaces = {one["id"]: one["surface"] for one in found["each"]}
+    assert surfaces.pop("p") is None and list(surfaces) == ["a", "b", "c"]
+    for name, area in (("a", 0.01), ("b", 0.09), ("c", 0.04)):
+        assert surfaces[name] == pytest.approx(slant * area, rel=1e-3)
+    rows = {row["label"]: row for row in found["rows"]}
+    assert rows["coral"]["surface"] == pytest.approx(surfaces["a"] + surfaces["c"], abs=1e-8)
+    assert rows["coral"]["rugosity"] == pytest.approx(slant, rel=1e-3)
+    again = change(server, token, put=[square("c", 0.25)], delete=["a"])
+    left = ask(server, "/api/annotations/surfaces").json  # what stayed is not measured again
+    assert (left["done"], left["total"]) == (2, 2) and again.status == 200
+    surfaces = {one["id"]: one["surface"] for one in left["each"]}
+    assert surfaces["c"] == pytest.approx(slant * 0.0625, rel=1e-3)
+    by_quadrat = measured(server, "?quadrat=0.25")["rows"]
+    parts = [row["surface"] for row in by_quadrat if row["label"] == "sand" and row["area"]]
+    assert len(parts) > 1 and sum(parts) == pytest.approx(surfaces["b"], rel=1e-6)
+
+
 @pytest.mark.parametrize("name", ["taglab", "coco", "biigle", "geojson"])
 def test_files_go_and_come_back(server: Server, name: str) -> None:
     assert ask(server, f"/api/annotations/export/{name}").status == 400  # nothing to write
@@ -144,15 +182,21 @@ def test_an_annotation_is_shown_in_the_pictures_that_see_it(
             inside = (ring >= [left, top]) & (ring <= [left + width, top + height])
             assert inside.all(axis=1).mean() >= 0.5 and 0 < shown["sigma_px"] < 3
         assert ask(server, "/api/annotations/nothing/pictures").status == 404
-        surface, ratio = ask(server, "/api/annotations/a/surface").json["figures"]
+        (one,) = measured(server)["each"]
         asked = call(server, "/api/model/measure", {"kind": "polygon", "places": box}).json
-        assert [surface, ratio] == asked["figures"][1:3]
-        assert 0.04 < surface["value"] < 0.08 and 0 < surface["sigma"] < 0.004
-        point = {**mark, "id": "p", "shape": {"kind": "point", "points": box[:1]}}
+        for name, figure in zip(("surface", "rugosity"), asked["figures"][1:3], strict=True):
+            assert one[name] == pytest.approx(figure["value"], abs=1e-6)
+            # how it was drawn counts as well
+            assert figure["sigma"] < one[f"{name}_sigma"] < 0.05 * one[name]
+        assert one["sigma"] < one["surface_sigma"] < 2 * one["sigma"]
+        taken = found["pictures"][0]
+        inner = {**mark, "id": "q", "image": taken["image"],
+                 "shape": {"kind": "polygon", "points": taken["rings"][0]}}  # fmt: skip
         token = ask(server, "/api/annotations").json["token"]
-        assert change(server, token, put=[point]).status == 200
-        for name, status in (("nothing", 404), ("p", 400)):
-            assert ask(server, f"/api/annotations/{name}/surface").status == status
+        assert change(server, token, put=[inner]).status == 200
+        first, second = measured(server)["each"]
+        for name, off in (("area", 0.002), ("surface", 0.01), ("rugosity", 0.01)):
+            assert second[name] == pytest.approx(first[name], rel=off)
 
 
 def test_a_survey_without_a_mosaic_says_so(tmp_path: Path) -> None:
@@ -160,4 +204,5 @@ def test_a_survey_without_a_mosaic_says_so(tmp_path: Path) -> None:
         assert ask(server, "/api/annotations").json["annotations"] == []
         reply = ask(server, "/api/annotations/table")
         assert reply.status == 400 and "mosaic" in reply.json["error"]
+        assert ask(server, "/api/annotations/surfaces").status == 400
     assert json.loads(reply.body)["error"]

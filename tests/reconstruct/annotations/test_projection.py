@@ -11,9 +11,9 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.seafloor.terrain import Terrain, read_terrain
 from camera_calib.rig import read_rig
+from reconstruct.annotations.marks import sigma_of_area
 from reconstruct.annotations.projection import OnPlane, Projector
-from reconstruct.annotations.table import sigma_of_area
-from reconstruct.annotations.values import Annotation, DrawnShape
+from reconstruct.annotations.values import DrawnShape
 from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.placing.alignment import align_rigid
 
@@ -142,10 +142,10 @@ def test_a_vertex_beyond_the_surface_is_one_line(truth: Truth) -> None:
     image = truth.projector.pictures.names[0]
     shape = DrawnShape(kind="polygon", points=((100.0, 100.0), (200.0, 100.0), (-4e3, 1e4)))
     with pytest.raises(ReconstructionError, match="1 of 3 vertices") as caught:
-        truth.projector.on_plane(Annotation(label="x", shape=shape, image=image))
+        truth.projector.on_plane(shape, image)
     assert len(str(caught.value).splitlines()) == 1
     with pytest.raises(ReconstructionError, match="nowhere"):
-        truth.projector.on_plane(Annotation(label="x", shape=shape, image="nowhere.png"))
+        truth.projector.on_plane(shape, "nowhere.png")
 
 
 def test_the_sigma_of_an_area_is_what_picks_do() -> None:

@@ -10,6 +10,7 @@ from rasterio.transform import Affine as GridAffine
 from alice_survey.base.edited_files import StaleError
 from alice_survey.base.errors import ConfigError, WorkspaceError
 from alice_survey.base.frames import Datum
+from reconstruct.annotations.marks import MeasuredMark
 from reconstruct.annotations.store import (
     FILE,
     change_annotations,
@@ -17,7 +18,7 @@ from reconstruct.annotations.store import (
     read_annotations,
     token_of,
 )
-from reconstruct.annotations.table import KnownGround, MeasuredMark, quadrats
+from reconstruct.annotations.table import KnownGround, quadrats
 from reconstruct.annotations.values import Annotation, AnnotationSet, DrawnShape, Label, with_labels
 from reconstruct.views.model import WorldFrame
 
@@ -87,7 +88,7 @@ def test_a_gis_sees_them_where_they_are() -> None:
 
 def measured(one: Annotation, sigma: float = 0.01) -> MeasuredMark:
     return MeasuredMark(annotation=one, shape=one.shape, area=one.shape.area, sigma=sigma,
-                    length=float("nan"))  # fmt: skip
+                        length=float("nan"), own=())  # fmt: skip
 
 
 KNOWN = np.ones((40, 60), bool)

@@ -77,8 +77,8 @@ def test_an_earlier_file_counts_poses_in_patches_and_says_so(tmp_path: Path) -> 
     down = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     near.add(np.array([[0.2, 0.2], [0.21, 0.2]]), down, 0.0)
     far.add(np.array([[0.1, 0.1], [0.7, 1.1]]), down, 0.0)
-    assert near.variance.shared == 0.0
-    assert far.variance.sigma == pytest.approx(np.sqrt(2) * 0.0002)
+    assert near.packed.variance.shared == 0.0
+    assert far.packed.variance.sigma == pytest.approx(np.sqrt(2) * 0.0002)
 
 
 def test_a_scale_of_navigation_is_counted(tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ from scipy.special import ellipe
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from reconstruct.measure.areas import surface_within
 from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, profile
-from reconstruct.measure.polygons import measure_polygon, quadrats, roughness
+from reconstruct.measure.polygons import measure_polygon, quadrats
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import DemGrid, tiled_raster
 from tests.reconstruct.measure.synthetic import (
@@ -35,6 +36,10 @@ SLANTED = [(-0.41, -0.32), (0.33, -0.4), (0.4, 0.21), (0.02, 0.43), (-0.35, 0.3)
 
 def named(figures: Sequence[Measured]) -> dict[str, Measured]:
     return {figure.name: figure for figure in figures}
+
+
+def roughness(surface: MeasuredSurface, polygon: shapely.Polygon) -> tuple[Measured, Measured]:
+    return surface_within(surface, polygon)[0].figures(surface)
 
 
 def ramp(x: Array, y: Array) -> Array:
