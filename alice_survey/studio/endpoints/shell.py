@@ -88,7 +88,7 @@ class _Shell:
 def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     """What the list of layers says of one."""
     is_base = isinstance(layer, PictureLayer) and layer.base
-    group = "Under it" if layer.name in (CHART, "contours") else layer.group
+    group = "Background" if layer.name in (CHART, "contours") else layer.group
     if is_base:
         group = "Base layer"
     return {

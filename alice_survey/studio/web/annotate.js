@@ -1,18 +1,18 @@
 /* The Annotate tab: labels, annotations on the mosaic, their areas, and other tools' files. */
 
-import {attempt, button, download, el, field, get, on, save as saveFile, say, send, table} from "./core.js";
+import {attempt, button, el, field, get, on, save as saveFile, say, send, table} from "./core.js";
 import {BLUE} from "./palette.js";
 import {Wall} from "./picture_views.js";
 import {canRedo, canUndo, current, record, redo, startHistory, undo} from "./undo.js";
 import {vertexHandles} from "./vertices.js";
-import {counted, csv, number, withSigma} from "./words.js";
+import {counted, number, withSigma} from "./words.js";
 import {annotationsOn} from "./annotate_map.js";
 import {isArea, targetOf} from "./annotate_shapes.js";
+import {annotationTable, coverTable, surfaceCells, warnings} from "./annotate_tables.js";
 import {drawingTool} from "./drawing.js";
 import {missing} from "./missing.js";
-import {pictureDrawing} from "./picture_drawing.js";
+import {pictureDrawing, pictureEditing} from "./picture_drawing.js";
 
-const MOST_ROWS = 100;
 const NOTHING = {labels: [], annotations: new Map()};
 const KINDS = {point: "Point", polyline: "Line", polygon: "Polygon", rectangle: "Rectangle"};
 
@@ -25,6 +25,10 @@ export function tab(studio) {
   let colours = [];
   let formats = [];
   let marks = new Map();
+  let surfaces = new Map();  /* rows of the server, with the annotation that each is `of` */
+  let surfaceRows = null;
+  let asked = 0;
+  let lost = [];
   let label = "";
   let chosen = null;
   let tool = null;
@@ -53,12 +57,45 @@ export function tab(studio) {
 
   async function measure() {
     marks = new Map();
+    lost = [];
+    asked += 1;
     cover.replaceChildren();
+    surfaces = new Map([...surfaces].filter(([id, row]) => stored.annotations.get(id) === row.of));
+    surfaceRows = null;
+    progress.textContent = "";
     if (!stored.annotations.size || !studio.state.has.mosaic) return;
-    const found = await attempt(() => get("/api/annotations/table", quadrat.value ? {quadrat: quadrat.value} : {}));
+    const found = await attempt(() => get("/api/annotations/table", sideNow()));
     if (!found) return;
     found.marks.forEach((mark) => marks.set(mark.id, mark));
-    cover.replaceChildren(coverTable(found), ...found.not_counted.map((line) => el("p", {class: "warn"}, "Not counted: " + line)));
+    lost = found.not_counted;
+    showCover(found.rows, found.known);
+    if (studio.state.has.dem) measureSurfaces(found.known);
+  }
+
+  const sideNow = () => (quadrat.value ? {quadrat: quadrat.value} : {});
+
+  /* Measured by the server a while at a time, which edits meanwhile end. */
+  async function measureSurfaces(known) {
+    const own = asked;
+    const of = stored.annotations;
+    for (;;) {
+      const found = await attempt(() => get("/api/annotations/surfaces", sideNow()));
+      if (own !== asked) return;
+      progress.textContent = found && !found.each ? "Measuring surfaces: " + found.done.toLocaleString("en") + " of " + found.total.toLocaleString("en") : "";
+      if (!found) return;
+      if (found.each) {
+        surfaceRows = found.each;
+        surfaces = new Map(found.each.map((row) => [row.id, {...row, of: of.get(row.id)}]));
+        showCover(found.rows, known, found.without_surface);
+        rows.replaceChildren(...rowsOf());
+        renderCard();
+        return;
+      }
+    }
+  }
+
+  function showCover(rowsOfLabels, known, without = []) {
+    cover.replaceChildren(coverTable(rowsOfLabels, known, unit), ...warnings("Not counted", lost), ...warnings("Without a surface", without));
   }
 
   /* One request after the other: each needs the token that the one before returned. */
@@ -184,7 +221,8 @@ export function tab(studio) {
     return Boolean(label);
   }
 
-  const colourNow = () => now().labels.find((one) => one.id === label).colour;
+  const colourOf = (one) => now().labels.find(({id}) => id === one.label).colour;
+  const colourNow = () => colourOf({label});
 
   /* In the pictures that show the middle of the map. */
   let inPictures = null;
@@ -198,13 +236,39 @@ export function tab(studio) {
     const {pictures, total} = await get("/api/pictures/seeing", {n: lat, e: lng, count: 40});
     if (!pictures.length) throw new Error("no picture shows the middle of the map");
     inPictures = inPictures || pictureDrawing({
-      done: (image, kind, points) => {
-        putNew(image, kind, points);
+      done: async (image, kind, points) => {
         say(KINDS[kind] + " drawn in " + image);
+        await putNew(image, kind, points);
+        sayIfLost(chosen);
       },
     });
-    wall?.hide();
+    hideWalls();
     inPictures.begin(counted(total, "picture shows", "pictures show") + " the middle of the map", pictures, {kind: kindInPictures.value, colour: colourNow()});
+  }
+
+  function sayIfLost(id) {
+    const line = lost.find((text) => text.includes(id));
+    if (line) say("It is kept, and not on the mosaic: " + line.slice(line.indexOf(": ") + 2), "warn");
+  }
+
+  /* One that was drawn in a picture is edited in that picture. */
+  let editing = null;
+  async function editInPicture(one) {
+    hideWalls();
+    editing = editing || pictureEditing({
+      now: () => now().annotations.get(chosen),
+      changed: async (next, tag) => {
+        await (next ? put(next, tag) : remove(chosen));
+        if (next) sayIfLost(next.id);
+      },
+    });
+    editing.begin(one, colourOf(one));
+  }
+
+  function hideWalls() {
+    wall?.hide();
+    inPictures?.hide();
+    editing?.hide();
   }
 
   function take(kind) {
@@ -237,7 +301,7 @@ export function tab(studio) {
 
   function choose(id) {
     chosen = id;
-    wall?.hide();
+    hideWalls();
     redraw();
     render();
   }
@@ -245,7 +309,7 @@ export function tab(studio) {
   async function showPictures(one) {
     const {pictures} = await get("/api/annotations/" + one.id + "/pictures");
     if (!pictures.length) throw new Error("no registered picture shows it");
-    inPictures?.hide();
+    hideWalls();
     wall = wall || new Wall();
     wall.show(counted(pictures.length, "picture that shows it best", "pictures that show it best"), pictures.map(({image, rings, sigma_px}) => ({
       name: image, rings, closed: isArea(one.shape), x: 0, y: 0, about: "outline known to " + number(sigma_px, "px", 2),
@@ -262,15 +326,15 @@ export function tab(studio) {
     const note = el("input", {type: "text", value: one.note, maxlength: 1000});
     note.addEventListener("change", () => put({...one, note: note.value}));
     const facts = [["Where", one.image || "on the mosaic"], ["Shape", one.shape.kind]];
-    if (mark && mark.area !== null) facts.push(["Area", withSigma(mark.area, mark.sigma, square)]);
+    if (mark && mark.area !== null) facts.push(["Area in plan", withSigma(mark.area, mark.sigma, square)], ...surfaceFacts(one));
     if (mark && mark.length !== null) facts.push(["Length", number(mark.length, unit, 4)]);
     if (one.author) facts.push(["By", one.author]);
     if (one.time_utc) facts.push(["Made", one.time_utc]);
     Object.entries(one.attributes).forEach(([key, value]) => facts.push([key, String(value)]));
     return [
       el("h2", {}, "Chosen"), field("Label", choice), field("Note", note), table("What is known of it", [], facts),
-      mark && mark.area !== null && studio.state.has.dem ? roughnessOf(one) : "",
       el("p", {class: "buttons"},
+        one.image === null ? "" : button("Edit in its picture", () => editInPicture(one), {disabled: !studio.mayWrite()}),
         button("Show in pictures", () => attempt(() => showPictures(one)), {disabled: !studio.state.has.dem}),
         button("Go there", () => go(one)),
         button("Delete", () => remove(one.id)),
@@ -278,13 +342,12 @@ export function tab(studio) {
     ];
   }
 
-  /* Found while the card is there already. */
-  function roughnessOf(one) {
-    const line = el("p", {class: "note"}, "Measuring the surface …");
-    get("/api/annotations/" + one.id + "/surface").then(({figures}) => {
-      line.textContent = figures.map((part) => part.title + " " + withSigma(part.value, part.sigma, part.unit)).join("; ");
-    }, (fault) => { line.textContent = fault.message; });
-    return line;
+  function surfaceFacts(one) {
+    if (!studio.state.has.dem) return [];
+    const row = surfaces.get(one.id);
+    if (!row && !surfaceRows) return [["Area of the surface", "is being measured …"]];
+    const [size, rugosity] = surfaceCells(row, square);
+    return size ? [["Area of the surface", size], ["Rugosity", rugosity]] : [["Area of the surface", "unknown"]];
   }
 
   const shapeOf = (one) => (one.image === null ? one.shape : marks.get(one.id)?.shape || null);
@@ -305,6 +368,7 @@ export function tab(studio) {
   words.addEventListener("input", () => rows.replaceChildren(...rowsOf()));
   const rows = el("div", {});
   const cover = el("div", {});
+  const progress = el("p", {class: "note", role: "status"});
   const quadrat = el("input", {type: "number", min: "0", step: "any"});
   quadrat.addEventListener("change", () => inTurn(measure));
 
@@ -317,34 +381,14 @@ export function tab(studio) {
   function rowsOf() {
     const found = wanted();
     const of = new Map(now().labels.map((one) => [one.id, one]));
-    const shown = found.slice(0, MOST_ROWS);
-    if (!shown.length) return [el("p", {class: "note"}, now().annotations.size ? "None of these." : "Nothing is annotated yet.")];
-    const lines = shown.map((one) => {
-      const mark = marks.get(one.id);
-      const size = mark && mark.area !== null ? withSigma(mark.area, mark.sigma)
-        : mark && mark.length !== null ? number(mark.length, unit, 4) : "";
-      const name = button(of.get(one.label).code + " " + one.label.split(" > ").pop(), () => { choose(one.id); go(one); }, {
+    if (!found.length) return [el("p", {class: "note"}, now().annotations.size ? "None of these." : "Nothing is annotated yet.")];
+    return annotationTable(found, {
+      unit, rows: surfaceRows?.filter((row) => found.some(({id}) => id === row.id)),
+      mark: (one) => marks.get(one.id), surface: (one) => surfaces.get(one.id),
+      name: (one) => button(of.get(one.label).code + " " + one.label.split(" > ").pop(), () => { choose(one.id); go(one); }, {
         "aria-pressed": String(one.id === chosen), title: one.label,
-      });
-      return [name, one.image === null ? one.shape.kind : one.shape.kind + ", picture", size];
+      }),
     });
-    const more = found.length > shown.length ? el("p", {class: "note"}, "The first " + MOST_ROWS + " of " + found.length + ".") : null;
-    return [table(counted(found.length, "annotation"), ["Label", "Shape", "Area, " + square], lines), more].filter(Boolean);
-  }
-
-  function coverTable(found) {
-    const side = found.rows[0]?.side;
-    const lines = found.rows.map((row) => [
-      ...(side ? [row.quadrat] : []), row.label, String(row.count), withSigma(row.area, row.sigma),
-      withSigma(100 * row.cover, 100 * row.cover_sigma, "%"),
-    ]);
-    const save = () => {
-      const keys = Object.keys(found.rows[0]);
-      download("cover.csv", csv(keys, found.rows.map((row) => keys.map((key) => row[key]))), "text/csv");
-    };
-    return el("div", {}, el("div", {style: {overflowX: "auto"}, tabindex: "0", role: "region", "aria-label": "What labels cover"},
-      table("Of " + number(found.known, square) + " known ground", [...(side ? ["Quadrat"] : []), "Label", "Count", "Area, " + square, "Cover"], lines)),
-    el("p", {class: "buttons"}, button("Export CSV", save)));
   }
 
   /* ---- Files ---- */
@@ -373,7 +417,7 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Draw in pictures"), field("Shape", kindInPictures), el("p", {class: "buttons"}, toPictures)),
     el("details", {}, el("summary", {}, "Your name"), field("Goes with what you draw", author)),
     card,
-    el("h2", {}, "Annotations"), field("Filter", words, "Labels, notes, names, pictures"), rows,
+    el("h2", {}, "Annotations"), field("Filter", words, "Labels, notes, names, pictures"), progress, rows,
     el("h2", {}, "Cover"), field("Quadrats of side, " + unit, quadrat, "Empty: the whole mosaic"), cover,
     el("details", {}, el("summary", {}, "Files of other tools"), field("Tool", format), field("File", file), el("p", {class: "buttons"}, bring),
       el("h3", {}, "Export for"), save));
@@ -394,6 +438,12 @@ export function tab(studio) {
     handles.show(entered && one && one.image === null && !tool && studio.mayWrite() ? targetOf(one) : null);
   }
 
+  function renderCard() {
+    const focused = card.contains(document.activeElement) ? document.activeElement.textContent : null;
+    card.replaceChildren(...cardOf());
+    if (focused) [...card.querySelectorAll("button")].find((one) => one.textContent === focused)?.focus({preventScroll: true});
+  }
+
   function render() {
     const {labels, annotations} = now();
     if (!labels.some((one) => one.id === label)) label = labels[0]?.id || "";
@@ -401,7 +451,7 @@ export function tab(studio) {
     const focused = document.activeElement?.value;
     labelList.replaceChildren(...labelRows());
     if (!labels.length) labelList.append(el("p", {class: "note"}, "No labels yet: add one, or import a species list."));
-    card.replaceChildren(...cardOf());
+    renderCard();
     rows.replaceChildren(...rowsOf());
     format.replaceChildren(...formats.map((one) => el("option", {value: one.name}, one.title)));
     save.replaceChildren(...[...formats, {name: "geojson", title: "GeoJSON"}].map((one) => button(one.title, () => attempt(() => saveFile("/api/annotations/export/" + one.name, "annotations")), {"data-export": one.name, disabled: !annotations.size})));
@@ -410,6 +460,7 @@ export function tab(studio) {
     [...tools, toPictures, bring, ...addLabel.querySelectorAll("button")].forEach((one) => { one.disabled = !writes; });
     if (focused) labelList.querySelector(`input[type=radio][value="${CSS.escape(focused)}"]`)?.focus();
     redraw();
+    editing?.refresh();
   }
 
   return {
@@ -425,8 +476,7 @@ export function tab(studio) {
       entered = false;
       drawn.show(false);
       handles.show(null);
-      wall?.hide();
-      inPictures?.hide();
+      hideWalls();
     },
     keys: {
       "Ctrl+z": () => step(undo, "Undone"), "Ctrl+y": () => step(redo, "Done again"), "Ctrl+Z": () => step(redo, "Done again"),

@@ -21,13 +21,14 @@ function cross(kind) {
 class PictureView {
   /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the `rings` that are
      seen in it. `changed(view)` is called where a person picks, if one may, `used(view)` where one takes
-     or drops a pick that stays. */
-  constructor(seen, {changed, used, chosen}) {
+     or drops a pick that stays, and `opened(view)` once the picture is there. */
+  constructor(seen, {changed, used, chosen, opened}) {
     this.name = seen.name;
     this.seen = seen;
     this.pick = null;
     this.use = true;
     this.onPick = changed;
+    this.onOpen = opened;
     this.box = el("div", {
       class: "picture-view", tabindex: "0", role: "application",
       "aria-label": "Picture " + seen.name + (changed ? ": click to pick; arrow keys move the pick by a pixel, with Shift by a tenth; Enter picks the middle; + and - zoom" : ": arrow keys move it, + and - zoom"),
@@ -72,16 +73,19 @@ class PictureView {
     });
     this.draw();
     this.box.dataset.ready = "";
+    this.onOpen?.(this);
   }
 
   /* Rings of pixels from the outer corner of the first, of which those that are not known are null. */
-  outline({rings, closed}) {
+  outline({rings, closed, colour = WHITE, closest = CLOSE}, framed = true) {
     const places = rings.map((ring) => ring.filter(([x]) => x !== null).map(([x, y]) => [-y, x]));
     const many = closed ? leaflet.polygon : leaflet.polyline;
-    [[INK, 6], [WHITE, 2.5]].forEach(([color, weight]) => (places[0].length > 1
+    this.shape = (this.shape || leaflet.featureGroup().addTo(this.map)).clearLayers();
+    this.colour = this.colour || colour;
+    [[INK, 6], [this.colour, 2.5]].forEach(([color, weight]) => this.shape.addLayer(places[0].length > 1
       ? many(places, {color, weight, fill: false, interactive: false})
-      : leaflet.circleMarker(places[0][0], {radius: 7, color, weight, fill: false, interactive: false})).addTo(this.map));
-    this.map.fitBounds(leaflet.latLngBounds(places.flat()).pad(0.3), {maxZoom: CLOSE, animate: false});
+      : leaflet.circleMarker(places[0][0], {radius: 7, color, weight, fill: false, interactive: false})));
+    if (framed) this.map.fitBounds(leaflet.latLngBounds(places.flat()).pad(0.3), {maxZoom: closest, animate: false});
   }
 
   byHand(x, y) {
@@ -152,10 +156,10 @@ class PictureView {
 
 /* The wall of views over the map. */
 export class Wall {
-  constructor({changed, used, refine} = {}) {
+  constructor({changed, used, opened, refine} = {}) {
     this.views = [];
     this.active = null;
-    this.acts = {changed, used, chosen: (view) => this.choose(view)};
+    this.acts = {changed, used, opened, chosen: (view) => this.choose(view)};
     this.title = el("strong", {}, "");
     this.refineButton = el("button", {type: "button", disabled: true, hidden: !refine, onclick: () => refine(this.active)}, "Find it in all others");
     this.more = el("button", {type: "button", hidden: true, onclick: () => this.showMore()}, "More pictures");
@@ -213,7 +217,11 @@ export class Wall {
     });
   }
 
-  hide() { this.root.hidden = true; }
+  hide() {
+    const held = this.root.contains(document.activeElement);
+    this.root.hidden = true;
+    if (held) document.getElementById("map-canvas").focus({preventScroll: true});
+  }
   clear() {
     this.views.forEach((view) => view.close());
     this.views = [];

@@ -85,7 +85,7 @@ if (state.background && state.datum) {
   const input = el("input", {type: "checkbox", value: "background", checked: true});
   input.addEventListener("change", () => (input.checked ? tiles.addTo(core.leaflet) : tiles.remove()));
   const host = new URL(state.background).host;
-  groupOf("Under it").append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
+  groupOf("Background").append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
     el("small", {}, "From the network, as --background says; its terms are those of " + host + ".")));
 }
 

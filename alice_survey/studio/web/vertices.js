@@ -15,12 +15,14 @@ function roundStep(length) {
   return [5, 2, 1].find((step) => step * power <= length * (1 + 1e-9)) * power;
 }
 
+const northEastIn = (unit) => ([n, e]) => fixed(n, 2, unit) + " north, " + fixed(e, 2, unit) + " east";
+
 /* What is edited is shown as a target: `name`, `word` of a vertex, and rings [{points, closed}] of points
    [north, east]; `value` is what is edited and `move(ring, i, place)` returns a new one; so do, where it can be done,
    `insert(ring, after, place or null)`, `remove(ring, i)`, `shift(north, east)` and `drop()` of all of it.
-   `changed(value, tag)` takes an edit, `moving(value)` one that goes on, and `left()` is called when
+   `text(point)` says where a vertex is; `changed(value, tag)` takes an edit, `moving(value)` one that goes on, and `left()` is called when
    Escape gives the focus back. */
-export function vertexHandles(map, name, {unit = "m", changed, moving, left}) {
+export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), changed, moving, left}) {
   const pane = map.createPane(name + "-vertices");
   pane.classList.add("vertices", "leaflet-zoom-hide");
   /* Where a handle was replaced meanwhile, the click is the pane's. */
@@ -29,7 +31,6 @@ export function vertexHandles(map, name, {unit = "m", changed, moving, left}) {
 
   const place = ([n, e]) => map.latLngToLayerPoint([n, e]);
   const step = (fine) => Math.max(0.001, roundStep((fine ? 1 : 8) / 2 ** map.getZoom()));
-  const text = ([n, e]) => fixed(n, 2, unit) + " north, " + fixed(e, 2, unit) + " east";
 
   const at = (name) => pane.querySelector(`[data-at="${name}"]`);
   const focus = (made) => made?.focus({preventScroll: true});

@@ -8,6 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
+import rasterio
 from axe_playwright_python.sync_playwright import Axe
 
 from tests.alice_survey.kit.browser import Heard, chromium
@@ -150,6 +151,8 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
     with serving(folder) as server, chromium() as browser:
         page, heard = opened(browser, server, "Annotate", width)
         add_label(page, "Porites")
+        page.wait_for_timeout(500)
+        before = (folder / "annotations.json").read_bytes()
         page.get_by_text("Draw in pictures", exact=True).click()
         with page.expect_request("**/api/pictures/seeing?*") as asking:
             page.get_by_role("button", name="Show the pictures of the map's middle").click()
@@ -170,7 +173,7 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         page.keyboard.press("f")
         page.locator("#status", has_text="Polygon drawn in").wait_for()
         page.get_by_role("button", name="Back to the map").first.click()
-        page.get_by_text("Area of the surface").wait_for(timeout=60_000)
+        page.get_by_role("row", name="Rugosity").first.wait_for(timeout=60_000)
         (one,) = stored(folder)
         seen = ask(server, f"/api/pictures/seeing?n={north}&e={east}&count=1").json["pictures"][0]
         assert one["image"] == seen["name"]
@@ -184,10 +187,59 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         area = 0.5 * 20 * 15 / seen["resolution"] ** 2
         assert mark["area"] == pytest.approx(area, rel=0.15)
         assert 0 < mark["sigma"] < 0.2 * area
+        (figures,) = ask(server, "/api/annotations/surfaces").json["each"]
+        # of a floor that is nearly level here: 1, less or more by noise
+        assert 1.0 - 4 * figures["rugosity_sigma"] < figures["rugosity"] < 1.2
+        assert 0 < figures["rugosity_sigma"] < 0.02 and figures["image"] == one["image"]
+        assert figures["surface"] == pytest.approx(figures["rugosity"] * mark["area"], rel=0.02)
+        assert 0 < figures["surface_sigma"] < 0.2 * area
         page.screenshot(path=str(tmp_path / f"kept-{width}.png"))
+        drawn = (folder / "annotations.json").read_bytes()
+
+        page.get_by_role("button", name="Edit in its picture").click()
+        corner = page.get_by_role("button", name="Corner 2 of 3")
+        corner.wait_for(timeout=60_000)
+        corner.focus()
+        page.keyboard.press("ArrowRight")
+        page.wait_for_timeout(700)
+        (moved,) = stored(folder)
+        shift = np.array(moved["shape"]["points"]) - points
+        assert 0.1 < shift[1, 0] <= 8.0 and np.abs(shift).sum() == pytest.approx(shift[1, 0])
+        spot = corner.bounding_box()
+        page.mouse.move(spot["x"] + 13, spot["y"] + 13)
+        page.mouse.down()
+        page.mouse.move(spot["x"] + 33, spot["y"] + 33, steps=4)
+        page.mouse.up()
+        page.wait_for_timeout(700)
+        (dragged,) = stored(folder)
+        shift = np.array(dragged["shape"]["points"]) - np.array(moved["shape"]["points"])
+        np.testing.assert_allclose(shift[[0, 2]], 0.0)
+        assert shift[1, 0] == pytest.approx(shift[1, 1], abs=0.1) and 1.0 < shift[1, 0] < 10.0
+        accessible(page)
+        page.screenshot(path=str(tmp_path / f"edited-{width}.png"))
+        for _ in range(2):
+            page.keyboard.press("Control+z")
+            page.wait_for_timeout(700)
+        assert (folder / "annotations.json").read_bytes() == drawn
+        corner.focus()
+        page.keyboard.press("Escape")  # to the picture
+        page.keyboard.press("Escape")  # to the map
+        assert page.evaluate("document.activeElement.id") == "map-canvas"
         page.get_by_role("button", name="Undo", exact=True).click()
         page.get_by_text("Nothing is annotated yet.").wait_for()
-        assert stored(folder) == []
+        page.wait_for_timeout(500)
+        assert (folder / "annotations.json").read_bytes() == before
+
+        page.locator("#panel-annotate").get_by_label("Shape", exact=True).select_option("point")
+        page.get_by_role("button", name="Show the pictures of the map's middle").click()
+        view.wait_for(timeout=60_000)
+        page.wait_for_timeout(500)
+        with rasterio.open(folder / "dense" / "dem.tif", "r+") as raster:
+            raster.write(np.full(raster.shape, np.nan, np.float32), 1)
+        view.focus()
+        page.keyboard.press("Enter")  # a point in a picture that meets no surface any more
+        page.locator("#status", has_text="no known surface").wait_for()
+        assert stored(folder)[0]["shape"]["kind"] == "point"
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         accessible(page)
         assert heard.complaints == []
