@@ -77,6 +77,10 @@ def at(page: Any, east: float, north: float) -> dict[str, float]:
     }
 
 
+def middle(page: Any) -> list[str]:
+    return [page.locator(MAP).get_attribute(f"data-{name}") for name in ("east", "north")]
+
+
 def click(page: Any, *places: tuple[float, float]) -> None:
     for place in places:
         page.locator(MAP).click(position=at(page, *place))
@@ -161,8 +165,13 @@ def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
         page.keyboard.press("p")
         for key in ("ArrowRight", "ArrowUp", "ArrowLeft"):
             page.keyboard.press("Enter")
+            before = middle(page)
             page.keyboard.press(key)
-            page.wait_for_timeout(400)
+            for _ in range(100):
+                page.wait_for_timeout(50)
+                if middle(page) != before:
+                    break
+            page.wait_for_timeout(300)
         page.keyboard.press("Enter")
         page.keyboard.press("Backspace")
         page.keyboard.press("f")
