@@ -47,6 +47,7 @@ export function meshPart(studio, {colour, measured}) {
   const about = el("p", {class: "note"});
   const kinds = el("select");
   const choice = field("Drawn as", kinds);
+  choice.hidden = true;
   const streamed = el("p", {class: "note"});
   const body = el("div", {}, choice, el("div", {class: "buttons"}, large), home, streamed, picked, about);
   home.append(root);
