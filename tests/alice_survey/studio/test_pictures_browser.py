@@ -72,7 +72,9 @@ def test_points_are_picked_measured_and_made_control(small_survey: Path, tmp_pat
         page.wait_for_selector("body[data-ready]", timeout=WAIT_MS)
         marked = []
         for number, place in enumerate(places):
-            image, pixel = truth.nearest(place)
+            found = truth.nearest(place)
+            assert found is not None
+            image, pixel = found
             view = opened(page, server, image, *(pixel - 0.5))
             marked.append((image, *moved_to(page, view, *(pixel - 0.5))))
             np.testing.assert_allclose(marked[-1][1:], pixel - 0.5, atol=0.06)
