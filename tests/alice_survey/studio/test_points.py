@@ -109,7 +109,7 @@ def test_a_cloud_replaced_while_it_is_read_is_a_conflict(
 
     replaced = threading.Event()
 
-    def slow(nodes, number):  # type: ignore[no-untyped-def]
+    def slow(nodes, number):
         found = read_node(nodes, number)
         deep_cloud(workspace / CLOUD, rippled(2.0, 1.0))
         replaced.set()
