@@ -108,24 +108,10 @@ def test_every_stage_is_reported(undisturbed: Path) -> None:
         assert event.get("done", 0) <= event.get("total", event.get("done", 0))
 
 
-def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> None:
-    """Without the truth next to the pictures the reconstruction is the same, to the byte."""
-    workspace = tmp_path / "blind"
-    shutil.copytree(undisturbed, workspace)
-    for stage in ("mapping", "sparse", "dense", "mosaic", "mesh", "evaluation", "calibration"):
-        shutil.rmtree(workspace / stage)
-    shutil.rmtree(workspace / "images" / "truth")
-    shutil.rmtree(workspace / "flight" / "truth")
-    shutil.rmtree(workspace / "pool" / "truth", ignore_errors=True)
-    command = [sys.executable, "-m", "alice_survey", "reconstruct", "-w", str(workspace)]
-    subprocess.run([*command, "--threads", "1"], check=True, capture_output=True)
-    seen, whole = results(workspace), results(undisturbed)
-    for name in seen:
-        if name.split("/")[0] in {"calibration", "mapping", "sparse", "dense", "mosaic", "mesh"}:
-            assert seen[name] == whole[name], name
-
-
-KILLS = 24
+KILLED = tuple(
+    stage for stage in FOLDERS for _ in range(2 if stage in {"mapping", "dense", "mesh"} else 1)
+)
+"""Stages to be killed in, in order; twice where they work longest."""
 
 
 def wait_for(
@@ -146,7 +132,7 @@ def wait_for(
 
 
 def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
-    """At random times in every stage, two or three times in each."""
+    """At random times in every stage, once in most."""
     workspace = settings_in(tmp_path / "killed")
     events = workspace.with_suffix(".jsonl")
     took_s = {
@@ -156,8 +142,8 @@ def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Pa
     rng = np.random.default_rng(5)
     killed = dict.fromkeys(FOLDERS, 0)
     whole_before_kill = 0
-    while sum(killed.values()) < KILLS:
-        stage = FOLDERS[sum(killed.values()) * len(FOLDERS) // KILLS]
+    while sum(killed.values()) < len(KILLED):
+        stage = KILLED[sum(killed.values())]
         shutil.rmtree(workspace / stage, ignore_errors=True)  # it had ended before the last kill
         seen = events.stat().st_size if events.exists() else 0
         run = start(workspace, threads=1)
@@ -171,8 +157,7 @@ def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Pa
         run.wait()
         if ended and not ended.get("resumed"):  # where kernels had to be compiled it took longer
             took_s[stage] = min(took_s[stage], ended["took_s"])
-    assert min(killed.values()) >= 2
-    assert whole_before_kill < KILLS / 2  # most fell into the work of their stage
+    assert whole_before_kill < len(KILLED) / 2  # most fell into the work of their stage
     assert start(workspace, threads=1).wait() == 0
     assert not list(workspace.glob("*.partial"))
     again, whole = results(workspace), results(undisturbed)
@@ -203,12 +188,19 @@ def reconstruct(
 def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
     undisturbed: Path, tmp_path: Path
 ) -> None:
-    """A picture that goes, one that changes, and memory that runs out."""
+    """A picture that goes, one that changes, and memory that runs out.
+
+    The truth is not next to the pictures: in the end the reconstruction is the same without it.
+    """
     workspace, events = tmp_path / "half", tmp_path / "half.jsonl"
     shutil.copytree(undisturbed, workspace)
     made = ("mapping", "sparse", "dense", "mosaic", "mesh")
-    for stage in (*made, "evaluation", "report"):
+    for stage in (*made, "evaluation", "report", "calibration"):
         shutil.rmtree(workspace / stage)
+    for stage in ("images", "flight", "pool"):
+        shutil.rmtree(workspace / stage / "truth", ignore_errors=True)
+    calibrate = [sys.executable, "-m", "alice_survey", "calibrate", "-w", str(workspace)]
+    subprocess.run(calibrate, check=True, capture_output=True)  # it warns, in lines of its own
     first, *_, last = sorted((workspace / "images" / "right").glob("*.png"))
     kept = tmp_path / last.name
     shutil.copy2(last, kept)
@@ -233,7 +225,7 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
     assert (run.communicate()[1].strip(), run.returncode) == ("", 0)
     again, whole = results(workspace), results(undisturbed)
     different = [name for name in again if again[name] != whole[name]]
-    assert {name.split("/")[0] for name in again} >= set(made)
+    assert {name.split("/")[0] for name in again} >= {*made, "calibration"}
     assert not different
 
 

@@ -91,6 +91,12 @@ class Made:
         write_rig(path, files.smaller_rig(read_rig(self.reef / "calibration/rig.json"), SMALL_PX))
         return path
 
+    @cached_property
+    def pool(self) -> Path:
+        """Pictures of a board in a pool."""
+        files.boards(self._folder, air=False)
+        return self._folder / "pool"
+
     @property
     def dive(self) -> Path:
         """A workspace of a few small pictures with rig and navigation, reconstructed."""
@@ -121,7 +127,7 @@ def _planned(folder: Path, made: Made) -> None:
 
 def _cameras(folder: Path, made: Made) -> None:
     files.boards(folder, air=True)
-    files.boards(folder, air=False)
+    shutil.copytree(made.pool, folder / "pool")
 
 
 def _certificate(folder: Path, made: Made) -> None:
@@ -146,7 +152,7 @@ def _stereo(folder: Path, made: Made) -> None:
 
 
 def _own_camera(folder: Path, made: Made) -> None:
-    files.boards(folder, air=False)
+    shutil.copytree(made.pool, folder / "pool")
     for name, kind in (("camchain.yaml", "kalibr"), ("stereo.yml", "opencv")):
         files.calibrated_in_air(folder / name, kind)
 

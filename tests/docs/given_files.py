@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
@@ -44,6 +43,8 @@ BOARD = "charuco 12x9 40mm 30mm"
 VIEWS = 8
 SHEET_PX_M = 4000
 """How finely the board is painted."""
+FINE = 2
+"""Samples along a side of a pixel."""
 FAST_S = 1.5
 """By which the clocks of cameras are ahead."""
 
@@ -67,39 +68,25 @@ def boards(folder: Path, *, air: bool) -> None:
         far_m=far_m,
         points=target.points,
     )
-    for name in looking.cameras:
+    sheet, corner_m = _sheet(target)
+    for name, camera in looking.cameras.items():
         place = folder / ("air" if air else "pool") / name
         place.mkdir(parents=True)
+        y, x = np.mgrid[: camera.height_px * FINE, : camera.width_px * FINE]
+        origins, rays = camera.unproject((np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / FINE)
         for view in range(VIEWS):
-            picture = board_picture(looking, name, poses[view], target)
-            cv2.imwrite(str(place / f"{view:02d}.png"), picture)
-
-
-def board_picture(
-    rig: Rig, name: str, rig_from_target: RigidTransform, target: Target, fine: int = 2
-) -> NDArray[np.uint8]:
-    """(H, W) grey values of a target that a camera sees through its port.
-
-    Args:
-        rig: cameras.
-        name: of the one that looks.
-        rig_from_target: where the target is.
-        target: what is seen.
-        fine: samples along a side of a pixel.
-    """
-    camera = rig.cameras[name]
-    target_from_cam = (rig.cam_from_rig[name] * rig_from_target).inv()
-    y, x = np.mgrid[: camera.height_px * fine, : camera.width_px * fine]
-    pixels = (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / fine
-    origins, rays = camera.unproject(pixels)
-    origins, rays = target_from_cam.apply(origins), target_from_cam.rotation.apply(rays)
-    places_m = (origins - rays * (origins[:, 2:] / rays[:, 2:]))[:, :2]
-    sheet, corner_m = _sheet(target)
-    places = ((places_m - corner_m) * SHEET_PX_M - 0.5).astype(np.float32).reshape(*x.shape, 2)
-    light = cv2.remap(
-        sheet, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=WALL
-    )
-    return to_srgb(cv2.resize(light, None, fx=1 / fine, fy=1 / fine, interpolation=cv2.INTER_AREA))
+            target_from_cam = (looking.cam_from_rig[name] * poses[view]).inv()
+            start, ways = target_from_cam.apply(origins), target_from_cam.rotation.apply(rays)
+            places_m = (start - ways * (start[:, 2:] / ways[:, 2:]))[:, :2]
+            places = ((places_m - corner_m) * SHEET_PX_M - 0.5).astype(np.float32)
+            light = cv2.remap(
+                sheet, places.reshape(*x.shape, 2), None, cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT, borderValue=WALL,
+            )  # fmt: skip
+            shrunken = cv2.resize(
+                light, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA
+            )
+            cv2.imwrite(str(place / f"{view:02d}.png"), to_srgb(shrunken))
 
 
 def _sheet(target: Target) -> tuple[NDArray[np.float32], Array]:

@@ -148,15 +148,19 @@ def _take(task: tuple[Path, str, int]) -> None:
 
 
 def render_survey(
-    folder: Path, executor: Executor, lines: int = LINES, moments: Sequence[int] | None = None
+    folder: Path,
+    executor: Executor,
+    lines: int = LINES,
+    moments: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
 ) -> None:
     """Write `NAME/0000.png` and so on, `navigation.csv` and `rig.json` of the truth.
 
-    Only those `moments` are taken; all if left out.
+    Only those `moments` are taken, by the cameras of those `names`; all if left out.
     """
     poses = bodies(lines)
     taken = range(len(poses)) if moments is None else moments
-    tasks = [(folder, name, moment) for name in four_cameras().cameras for moment in taken]
+    tasks = [(folder, name, moment) for name in names or four_cameras().cameras for moment in taken]
     list(executor.map(_take, tasks, label="pictures"))
     write_rig(folder / "rig.json", four_cameras())
     rng = np.random.default_rng(_SEED + 1)

@@ -62,27 +62,28 @@ def check_calibration(folder: Path, rig: Rig) -> None:
 
 
 @pytest.mark.slow
-def test_four_cameras_are_calibrated_and_map_as_with_the_true_rig(tmp_path: Path) -> None:
-    """Flat ports, domes, a fisheye, two look obliquely; then without the first, the reference."""
+def test_four_cameras_are_calibrated_and_map_as_well_as_with_the_true_rig(tmp_path: Path) -> None:
+    """Flat ports, domes, a fisheye, two look obliquely; then without the first, the reference.
+
+    The true rig keeps the bounds of `check` and is not run: what was found must keep them too.
+    """
     pictures = tmp_path / "pictures"
     render_survey(pictures, local_executor(), LINES)
     found = calibrated_rig(tmp_path, local_executor())
     check_calibration(tmp_path, read_rig(found))
-    runs = (pictures / "rig.json", NAMES), (found, NAMES), (found, NAMES[1:])
-    for rig, names in runs:
-        workspace = tmp_path / f"{len(names)}_{rig.parent.name}"
-        said = import_survey(pictures, rig, workspace, names)
+    for names in (NAMES, NAMES[1:]):
+        workspace = tmp_path / f"of_{len(names)}"
+        said = import_survey(pictures, found, workspace, names)
         assert f" of {', '.join(names[:-1])} and {names[-1]}" in said
         (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
         run(["mapping", "placing", "dense", "mosaic"], workspace, None)
         check(score(workspace, LINES), LINES * MOMENTS * len(names), 0.1)
-        if rig == found:
-            port = PortRecord.read(workspace / "sparse" / "port.json")
-            moves = np.subtract(port.after, port.before) / port.prior_sigmas
-            assert 0.1 < np.sqrt(np.mean(moves**2)) < 1.2
-            assert np.abs(moves).max() < 3.5
-    workspace = tmp_path / "4_pictures"
+        port = PortRecord.read(workspace / "sparse" / "port.json")
+        moves = np.subtract(port.after, port.before) / port.prior_sigmas
+        assert 0.1 < np.sqrt(np.mean(moves**2)) < 1.2
+        assert np.abs(moves).max() < 3.5
+    workspace = tmp_path / "of_4"
     command("report", "-w", workspace)
     report = (workspace / "report" / "report.html").read_text()
-    assert "as imported with the pictures" in report
+    assert "Rig refined by the survey" in report
     assert all(word in report for word in (*NAMES, "fisheye", "dome of 80 mm radius"))

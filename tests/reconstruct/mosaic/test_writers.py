@@ -60,7 +60,7 @@ def written(folder: Path, side_px: int) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    "side_px", [8 * TILE_PX, pytest.param(63 * TILE_PX, marks=pytest.mark.slow)]
+    "side_px", [8 * TILE_PX, pytest.param(33 * TILE_PX, marks=pytest.mark.slow)]
 )
 def test_a_strip_across_a_large_box_takes_little(side_px: int, tmp_path: Path):
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

@@ -271,9 +271,9 @@ def test_a_linked_survey_has_one_group(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_rendered_lines_with_a_gap_between_them(tmp_path: Path) -> None:
     """The first and the last of four lines, by the commands: no picture of one shows the other."""
-    pictures, workspace = tmp_path / "pictures", tmp_path / "two"
-    render_survey(pictures, local_executor(), moments=(*range(4), *range(12, 16)))
-    import_survey(pictures, pictures / "rig.json", workspace, ("wide", "tele"))
+    pictures, workspace, names = tmp_path / "pictures", tmp_path / "two", ("wide", "tele")
+    render_survey(pictures, local_executor(), moments=(*range(4), *range(12, 16)), names=names)
+    import_survey(pictures, pictures / "rig.json", workspace, names)
     (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
     run(["mapping", "placing"], workspace, None)
     found = RegistrationRecord.read(workspace / "sparse" / "registration.json")
