@@ -172,7 +172,8 @@ def _start(
         camera = sighting.camera
         points, directions = camera.unproject(sighting.pixels)
         back_m = camera.n_water * (
-            camera.port.port_distance_m + camera.port.glass_thickness_m / camera.port.n_glass
+            camera.parameter("port_distance_m")
+            + camera.parameter("glass_thickness_m") / camera.parameter("n_glass")
         )
         focal_px = camera.n_water * math.sqrt(camera.fx_px * camera.fy_px)
         centres.append(points - back_m * directions)

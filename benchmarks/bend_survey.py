@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 from scipy.stats.qmc import Halton
@@ -332,7 +333,7 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
     rng = np.random.default_rng([seed, _NOISE])
     tree, far_m = cKDTree(points), _FAR * track.config.plan.altitude_m
     where: list[RigidTransform] = []
-    seen: list[tuple[Array, Array]] = []
+    seen: list[tuple[NDArray[np.int64], Array]] = []
     depths = []
     for body in bodies:
         for name, camera in true.cameras.items():

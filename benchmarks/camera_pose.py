@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.figures import Figure, Goal
 from tests.cameras import flat_port_camera
@@ -117,7 +117,9 @@ class Level:
         return [figure.miss() for figure in self.figures() if figure.met is False]
 
 
-def simulated(rng: np.random.Generator, noise_px: float) -> tuple[Sighting, RigidTransform, Array]:
+def simulated(
+    rng: np.random.Generator, noise_px: float
+) -> tuple[Sighting, RigidTransform, NDArray[np.bool_]]:
     """One trial's sighting, its true pose (`cam_from_world`) and which rows are right."""
     normal = rng.uniform([-0.2, -0.2, 0.8], [0.2, 0.2, 1.2])
     x, y, z = (normal / np.linalg.norm(normal)).tolist()

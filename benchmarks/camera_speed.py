@@ -96,7 +96,7 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
     rng = np.random.default_rng(1)
     pixels = rng.uniform([0, 0], [camera.width_px, camera.height_px], (points_count, 2))
     points = camera.at_depth(pixels, rng.uniform(0.6, 10.0, points_count))
-    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    matrix = _matrix(camera)
     distortion = np.array([camera.parameter(name) for name in ("k1", "k2", "p1", "p2", "k3")])
     zero = np.zeros(3)
     colmap = pycolmap.Camera(
@@ -130,7 +130,7 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
         "COLMAP's img_from_cam": (colmap.img_from_cam, points),
         "COLMAP's cam_from_img": (colmap.cam_from_img, pixels),
     }
-    one = {name: partial(*work) for name, work in works.items()}
+    one = {name: partial(work, rows) for name, (work, rows) in works.items()}
     two = {f"{name}, two cores": _shared(*work) for name, work in works.items()}
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -175,10 +175,10 @@ def against_aquacal(camera: Camera, points: Array, runs: int, python: Path) -> R
         np.savez(
             case,
             points=some,
-            matrix=[[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
+            matrix=_matrix(camera),
             distortion=[camera.parameter(name) for name in ("k1", "k2", "p1", "p2", "k3")],
             size=[camera.width_px, camera.height_px],
-            port_distance_m=camera.port.port_distance_m,
+            port_distance_m=camera.parameter("port_distance_m"),
             n_water=camera.n_water,
         )
         with _peer(python, case) as (name, run):
@@ -238,6 +238,10 @@ def race(works: Mapping[str, Callable[[], object]], runs: int) -> dict[str, floa
             if run:
                 best[name] = min(best[name], seconds)
     return best
+
+
+def _matrix(camera: Camera) -> Array:
+    return np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
 
 
 def _timed(work: Callable[[], object]) -> float:

@@ -66,11 +66,14 @@ def workers_of(work: Path, count: int) -> Iterator[Path]:
     file.unlink(missing_ok=True)
     scheduler = ["scheduler", "--scheduler-file", str(file), "--port", "0", "--no-dashboard"]
     worker = ["worker", "--scheduler-file", str(file), "--nthreads", "1", "--nworkers", str(count)]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     dask = [sys.executable, "-m", "dask"]
     with contextlib.ExitStack() as stack:
         for part in (scheduler, worker):
-            process = subprocess.Popen([*dask, *part, "--host", "127.0.0.1"], **quiet)
+            process = subprocess.Popen(
+                [*dask, *part, "--host", "127.0.0.1"],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
             stack.callback(process.wait)
             stack.callback(process.terminate)
             while not file.exists():
@@ -89,7 +92,7 @@ def measured_s(work: Path, survey: Path, workers: int) -> float:
             "reconstruct", "-w", str(copy), "--quiet", "--cluster", str(file),
             "--events", str(events),
         )  # fmt: skip
-    return sum(read_json(copy / stage / "stage.json")["took_s"] for stage in _STAGES)
+    return float(sum(read_json(copy / stage / "stage.json")["took_s"] for stage in _STAGES))
 
 
 def task_cost_s(work: Path, tasks: int = 300) -> float:

@@ -23,6 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from alice_survey.base.artefacts import write_csv
@@ -84,7 +85,7 @@ def judge(mosaic: Path, survey: ColourSurvey, clip: Path) -> Difference:
     rows, columns = (n // CELL_PX * CELL_PX for n in picture.shape[1:])
     row, column = np.mgrid[:rows, :columns] + 0.5
     points, material = from_above(survey.scene.terrain, at.f + row * at.e, at.c + column * at.a)
-    texture = survey.scene.texture
+    texture = survey.texture
     flat = points.reshape(-1, 3)
     true = texture.albedo(flat, material.ravel(), np.full(len(flat), at.a, np.float32))
     beside = texture.on_card(flat).reshape(rows, columns) < 0
@@ -98,7 +99,7 @@ def judge(mosaic: Path, survey: ColourSurvey, clip: Path) -> Difference:
     return found
 
 
-def _cells(values: Array) -> Array:
+def _cells(values: NDArray[Any]) -> Array:
     """Means over cells."""
     rows, columns, channels = values.shape
     parts = values.reshape(rows // CELL_PX, CELL_PX, columns // CELL_PX, CELL_PX, channels)
@@ -153,15 +154,20 @@ def figures(where: str, found: Mapping[str, Difference], *, quick: bool) -> tupl
     ) else None  # fmt: skip
     made = []
     for method, one in found.items():
-        peer = {} if best is None or method in PEERS else {"peer": best[1], "peer_value": best[0]}
-        goal = _GOAL if peer and method in ("water", CARD) and not quick else None
+        rival = None if method in PEERS else best
+        goal = _GOAL if rival and method in ("water", CARD) and not quick else None
         for what, value in (
             ("90 % dE2000", one.percentile_90),
             ("median dE2000 at the true lightness", one.median_at_true_lightness),
         ):
             made.append(Figure(name=f"{where}, {method}: {what}", value=value, unit=""))
         name = f"{where}, {method}: median dE2000"
-        made.append(Figure(name=name, value=one.median, unit="", goal=goal, **peer))
+        peer_value, peer = rival or (None, None)
+        made.append(
+            Figure(
+                name=name, value=one.median, unit="", peer=peer, peer_value=peer_value, goal=goal
+            )
+        )
     return tuple(made)
 
 

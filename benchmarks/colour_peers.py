@@ -43,7 +43,8 @@ def sea_thru(pictures: Sequence[Array], ranges: Sequence[Array]) -> list[Array]:
     """
     light = np.concatenate([p[::_STEP, ::_STEP].reshape(-1, 3) for p in pictures])
     z = np.concatenate([r[::_STEP, ::_STEP].ravel() for r in ranges])
-    edges = np.linspace(*np.percentile(z, [0.5, 99.5]), _RANGES + 1)
+    nearest, farthest = np.percentile(z, [0.5, 99.5])
+    edges = np.linspace(nearest, farthest, _RANGES + 1)
     dark = []
     for near, far in pairwise(edges):
         inside = np.flatnonzero((z >= near) & (z < far))
@@ -85,8 +86,10 @@ def _fitted(
 ) -> Callable[[Array], Array]:  # fmt: skip
     """A law of range through values, by least squares with Huber's weights."""
     scale = max(float(np.median(np.abs(value - np.median(value)))), 1e-4)
-    best = least_squares(
-        lambda p: law(p, z) - value, start, bounds=([0.0] * len(most), most), loss="huber",
-        f_scale=scale,
-    )  # fmt: skip
+
+    def misses(p: Array) -> Array:
+        return law(p, z) - value
+
+    bounds = [0.0] * len(most), most
+    best = least_squares(misses, start, bounds=bounds, loss="huber", f_scale=scale)
     return lambda z: law(best.x, z)

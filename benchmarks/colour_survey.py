@@ -68,7 +68,7 @@ class Floor(Texture):
     def on_card(self, points_ned: Array) -> NDArray[np.intp]:
         """(N,) which patch of the card, -1 beside it."""
         local = np.abs(points_ned[:, None, :2] - card_centres(self.card_ne))
-        inside = (local <= CARD_M / 2).all(axis=2)
+        inside = np.all(local <= CARD_M / 2, axis=2)
         return np.where(inside.any(axis=1), inside.argmax(axis=1), -1)
 
     def albedo(self, points_ned: Array, material: Floats, footprint_m: Floats) -> Floats:
@@ -130,6 +130,11 @@ class ColourSurvey:
         """Middle of the card's first patch: about the middle of the survey."""
         return STEP_M * (self.stations - 1) / 2, LINE_M * (self.lines - 1) / 2 - CARD_M / 2
 
+    @property
+    def texture(self) -> Floor:
+        """Of the sea floor and of the card on it."""
+        return Floor(seed=survey_texture(SEED).seed, card_ne=self.card_ne)
+
     @cached_property
     def scene(self) -> Scene:
         """Sea floor with the card lying level on it."""
@@ -139,8 +144,8 @@ class ColourSurvey:
         )  # fmt: skip
         seafloor = SeafloorConfig(relief_m=self.relief_m, rocks_per_m2=1.0, largest_rock_m=0.6)
         terrain = build_terrain(seafloor, reach, DEPTH_M, np.random.default_rng([SEED, 2]))
-        texture = Floor(seed=survey_texture(SEED).seed, card_ne=self.card_ne)
-        return Scene(terrain=_with_card(terrain, card_centres(self.card_ne)), texture=texture)
+        terrain = _with_card(terrain, card_centres(self.card_ne))
+        return Scene(terrain=terrain, texture=self.texture)
 
     @cached_property
     def light(self) -> CameraLight:
@@ -276,7 +281,7 @@ def from_above(terrain: Terrain, north: Array, east: Array) -> tuple[Array, Floa
     return points, (corners * weights).sum(axis=-1).astype(np.float32)
 
 
-def card_rows(survey: ColourSurvey, most: int = 4) -> Sequence[tuple[str, float, ...]]:
+def card_rows(survey: ColourSurvey, most: int = 4) -> Sequence[tuple[str | float, ...]]:
     """Rows of `colour_reference.csv`: the card in the pictures that show it whole and nearest."""
     camera = survey.rig.cameras["left"]
     centres = card_centres(survey.card_ne)

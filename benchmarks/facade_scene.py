@@ -87,8 +87,8 @@ COLUMNS = [Column(x=x, y=-0.1, radius=0.28, low=0.0, high=4.5) for x in (-1.5, 1
 
 def distance(points: Array) -> Array:
     """(N,) of points (N, 3) from the surface, negative inside."""
-    solids = [*boxes(), *COLUMNS]
-    return np.min([solid.distance(points) for solid in solids], axis=0)
+    solids: list[Box | Column] = [*boxes(), *COLUMNS]
+    return np.asarray(np.min([solid.distance(points) for solid in solids], axis=0))
 
 
 def normals(points: Array) -> Array:
@@ -116,7 +116,9 @@ def reached(starts: Array, ends: Array) -> NDArray[np.bool_]:
 
 def mesh() -> tuple[Array, NDArray[np.int64], Array]:
     """Corners (V, 3), triangles (T, 3) and texture coordinates (V, 2), faces apart."""
-    corners, triangles, places = [], [], []
+    corners: list[Array] = []
+    triangles: list[NDArray[np.int64]] = []
+    places: list[Array] = []
     for box in boxes():
         low, high = np.array(box.low), np.array(box.high)
         for axis in range(3):

@@ -15,8 +15,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+import pycolmap
 
 from alice_survey.base.config import SurveyConfig
 from benchmarks.figures import Figure, Findings, add_options, hand_over
@@ -85,14 +87,8 @@ def matches(first: Path, second: Path, runs: int) -> list[Figure]:
         files = [Path(folder) / f"{k}.npz" for k in range(2)]
         for file, row in zip(files, found, strict=True):
             save_features(file, row)
-        cameras = [
-            f"PINHOLE {g.shape[1]} {g.shape[0]} 0 {1.2 * g.shape[1]} {1.2 * g.shape[1]} "
-            f"{g.shape[1] / 2} {g.shape[0] / 2}"
-            for g in greys
-        ]
-        task = matching.PairTask(
-            first=files[0], second=files[1], ratio=0.8, cameras=(cameras[0], cameras[1])
-        )
+        one, other = (_pinhole(*grey.shape) for grey in greys)
+        task = matching.PairTask(first=files[0], second=files[1], ratio=0.8, cameras=(one, other))
         worth = matching._WORTH_PROBING
         kept: dict[str, Array] = {}
 
@@ -135,6 +131,14 @@ def matches(first: Path, second: Path, runs: int) -> list[Figure]:
             Figure(name=f"{where}: median move", value=float(np.nanmedian(move)), unit="px"),
         ]
     return rows
+
+
+def _pinhole(height_px: int, width_px: int) -> dict[str, Any]:
+    focal_px = 1.2 * width_px
+    params = [focal_px, focal_px, width_px / 2, height_px / 2]
+    camera = pycolmap.Camera(model="PINHOLE", width=width_px, height=height_px, params=params)
+    fields: dict[str, Any] = camera.todict()
+    return fields
 
 
 def growth(surveys: list[tuple[int, int, int]]) -> list[Figure]:

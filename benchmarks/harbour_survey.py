@@ -100,15 +100,15 @@ def stations(step_m: float) -> list[Station]:
     row("tie", (-2.8, 4.4, 4.2), (-2.6, 4.4, 5.3), ahead, (0.0, -30.0), 4)
     # Around the pile the floor links to the other rows, and one ring to the other.
     row("floor", (-2.8, -0.7, 4.0), (-2.8, -1.9, 4.0), (90.0, 90.0), nadir)
-    north, east = PILE.place_ne
-    row("tie", (north - 1.75, east, 4.4), (north - 1.3, east, 4.1), ahead, (0.0, 90.0), tie)
+    pile_north, pile_east = PILE.place_ne
+    before, over = (pile_north - 1.75, pile_east, 4.4), (pile_north - 1.3, pile_east, 4.1)
+    row("tie", before, over, ahead, (0.0, 90.0), tie)
     for depth, down in ((4.4, 0.0), (4.6, 18.0)):
         arc = 1.75 * np.deg2rad(200.0)
         for azimuth in np.linspace(-100.0, 100.0, round(arc / step_m) + 1).tolist():
             angle = np.deg2rad(azimuth)
-            north = PILE.place_ne[0] - 1.75 * np.cos(angle)
-            east = PILE.place_ne[1] + 1.75 * np.sin(angle)
-            place = (float(north), float(east), depth)
+            aside_north, aside_east = -1.75 * np.cos(angle), 1.75 * np.sin(angle)
+            place = (float(pile_north + aside_north), float(pile_east + aside_east), depth)
             found.append(Station(row="pile", place=place, heading_deg=-azimuth, down_deg=down))
     return found
 

@@ -193,7 +193,6 @@ def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
 
 def _angles(rows: int, sampled: int) -> list[Angle]:
     costs = time_costs(0.2)
-    kinds = {"cross_lines": 1, "closing_line": True}
     found = []
     for name, shape in shapes().items():
         area = planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M)
@@ -202,11 +201,14 @@ def _angles(rows: int, sampled: int) -> list[Angle]:
         home = (float(north), float(east))
         for _ in range(2):
             began = time.perf_counter()
-            sweep = best_heading(area, PATTERN, ways, costs, home, **kinds)
+            sweep = best_heading(area, PATTERN, ways, costs, home, cross_lines=1, closing_line=True)
             seconds = time.perf_counter() - began
         headings = np.arange(sampled) * math.pi / sampled
         site, bounded = Site.of(area), comparable(costs)
-        costs_j = [laid(site, h, PATTERN, ways, bounded, home, **kinds).energy_j for h in headings]
+        costs_j = [
+            laid(site, h, PATTERN, ways, bounded, home, cross_lines=1, closing_line=True).energy_j
+            for h in headings
+        ]
         edges = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne])
         across = np.abs(
             edges[:, 1] * np.cos(headings)[:, None] - edges[:, 0] * np.sin(headings)[:, None]

@@ -9,6 +9,7 @@ import rasterio.features
 import shapely
 import shapely.affinity
 from shapely.geometry import MultiPoint, MultiPolygon, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.frames import Array, Datum
 from missions.values.area import Area, multipolygon
@@ -40,7 +41,7 @@ def shapes() -> dict[str, Polygon]:
     }
     if CHART.is_file():
         named["chart, 17 gaps"] = chart(CHART)
-    return {name: _one_wide(shape) for name, shape in named.items()}
+    return {name: _one_wide(_whole(shape)) for name, shape in named.items()}
 
 
 def marina(jetties: int, piles: int) -> Polygon:
@@ -56,7 +57,7 @@ def marina(jetties: int, piles: int) -> Polygon:
         for jetty in range(jetties)
         for pile in range(piles)
     ]
-    return Polygon(basin.difference(shapely.union_all(rows)))
+    return _whole(basin.difference(shapely.union_all(rows)))
 
 
 def quay(piles: int) -> Polygon:
@@ -71,7 +72,7 @@ def quay(piles: int) -> Polygon:
         for pile in range(piles)
     ]
     turned = shapely.affinity.rotate(MultiPoint(pairs), 17.0, origin=(0.5, 0.15))
-    return Polygon(strip.difference(turned.buffer(_PILE, 6)))
+    return _whole(strip.difference(turned.buffer(_PILE, 6)))
 
 
 def chart(raster: Path) -> Polygon:
@@ -81,7 +82,7 @@ def chart(raster: Path) -> Polygon:
         known = (depth != file.nodata) & np.isfinite(depth)
     pieces = rasterio.features.shapes(known.astype(np.uint8), mask=known)
     largest = max((shapely.geometry.shape(piece) for piece, _ in pieces), key=lambda p: p.area)
-    return Polygon(largest.simplify(1.0))
+    return _whole(largest.simplify(1.0))
 
 
 def harbour(rows: int, columns: int) -> Polygon:
@@ -98,7 +99,7 @@ def harbour(rows: int, columns: int) -> Polygon:
         for row in range(rows)
         for column in range(columns)
     ]
-    return Polygon(basin.difference(pier).difference(shapely.union_all(piles)))
+    return _whole(basin.difference(pier).difference(shapely.union_all(piles)))
 
 
 def planned_area(shape: Polygon, rows: int, spacing_m: float, margin_m: float) -> Area:
@@ -113,6 +114,13 @@ def planned_area(shape: Polygon, rows: int, spacing_m: float, margin_m: float) -
         allowed=multipolygon(around),
         no_go=multipolygon(holes),
     )
+
+
+def _whole(shape: BaseGeometry) -> Polygon:
+    """The same shape, which is one polygon."""
+    if not isinstance(shape, Polygon):
+        raise TypeError(f"{shape.geom_type} where one polygon is needed")
+    return shape
 
 
 def _one_wide(shape: Polygon) -> Polygon:

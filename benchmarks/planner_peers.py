@@ -82,11 +82,10 @@ def own_plan(area: Area, repeats: int) -> Way:
         lines = own_lines(area, ways)
         route_through(lines, _TURN_RADIUS_M, _RUN_IN_M, ways=ways, costs=time_costs(_SPEED_MPS))
         best = min(best, time.process_time() - began)
-    places = [lines[0].start_ne_m]
-    for before, after in pairwise([*lines, None]):
-        places.append(before.end_ne_m)
-        if after is not None:
-            places += ways.path_ne(before.end_ne_m, after.start_ne_m)[1:].tolist()
+    places = [lines[0].start_ne_m, lines[0].end_ne_m]
+    for before, after in pairwise(lines):
+        places += ways.path_ne(before.end_ne_m, after.start_ne_m)[1:].tolist()
+        places.append(after.end_ne_m)
     return Way(
         seconds=best,
         seen=np.array([(*line.start_ne_m, *line.end_ne_m) for line in lines]),
@@ -214,19 +213,18 @@ def covered_share(area: Area, seen: Array) -> float:
     along, aside = PATTERN.half_along_m * ahead, PATTERN.half_across_m * ahead[:, ::-1]
     aside = aside * np.array([-1.0, 1.0])
     begin, end = seen[:, :2] - along, seen[:, 2:] + along
-    boxes = shapely.polygons(
-        np.stack([begin - aside, end - aside, end + aside, begin + aside], axis=1)
-    )
+    corners = np.stack([begin - aside, end - aside, end + aside, begin + aside], axis=1)
+    boxes = np.asarray(shapely.polygons(corners))
     hit = shapely.STRtree(boxes).query(shapely.points(points), predicate="intersects")[0]
     return len(np.unique(hit)) / len(points)
 
 
 def _lines_of(path: Array) -> Array:
     """Lines, (S, 4), of a way: its straights within a degree of the heading."""
-    straights = np.concatenate([path[:-1], path[1:]], axis=1)
+    straights: Array = np.concatenate([path[:-1], path[1:]], axis=1)
     north, east = (path[1:] - path[:-1]).T
     off = (np.arctan2(east, north) - HEADING_RAD + math.pi / 2) % math.pi - math.pi / 2
-    return straights[np.abs(off) < math.radians(1.0)]
+    return np.asarray(straights[np.abs(off) < math.radians(1.0)])
 
 
 def _timed(work: Callable[[], _Result], repeats: int) -> tuple[float, _Result]:

@@ -87,7 +87,7 @@ def compare(ours: Array, theirs: Array, rng: np.random.Generator) -> dict[str, f
     for _ in range(_ROUNDS):
         distance, index = tree.query(moved, workers=-1)
         near = distance < np.percentile(distance, 80)
-        similarity = align_similarity(sample[near], theirs[index[near]])
+        similarity = align_similarity(sample[near], theirs[index][near])
         moved = similarity.apply(sample)
     _, neighbours = tree.query(moved, k=12, workers=-1)
     around = theirs[neighbours]

@@ -169,8 +169,10 @@ def _several(case_file: Path, on_gpu: bool, views: int) -> tuple[float, float]:
 def views_a_minute(case_file: Path, on_gpu: bool, processes: int, views: int) -> float:
     """How many views processes that start together refine in a minute."""
     context = get_context("spawn")
-    start = {"initializer": _share_barrier, "initargs": (context.Barrier(processes),)}
-    with ProcessPoolExecutor(processes, context, **start) as pool:
+    barrier = (context.Barrier(processes),)
+    with ProcessPoolExecutor(
+        processes, context, initializer=_share_barrier, initargs=barrier
+    ) as pool:
         work = partial(_several, case_file, on_gpu)
         times = np.array(list(pool.map(work, [views] * processes)))
     return 60.0 * processes * views / float(times[:, 1].max() - times[:, 0].min())

@@ -130,8 +130,8 @@ def _model(
         baseline=model_baseline(model), rig_factor=1.0,
     )  # fmt: skip
     cameras = {name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()}
-    seen = Observations(images=records, cameras=cameras, taken=keypoints, pairs=(), warps=warps)
-    Keypoints(mapped, seen).correct(model, 1.0)
+    observed = Observations(images=records, cameras=cameras, taken=keypoints, pairs=(), warps=warps)
+    Keypoints(mapped, observed).correct(model, 1.0)
     model.update_point_3d_errors()
     return mapped
 

@@ -173,7 +173,7 @@ def main() -> None:
         f"each, {tiles.worst_ms:.1f} at most; reading and encoding alone {tiles.twin_ms:.1f} ms",
         flush=True,
     )
-    figures = tuple(figure for one in (*rows, tiles) for figure in one.figures())
+    figures = (*(figure for row in rows for figure in row.figures()), *tiles.figures())
     values = {"replans": [asdict(row) for row in rows], "tiles": asdict(tiles)}
     sys.exit(hand_over(options, about, Findings(figures=figures), values))
 

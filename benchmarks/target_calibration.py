@@ -100,7 +100,7 @@ def bent(target: Board, rng: np.random.Generator) -> Array:
         out[:, 2] += 0.2 * target.bow_m * rng.choice([-1.0, 1.0]) * sag
     out[:, :2] *= [1.0 + target.stretch / 2.0, 1.0 - target.stretch / 2.0]
     out[:, :2] += rng.normal(0.0, target.place_m or 1e-12, (len(out), 2))
-    return out + middle
+    return np.asarray(out + middle)
 
 
 def _waves(points: Array, reach: float, rng: np.random.Generator) -> Array:

@@ -142,7 +142,7 @@ class NumpyTwin:
         force = self.matrix @ (thrust * t[:, column.KEPT])
         force[3:] += self.axes @ torque
         force[0] -= np.sum(a * np.exp(-b * ratio) + c * np.exp(-d * ratio)) * u * abs(u)
-        return force
+        return np.asarray(force)
 
     def rates(self, time_s: float, state: Array, command_rps: Array, load: Array) -> Array:
         """(13 + n,) rate of change of a state."""

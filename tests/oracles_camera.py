@@ -39,14 +39,14 @@ def project_by_bisection(camera: Camera, point_cam: Array) -> Array:
     """
     x, y, z = point_cam
     radius = math.hypot(x, y)
-    water_m = z - camera.port.port_distance_m - camera.port.glass_thickness_m
+    water_m = z - camera.parameter("port_distance_m") - camera.parameter("glass_thickness_m")
 
     def reaches(angle: float) -> float:
-        in_glass = math.asin(math.sin(angle) / camera.port.n_glass)
+        in_glass = math.asin(math.sin(angle) / camera.parameter("n_glass"))
         in_water = math.asin(math.sin(angle) / camera.n_water)
         return (
-            camera.port.port_distance_m * math.tan(angle)
-            + camera.port.glass_thickness_m * math.tan(in_glass)
+            camera.parameter("port_distance_m") * math.tan(angle)
+            + camera.parameter("glass_thickness_m") * math.tan(in_glass)
             + water_m * math.tan(in_water)
             - radius
         )
@@ -65,17 +65,17 @@ def project_by_shortest_path(camera: Camera, point_cam: Array) -> Array:
     path |A| + n_glass |B - A| + n_water |P - B| is convex; its least value is found by Newton's
     method on all four unknowns, without any thought of a plane of refraction.
     """
-    normal = np.asarray(camera.port.normal) / np.linalg.norm(camera.port.normal)
+    normal = np.asarray(camera.port.axis_cam) / np.linalg.norm(camera.port.axis_cam)
     first = np.cross(normal, [0.3, -0.5, 0.8])
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)], axis=1)
-    inner = camera.port.port_distance_m * normal
-    outer = inner + camera.port.glass_thickness_m * normal
+    inner = camera.parameter("port_distance_m") * normal
+    outer = inner + camera.parameter("glass_thickness_m") * normal
     # Differences A - 0, B - A and P - B are linear in the unknowns: d = base + matrix @ unknowns.
     zeros = np.zeros((3, 2))
     spans = [
         (1.0, inner, np.hstack([axes, zeros])),
-        (camera.port.n_glass, outer - inner, np.hstack([-axes, axes])),
+        (camera.parameter("n_glass"), outer - inner, np.hstack([-axes, axes])),
         (camera.n_water, np.asarray(point_cam) - outer, np.hstack([zeros, -axes])),
     ]
 
@@ -102,8 +102,12 @@ def project_by_shortest_path(camera: Camera, point_cam: Array) -> Array:
     sideways = np.asarray(point_cam) @ axes
     start = np.concatenate(
         [
-            sideways * (camera.port.port_distance_m / along),
-            sideways * ((camera.port.port_distance_m + camera.port.glass_thickness_m) / along),
+            sideways * (camera.parameter("port_distance_m") / along),
+            sideways
+            * (
+                (camera.parameter("port_distance_m") + camera.parameter("glass_thickness_m"))
+                / along
+            ),
         ]
     )
     found = minimize(
@@ -114,7 +118,7 @@ def project_by_shortest_path(camera: Camera, point_cam: Array) -> Array:
     return lens_pixel(camera, inner + axes @ found[:2])
 
 
-def numeric_slope(at: Callable[[float], Array], step: float) -> Array:
+def numeric_slope(at: Callable[..., Array], step: float) -> Array:
     """Slope of a function of one number at 0, by differences of sixth order."""
     weights = {1: 45.0, 2: -9.0, 3: 1.0}
     total = sum(w * (at(i * step) - at(-i * step)) for i, w in weights.items())

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
@@ -23,7 +25,7 @@ DATUM = Datum(32.8236, 34.9553)
 _FLOOR_M = 50.0
 
 
-def area_of(shape: shapely.Geometry, margin_m: float = 3.0) -> Area:
+def area_of(shape: BaseGeometry, margin_m: float = 3.0) -> Area:
     """An area with room to turn."""
     return Area(
         datum=DATUM,
@@ -57,7 +59,7 @@ def shifted(stations: Stations, north_m: float, east_m: float) -> Stations:
     return replace(stations, glass_ne=stations.glass_ne + np.array([north_m, east_m]))
 
 
-def stations_at(places_ne: Any, altitude_m: float = 1.0, **others: Any) -> Stations:
+def stations_at(places_ne: Any, altitude_m: ArrayLike = 1.0, **others: Any) -> Stations:
     """Level stations headed north, each on a line of its own if no lines are given."""
     places = np.asarray(places_ne, dtype=np.float64).reshape(-1, 2)
     given = {

@@ -5,10 +5,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import write_csv, write_json
@@ -35,7 +37,7 @@ PINHOLE = Pinhole(
 ALTITUDE_M, DEPTH_M = 2.0, 12.0
 
 
-def merged(depths: Array, sigmas: Array, gate: float) -> tuple[float, float, int]:
+def merged(depths: NDArray[Any], sigmas: NDArray[Any], gate: float) -> tuple[float, float, int]:
     """One pixel of `merge_depths`."""
     known = [(float(z), float(s)) for z, s in zip(depths, sigmas, strict=True) if not math.isnan(z)]
     companies = [
@@ -52,7 +54,12 @@ def merged(depths: Array, sigmas: Array, gate: float) -> tuple[float, float, int
 
 
 def fused(
-    heights: Array, sigmas: Array, views: Array, stations: Array, gate: float, shared: float
+    heights: Array,
+    sigmas: Array,
+    views: Array,
+    stations: NDArray[np.intp],
+    gate: float,
+    shared: float,
 ) -> tuple[float, float, int, int]:
     """`robust_height` of some points."""
     weights = 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2

@@ -20,7 +20,8 @@ def air_slope(camera: Camera, start: Array, point: Array) -> Array:
     """
     moved = changed(
         camera,
-        port_distance_m=camera.port.port_distance_m - float(start @ np.array(camera.port.normal)),
+        port_distance_m=camera.parameter("port_distance_m")
+        - float(start @ np.array(camera.port.axis_cam)),
     )
     pixel = project_by_shortest_path(moved, point - start)
     return (pixel - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]

@@ -19,8 +19,8 @@ def traced_spot(camera: Camera, x_px: float, y_px: float, altitude_m: float) -> 
     sine = out / math.sqrt(1.0 + out * out)
     reach = 0.0
     for thickness, index in (
-        (camera.port.port_distance_m, 1.0),
-        (camera.port.glass_thickness_m, camera.port.n_glass),
+        (camera.parameter("port_distance_m"), 1.0),
+        (camera.parameter("glass_thickness_m"), camera.parameter("n_glass")),
         (altitude_m, camera.n_water),
     ):
         reach += thickness * math.tan(math.asin(sine / index))

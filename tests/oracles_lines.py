@@ -9,7 +9,9 @@ import numpy as np
 import shapely
 import shapely.affinity
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.frames import Array, Datum
 from missions.lines.hops import comparable
@@ -31,7 +33,7 @@ ELL = Polygon([(0, 0), (30, 0), (30, 14), (15, 14), (15, 30), (0, 30)])
 ELL_WITH_HOLES = ELL.difference(box(5, 4, 9.3, 10)).difference(Point(8, 21).buffer(2.3, 4))
 
 
-def area_of(survey: shapely.Geometry, margin_m: float = 3.0) -> Area:
+def area_of(survey: BaseGeometry, margin_m: float = 3.0) -> Area:
     """An area whose holes are no-go zones, and that may be left by a margin."""
     parts = multipolygon(survey)
     holes = MultiPolygon([Polygon(ring) for part in parts.geoms for ring in part.interiors])
@@ -40,7 +42,7 @@ def area_of(survey: shapely.Geometry, margin_m: float = 3.0) -> Area:
 
 
 def lay(
-    survey: shapely.Geometry,
+    survey: BaseGeometry,
     heading: float = 0.0,
     pattern: Pattern = STEREO,
     *,
@@ -71,7 +73,7 @@ def random_area(rng: np.random.Generator) -> MultiPolygon:
         count = int(rng.integers(3, 12))
         angles = np.sort(rng.uniform(0, 2 * np.pi, count))
         radii = rng.uniform(0.2, 1, count) * rng.uniform(2, 12)
-        shape: shapely.Geometry = Polygon(np.c_[radii * np.cos(angles), radii * np.sin(angles)])
+        shape: BaseGeometry = Polygon(np.c_[radii * np.cos(angles), radii * np.sin(angles)])
     elif kind == 1:
         corners, x = [(0.0, 0.0)], 0.0
         for _ in range(int(rng.integers(2, 5))):
@@ -99,7 +101,7 @@ areas = st.integers(0, 2**32 - 1).map(lambda seed: random_area(np.random.default
 
 
 def reaches_by_shapely(
-    survey: shapely.Geometry, heading_rad: float, offset: float, half_m: float
+    survey: BaseGeometry, heading_rad: float, offset: float, half_m: float
 ) -> list[tuple[float, float]]:
     """Projection on u of what lies in a strip, by clipping."""
     turned = shapely.affinity.rotate(survey, -heading_rad, origin=(0, 0), use_radians=True)
@@ -134,13 +136,13 @@ def sees(lines: Sequence[Line], points: Array, pattern: Pattern) -> tuple[Array,
     return passes, pictures
 
 
-def seen_enough(lines: Sequence[Line], points: Array, pattern: Pattern) -> Array:
+def seen_enough(lines: Sequence[Line], points: Array, pattern: Pattern) -> NDArray[np.bool_]:
     """Whether each point is seen at the requested overlap."""
     passes, pictures = sees(lines, points, pattern)
     return (passes >= pattern.passes) & (pictures >= pattern.passes * pattern.pictures)
 
 
-def points_in(area: shapely.Geometry, count: int) -> Array:
+def points_in(area: BaseGeometry, count: int) -> Array:
     """About a given number of places, (N, 2), evenly over an area."""
     x_0, y_0, x_1, y_1 = area.bounds
     pitch = math.sqrt(area.area / count)
@@ -154,7 +156,11 @@ def as_string(line: Line) -> LineString:
 
 
 def best_tour_by_trial(
-    exits: Array, inner: Array, hop: Callable[[int, int], float], start: Array, finish: Array
+    exits: NDArray[np.int64],
+    inner: Array,
+    hop: Callable[[int, int], float],
+    start: Array,
+    finish: Array,
 ) -> float:
     """The least cost of all orders and corners of entry; arguments as of `tour.exact_tour`."""
     cells = len(inner) // 4

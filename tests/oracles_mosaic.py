@@ -4,6 +4,7 @@ import itertools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 
@@ -25,7 +26,7 @@ def lanczos_at(picture: Array, x: float, y: float) -> Array:
     return np.maximum(total / norm, 0.0)
 
 
-def labels_energy(number: Array, share: Array, colours: Array, chosen: Array) -> float:
+def labels_energy(number: Array, share: Array, colours: Array, chosen: NDArray[np.int32]) -> float:
     """What `choose_views` lowers, by its definition."""
     total = 0.0
     rows, columns = chosen.shape

@@ -85,7 +85,7 @@ def next_state(
     )
 
 
-def jacobian(function: Callable[[Array], Array], size: int, step: float = 1e-5) -> Array:
+def jacobian(function: Callable[..., Array], size: int, step: float = 1e-5) -> Array:
     """Central differences about zero."""
     columns = []
     for i in range(size):

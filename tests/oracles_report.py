@@ -72,7 +72,7 @@ def synthetic_views(
         for name, camera in rig.cameras.items():
             seen = camera.project(rig.cam_from_rig[name].apply(pose.apply(board)))
             seen = seen + rng.normal(0, noise_px, seen.shape)
-            inside = ((seen > 0) & (seen < [camera.width_px, camera.height_px])).all(axis=1)
+            inside = np.all((seen > 0) & (seen < [camera.width_px, camera.height_px]), axis=1)
             pixels[name] = np.where(inside[:, None], seen, np.nan)
         if all(np.isfinite(p[:, 0]).sum() > 40 for p in pixels.values()):
             views.append(TargetView(name=f"{len(views):02d}", pixels=pixels))
@@ -180,8 +180,11 @@ def best_pose_by_search(true: Camera, wrong: Camera, anchors_cam: Array) -> Rigi
     def pose(vector: Array) -> RigidTransform:
         return RigidTransform.from_components(vector[3:], Rotation.from_rotvec(vector[:3]))
 
+    def misses(vector: Array) -> Array:
+        return (wrong.project(pose(vector).apply(anchors_cam)) - wanted).ravel()
+
     found = least_squares(
-        lambda vector: (wrong.project(pose(vector).apply(anchors_cam)) - wanted).ravel(),
+        misses,
         np.zeros(6),
         x_scale=[1e-3] * 6,
         xtol=1e-15,

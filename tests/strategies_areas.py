@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
 
 from missions.values.area import multipolygon
 
@@ -17,7 +18,7 @@ def stars(draw: Any) -> MultiPolygon:
     reaches = draw(st.lists(st.floats(3.0, 12.0), min_size=5, max_size=9))
     angles = np.linspace(0, 2 * math.pi, len(reaches), endpoint=False)
     corners = np.array(reaches)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    area: shapely.Geometry = Polygon(corners)
+    area: BaseGeometry = Polygon(corners)
     for _ in range(draw(st.integers(0, 3))):
         north, east = draw(st.floats(-6, 6)), draw(st.floats(-6, 6))
         size = draw(st.floats(0.5, 3.0))
@@ -43,7 +44,7 @@ def areas() -> st.SearchStrategy[MultiPolygon]:
     return stars() | blocks()
 
 
-def _without_pinches(area: shapely.Geometry) -> MultiPolygon:
+def _without_pinches(area: BaseGeometry) -> MultiPolygon:
     """The area less its passages narrower than a few mm, which shapely lets a path through."""
     return multipolygon(area.buffer(-0.005, join_style="mitre").buffer(0.002, join_style="mitre"))
 

@@ -1,5 +1,7 @@
 """The facade's truth and judge, each by a second route."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -53,9 +55,9 @@ def test_a_camera_sees_its_target_in_the_middle_with_what_is_above_on_top() -> N
         assert right[0] > middle[0] + 10
     # half the width of the picture at a distance of one is the tangent of half the angle
     eye, target = np.array([0.0, -5.0, 1.0]), np.array([0.0, 0.0, 1.0])
-    camera = {"eye": eye, "target": target, "up": [0.0, 0.0, 1.0]}
+    level: dict[str, Any] = {"eye": eye, "target": target, "up": [0.0, 0.0, 1.0]}
     half = 5.0 * np.tan(np.deg2rad(scene.FOV_DEG / 2))
-    edge = projected(np.array([[half, 0.0, 1.0]]), camera)[0]
+    edge = projected(np.array([[half, 0.0, 1.0]]), level)[0]
     np.testing.assert_allclose(edge, [scene.SIZE_PX[0], scene.SIZE_PX[1] / 2], atol=1e-9)
 
 

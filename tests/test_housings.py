@@ -63,7 +63,9 @@ def check(score: dict[str, Any], length_m: float, width_m: float) -> None:
 def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> list[str]:
     """What is bad in a calibration from the pool's pictures."""
     pool = workspace / "pool" if port else workspace / "pool" / "air"
-    glass = {"glass_mm": "6", "n_glass": "1.49"} if port in ("flat", "dome", "auto") else {}
+    glass: dict[str, Any] = (
+        {"glass_mm": "6", "n_glass": "1.49"} if port in ("flat", "dome", "auto") else {}
+    )
     calibrate_pictures(
         CalibrateOptions(
             left=str(pool / "left"), right=str(pool / "right"), target=BOARD, output=output,

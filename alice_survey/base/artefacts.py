@@ -118,7 +118,7 @@ class StageRecord(JsonRecord):
     """Versions of the packages that affect results."""
 
 
-def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bool:
+def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> bool:
     """Do a stage's work unless its folder exists and nothing it depends on has changed.
 
     Args:
@@ -181,7 +181,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     return True
 
 
-def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
+def _measured(partial: Path, work: Callable[[Path], object]) -> Spent:
     """Do a stage's work; return the resources used, including those of an interrupted run."""
     try:
         earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))

@@ -3,15 +3,17 @@
 const TURN = Math.PI / 24;
 const NEARER = 1.2;
 const FILLED = 0.9;
+const MARK_PX = 6;
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
-/* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where it
-   is seen from, `lost` is called when the browser takes its graphics memory back. Returns `pick`,
-   which gives the point under a pixel of the canvas or null, `mark`, which shows some points and the
+/* A mesh that turns, of binary glTF: east is x, up is y, south is z; without one, an empty box
+   `around` what `show` draws. `told` gets words on where it is seen from, `lost` is called when the
+   browser takes its graphics memory back. Returns `pick`, which gives what is under a pixel of the
+   canvas, with its `point`, or null, `mark`, which shows some points and the
    lines between, and `show`, which draws another model, in the same axes, that is brought up to date
    before each frame, or the first one again; `dress` makes a model ready for it, `forget` gives its
    memory back. */
-async function startMesh(root, canvas, bytes, {told, lost}) {
+async function startMesh(root, canvas, bytes, {told, lost, around}) {
   const view = canvas.parentElement;
   const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
   renderer.setPixelRatio(Math.min(2, window.devicePixelRatio || 1));
@@ -20,9 +22,9 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   const lamp = new three.DirectionalLight(0xffffff, 2.6);
   scene.add(new three.HemisphereLight(0xffffff, 0x8c98a0, 1.1), lamp, lamp.target);
 
-  const model = (await parse(bytes)).scene;
+  const model = bytes ? (await parse(bytes)).scene : new three.Scene();
   scene.add(model);
-  const box = new three.Box3().setFromObject(model);
+  const box = around || new three.Box3().setFromObject(model);
   const ball = box.getBoundingSphere(new three.Sphere());
   lamp.position.copy(ball.center).add(new three.Vector3(-1, 0.7, -0.5).multiplyScalar(ball.radius));
   lamp.target.position.copy(ball.center);
@@ -71,6 +73,7 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   canvas.addEventListener("blur", () => { controls.enableZoom = false; });
   canvas.addEventListener("pointerdown", () => canvas.focus({preventScroll: true}));
 
+  let marks = [];
   let asked = false;
   function draw() {
     note();
@@ -79,6 +82,10 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     requestAnimationFrame(() => {
       asked = false;
       current.update();
+      const perPx = 2 * Math.tan(camera.fov * Math.PI / 360) / canvas.clientHeight;
+      marks.forEach((one) => {
+        if (one.isMesh) one.scale.setScalar(MARK_PX * perPx * camera.position.distanceTo(one.position));
+      });
       renderer.render(scene, camera);
     });
   }
@@ -140,15 +147,15 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   function pick(x, y) {
     const {clientWidth: width, clientHeight: height} = canvas;
     caster.setFromCamera(new three.Vector2(2 * x / width - 1, 1 - 2 * y / height), camera);
+    if (current.pick) return current.pick(caster.ray);
     const seen = current.group === model ? [model] : current.group.children.filter((part) => part.visible);
-    return caster.intersectObjects(seen, true)[0]?.point || null;
+    return caster.intersectObjects(seen, true)[0] || null;
   }
 
-  /* Seen through what is before them. */
-  let marks = [];
+  /* Seen through what is before them, from afar as large as from near. */
   function mark(points, colour) {
     marks.forEach((one) => scene.remove(one));
-    const dot = new three.SphereGeometry(ball.radius * 0.008, 12, 8);
+    const dot = new three.SphereGeometry(1, 16, 12);
     const paint = new three.MeshBasicMaterial({color: colour, depthTest: false});
     marks = points.map((point) => {
       const one = new three.Mesh(dot, paint);

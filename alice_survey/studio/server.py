@@ -22,6 +22,7 @@ try:
 
     from alice_survey.studio.app import application
     from alice_survey.studio.endpoints.base import Studio
+    from alice_survey.studio.endpoints.plan import prepare_planning
 except ImportError as missing:
     raise WorkspaceError(
         f"the studio needs {missing.name}, which is not installed: "
@@ -195,6 +196,7 @@ def run_studio(
         WorkspaceError: the port is taken, or the chart cannot be shown.
     """
     server = Server(workspace, port, log=log, chart=chart, background=background)
+    threading.Thread(target=prepare_planning, daemon=True).start()
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:

@@ -17,6 +17,7 @@ from alice_survey.base.cluster import engine
 from alice_survey.base.cluster.connection import read_cluster_file
 from alice_survey.base.cluster.engine import ClusterExecutor, cluster_executor
 from alice_survey.base.cluster.shared_values import LARGE_BYTES, packed, packed_once, unpacked
+from alice_survey.base.cluster.worker import code_and_versions
 from alice_survey.base.errors import AliceError, ConfigError, WorkspaceError, heard
 from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.run.resources import Meter
@@ -119,7 +120,7 @@ def test_a_cluster_gives_what_this_process_gives(executor: ClusterExecutor, tmp_
     ]
     assert meter.look().cpu_s > 0.0
     with pytest.raises(TypeError) as raised:
-        list(executor.map(abs, ["a"], label="abs"))  # type: ignore[list-item]
+        list(executor.map(abs, ["a"], label="abs"))  # type: ignore[arg-type]
     assert "run_task" in "".join(raised.value.__notes__)  # where it happened
     assert [path.name for path in tmp_path.iterdir()] == [engine.STORE]
 
@@ -224,7 +225,7 @@ def test_a_worker_that_loses_the_files_is_left_out(tmp_path: Path) -> None:
             tasks = [(tmp_path, folder / "seven", n) for n in range(8)]
             found = executor.map(dask_tasks.read_when_allowed, tasks, label="read")
             with ThreadPoolExecutor(1) as waiting:
-                all_found = waiting.submit(copy_context().run, list, found)
+                all_found = waiting.submit(copy_context().run, lambda: list(found))
                 while len(list(tmp_path.glob("*.begun"))) < 2:
                     time.sleep(0.05)
                 enter = ("nsenter", "--mount", "--target", str(hidden.pid))
@@ -274,7 +275,7 @@ def test_what_is_wrong_with_a_cluster_is_said_before_work(
         kill(machines.workers[-1].pid, signal.SIGTERM)
         machines.workers[-1].wait()
         machines.add("narrow")
-        other = tuple({**dict(engine.code_and_versions()), "numpy": "0.1"}.items())
+        other = tuple({**dict(code_and_versions()), "numpy": "0.1"}.items())
         monkeypatch.setattr(engine, "code_and_versions", lambda: other)
         assert "this machine has 0.1: install the same" in fault()
     assert not (tmp_path / engine.STORE).exists()

@@ -54,7 +54,7 @@ def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() 
     with local_executor(2).started() as started:
         first, second = (set(started.map(_process, range(8), label="ids")) for _ in range(2))
         with pytest.raises(TypeError):
-            list(started.map(abs, [1, "a", 2], label="abs"))  # type: ignore[list-item]
+            list(started.map(abs, [1, "a", 2], label="abs"))  # type: ignore[arg-type]
         third = set(started.map(_process, range(8), label="ids"))
     assert len(first) == 2
     assert first == second == third
@@ -68,7 +68,7 @@ def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() 
 
 def test_a_fault_of_the_work_reaches_the_caller() -> None:
     with pytest.raises(TypeError):
-        list(local_executor(2).map(abs, [1, "a", 2], label="abs"))  # type: ignore[list-item]
+        list(local_executor(2).map(abs, [1, "a", 2], label="abs"))  # type: ignore[arg-type]
 
 
 class Elsewhere:

@@ -174,7 +174,7 @@ def test_between_poses_it_is_straight_and_turns_evenly() -> None:
     time_s, given_poses = poses()
     at = interpolate_poses(time_s, given_poses, np.array([0.25, 2.0]))
 
-    np.testing.assert_allclose(at.translation, [[0.25, 0.5, 0.75], [3, 2, 2]], atol=1e-12)
+    np.testing.assert_allclose(at.translation, [[0.25, 0.5, 0.75], [3.0, 2.0, 2.0]], atol=1e-12)
     np.testing.assert_allclose(at.rotation.as_euler("ZYX")[:, 0], [0.1, 0.0], atol=1e-12)
 
 

@@ -71,7 +71,9 @@ def test_what_is_taken_out_leaves_its_comment_and_comes_back_as_it_was() -> None
 
 
 def test_equal_values_change_nothing() -> None:
-    same = {"plan": {"altitude_m": 2, "closing_line": True}, "camera": {"dome_centre_m": [0, 0, 0]}}
+    same: dict[str, dict[str, Any]] = {
+        "plan": {"altitude_m": 2, "closing_line": True}, "camera": {"dome_centre_m": [0, 0, 0]}
+    }  # fmt: skip
     assert with_settings_changed(TEMPLATE, same) == TEMPLATE
 
 

@@ -101,11 +101,11 @@ def test_a_pixel_comes_back_within_a_billionth(camera: Camera, distance_m: float
 def test_project_agrees_with_the_shortest_optical_path(
     camera: Camera, x: float, y: float, water_m: float
 ) -> None:
-    glass_m = camera.port.port_distance_m + camera.port.glass_thickness_m
-    point = (glass_m + water_m) * np.array(camera.port.normal) + water_m * np.array([x, y, 0.0])
-    if camera.port.port_distance_m < 1e-6:
+    glass_m = camera.parameter("port_distance_m") + camera.parameter("glass_thickness_m")
+    point = (glass_m + water_m) * np.array(camera.port.axis_cam) + water_m * np.array([x, y, 0.0])
+    if camera.parameter("port_distance_m") < 1e-6:
         camera = changed(camera, port_distance_m=1e-6)
-    if camera.port.glass_thickness_m < 1e-6:
+    if camera.parameter("glass_thickness_m") < 1e-6:
         camera = changed(camera, glass_thickness_m=1e-6)
 
     np.testing.assert_allclose(
@@ -124,7 +124,7 @@ def test_project_agrees_with_bisection(
     camera: Camera, slope: float, azimuth: float, water_m: float
 ) -> None:
     camera = changed(camera, normal=(0.0, 0.0, 1.0))
-    z = camera.port.port_distance_m + camera.port.glass_thickness_m + water_m
+    z = camera.parameter("port_distance_m") + camera.parameter("glass_thickness_m") + water_m
     point = np.array([slope * z * math.cos(azimuth), slope * z * math.sin(azimuth), z])
     if not np.all(np.isfinite(camera.project(point))):
         assert slope > 0.4  # only far outside of the frame may a lens have no image
@@ -146,7 +146,7 @@ def points_in_water(draw: st.DrawFn) -> Array:
 @settings(deadline=None, max_examples=60)
 @given(camera=cameras(), points=points_in_water())
 def test_slopes_by_the_point_are_those_of_project(camera: Camera, points: Array) -> None:
-    points = np.vstack([points, 1.5 * np.array(camera.port.normal)])
+    points = np.vstack([points, 1.5 * np.array(camera.port.axis_cam)])
     pixels, by_point, _ = camera.project_jacobian(points)
 
     np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
@@ -165,11 +165,11 @@ STEPS = dict.fromkeys(PARAMETERS, 0.0001) | {
 def test_slopes_by_each_parameter_are_those_of_project(camera: Camera, points: Array) -> None:
     camera = changed(
         camera,
-        port_distance_m=camera.port.port_distance_m + 1e-3,
-        glass_thickness_m=camera.port.glass_thickness_m + 1e-3,
+        port_distance_m=camera.parameter("port_distance_m") + 1e-3,
+        glass_thickness_m=camera.parameter("glass_thickness_m") + 1e-3,
         n_water=camera.n_water + 4e-3,
     )
-    points = np.vstack([points, 1.5 * np.array(camera.port.normal)])
+    points = np.vstack([points, 1.5 * np.array(camera.port.axis_cam)])
     _, _, by_parameter = camera.project_jacobian(points)
 
     for i, name in enumerate(PARAMETERS):
@@ -216,7 +216,7 @@ def test_parameters_go_by_name() -> None:
     camera = MANTA.with_parameters(values)
 
     assert {name: camera.parameter(name) for name in PARAMETERS} == pytest.approx(values)
-    assert math.hypot(*camera.port.normal) == pytest.approx(1.0, abs=1e-15)
+    assert math.hypot(*camera.port.axis_cam) == pytest.approx(1.0, abs=1e-15)
     with pytest.raises(CalibrationError, match="k9"):
         MANTA.with_parameters({"k9": 0.1})
     with pytest.raises(CalibrationError, match="normal_x"):

@@ -102,6 +102,7 @@ def test_a_mount_is_stated_shown_drawn_and_taken_from_another_rig(rig: Rig, tmp_
     )
     other = with_mount(rig, str(path), None)
     np.testing.assert_allclose(other.body_from_rig.as_matrix(), found.body_from_rig.as_matrix())
+    assert found.body_from_rig is not None
     turned = replace(
         found,
         body_from_rig=RigidTransform.from_rotation(Rotation.from_rotvec([0, 0, 0.02]))

@@ -171,7 +171,7 @@ def test_cameras_stand_above_and_before_the_tank(tank: Tank) -> None:
     top, front = (pose.inv().translation for pose in tank.poses)
     np.testing.assert_allclose(top, [0.18, 0.075, -0.198], atol=0.012)
     np.testing.assert_allclose(front, [0.17, 0.371, 0.073], atol=0.012)
-    assert all(0.15 < camera.port.port_distance_m < 0.21 for camera in tank.cameras)
+    assert all(0.15 < camera.parameter("port_distance_m") < 0.21 for camera in tank.cameras)
 
 
 def test_reprojection_error_is_below_the_published(aquarium: Aquarium, tank: Tank) -> None:

@@ -325,13 +325,13 @@ def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) ->
         bag.add_imu(stamp, "/imu", "imu", flipped_quaternion(turn.as_quat()))
         bag.add_pressure(stamp, "/pressure", 101325.0 + 1025.0 * 9.80665 * row["depth_m"])
     kind, wanted = "sensor_msgs/msg/CompressedImage", set(stations)
-    for row in rows_of(reef / "images/manifest.csv"):
-        if int(row["station"]) in wanted:
-            seen = shrunk(cv2.imread(str(reef / "images" / row["image"])), width_px)
-            stamp = round((SAID + timedelta(seconds=float(row["time_s"]))).timestamp() * 1e9)
+    for taken in rows_of(reef / "images/manifest.csv"):
+        if int(taken["station"]) in wanted:
+            seen = shrunk(cv2.imread(str(reef / "images" / taken["image"])), width_px)
+            stamp = round((SAID + timedelta(seconds=float(taken["time_s"]))).timestamp() * 1e9)
             data = cv2.imencode(".png", seen)[1].ravel()
             picture = bag.make(
-                kind, header=bag.header(stamp, row["camera"]), format="png", data=data
+                kind, header=bag.header(stamp, taken["camera"]), format="png", data=data
             )
             bag.add(f"/camera/{row['camera']}/compressed", kind, stamp, picture)
     bag.write(path)

@@ -194,10 +194,10 @@ def read_picture(path: Path) -> object:
 
 def read_for_matching(path: Path) -> object:
     from missions.exposure.gain import read_linear
-    from reconstruct.pictures.normalise import finely, read_deep
+    from reconstruct.pictures.normalise import even_light, finely, read_deep
     from reconstruct.pictures.undistorted import read_colour
 
-    return finely(read_deep(path)), read_colour(path), read_linear(path, linear=False)
+    return finely(even_light(read_deep(path))), read_colour(path), read_linear(path, linear=False)
 
 
 def read_mask(path: Path) -> object:

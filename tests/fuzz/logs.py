@@ -245,14 +245,15 @@ def swelling_bag(folder: Path, packed: str, size: int) -> Path:
 
     bag = Bag(1 if packed == "bz2" else 2)
     bag.add_nav_sts(_START_NS, (41.7, 3.03, 5.0), (0.01, -0.02, 3.1), 2.5)
+    writer: Writer1 | Writer2
     if packed == "bz2":
         path = folder / "a.bag"
-        writer = Writer1(path)
-        writer.set_compression(Writer1.CompressionFormat.BZ2)
+        writer = one = Writer1(path)
+        one.set_compression(Writer1.CompressionFormat.BZ2)
     else:
         path = folder / "a"
-        writer = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        writer = two = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        two.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
         bag.fill(writer)
         connection = writer.add_connection("/x", "std_msgs/msg/String", typestore=bag.store)

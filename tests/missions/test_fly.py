@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,7 +126,7 @@ def test_the_bag_opens_and_holds_what_the_navigation_log_says(workspace: Path) -
         wanted = [c for c in reader.connections if c.topic.endswith("navigation/odometry")]
         assert len(wanted) == 1
         for connection, _, raw in reader.messages(connections=wanted):
-            message = reader.deserialize(raw, connection.msgtype)
+            message: Any = reader.deserialize(raw, connection.msgtype)
             depths.append(-message.pose.pose.position.z)
     log = read_columns(flight / "navigation.csv", ("depth_m",))["depth_m"]
     np.testing.assert_allclose(depths, log[::2], atol=1e-4)

@@ -177,7 +177,7 @@ def test_navigation_is_consistent_in_the_closed_loop() -> None:
     epochs = min(len(square) for square in squares)
     assert epochs > 0.5 * plan_of().duration_s / 2
     mean = np.stack([square[:epochs] for square in squares]).mean(axis=0)
-    low, high = chi2.ppf([0.025, 0.975], len(axes) * runs) / runs
+    low, high = (chi2.ppf(share, len(axes) * runs) / runs for share in (0.025, 0.975))
     assert ((mean > low) & (mean < high)).mean() >= 0.9
 
 

@@ -78,8 +78,10 @@ def four_cameras() -> Rig:
             port=DomePort(dome_z_m=-0.003, outer_radius_m=0.08, glass_thickness_m=0.006),
         ),
     }  # fmt: skip
-    turns = {"wide": [0, 0, 0], "tele": [1, -2, 90], "bow": [20, 1, -1], "side": [-1, 18, 2]}
-    places = {
+    turns: dict[str, list[float]] = {
+        "wide": [0, 0, 0], "tele": [1, -2, 90], "bow": [20, 1, -1], "side": [-1, 18, 2],
+    }  # fmt: skip
+    places: dict[str, list[float]] = {
         "wide": [0, 0, 0], "tele": [0.14, 0.01, 0], "bow": [0.06, -0.12, 0.02],
         "side": [0.2, 0.1, -0.01],
     }  # fmt: skip

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
@@ -32,7 +33,7 @@ class Scene:
     points_ned: Array
     pixels: list[Array]
     """As the flat-port cameras see them."""
-    ids: list[Array]
+    ids: list[NDArray[np.int64]]
     """Which point every pixel shows."""
     pairs: list[tuple[int, int, PairMatches]]
 

@@ -28,7 +28,7 @@ from reconstruct.views.model import MEAN_PLANE, SparseModel, WorldFrame, write_f
 from tests.oracles_dense import FRAME, Scene, flat, position_code, sparse_model, stereo_views
 
 NADIR = sparse_model(
-    stereo_views(0.3 * np.arange(3), np.zeros(3)), Scene(depth_of=flat, paint=position_code)
+    stereo_views(0.3 * np.arange(3.0), np.zeros(3)), Scene(depth_of=flat, paint=position_code)
 )
 
 

@@ -84,6 +84,15 @@ class AskedExport(Config):
     measures: list[ExportedMeasure] = Field(min_length=1, max_length=_MOST_MEASURES)
 
 
+def plane_json(held: Held) -> dict[str, Any] | None:
+    """Axes of the plane that the map is of, east, north, up; None of the level one."""
+    plane = held.plane
+    return None if plane is None else {
+        "origin": plane.origin_enu, "right": plane.right_enu, "up": plane.up_enu,
+        "out": plane.out_enu,
+    }  # fmt: skip
+
+
 class _ModelTab:
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
@@ -227,7 +236,6 @@ class _ModelTab:
         record = held.read(MeshRecord)
         if record is None or not workspace.has("mesh/mesh.glb"):
             raise FileNotFoundError("mesh/mesh.glb")
-        plane = held.plane
         tiles = "mesh/tiles/tileset.json"
         return {
             "address": f"/mesh.glb?v={workspace.token('mesh/mesh.glb')}",
@@ -236,11 +244,8 @@ class _ModelTab:
             "still": "/files/mesh/mesh.png" if workspace.has("mesh/mesh.png") else None,
             "tiles": f"/files/{tiles}" if workspace.has(tiles) else None,
             "offset": record.offset_east_north_up,
-            "plane": None if plane is None else {
-                "origin": plane.origin_enu, "right": plane.right_enu, "up": plane.up_enu,
-                "out": plane.out_enu,
-            },
-        }  # fmt: skip
+            "plane": plane_json(held),
+        }
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

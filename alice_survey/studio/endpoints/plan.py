@@ -5,7 +5,7 @@ import math
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -59,6 +59,12 @@ _MOST_MOMENTS = 4000
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 _JSON = "application/json"
+
+
+def prepare_planning() -> None:
+    """Load what plans, and compile it where that is not done: about 20 s after an installation."""
+    with _quiet(), suppress(AliceError):
+        preview(SurveyConfig())
 
 
 class PlanRequest(Config):

@@ -67,6 +67,14 @@ export function tab(studio) {
       stop),
     el("p", {class: "note"}, "For files elsewhere and for vehicles: alice-survey studio --log nav.csv, udp:14600, mavlink:udpin:127.0.0.1:14550 or ros."));
 
+  // files may come while the page is open
+  for (const event of ["pointerenter", "focusin"]) {
+    choose.addEventListener(event, async () => {
+      const heard = await get("/api/follow/state").catch(() => null);
+      if (heard) fillChoices(heard);
+    });
+  }
+
   const live = el("div", {hidden: true}, big,
     el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"}, LEGEND.map(([colour, text]) => el("li", {},
       el("span", {class: "swatch", style: {background: colour}}), text))),
@@ -141,7 +149,11 @@ export function tab(studio) {
   }
 
   function fillChoices(heard) {
-    logs.replaceChildren(...heard.logs.map((name) => el("option", {value: name}, name)));
+    const chosen = logs.value;
+    if ([...logs.options].map((option) => option.value).join("\n") !== heard.logs.join("\n")) {
+      logs.replaceChildren(...heard.logs.map((name) => el("option", {value: name}, name)));
+      if (heard.logs.includes(chosen)) logs.value = chosen;
+    }
     if (!format.children.length) {
       format.append(el("option", {value: ""}, "all formats"), ...heard.formats.map((name) => el("option", {value: name}, name)));
     }

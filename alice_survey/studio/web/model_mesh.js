@@ -1,9 +1,10 @@
-/* The mesh in the tab Model: it turns, a click picks a place on it, two picks give a length. */
+/* The model in 3D in the tab Model, as a mesh or as points: it turns, a click picks a place on it, two picks give a length. */
 
-import {attempt, button, bytes, el, get, say} from "./core.js";
+import {attempt, button, bytes, el, field, get, say} from "./core.js";
+import {boxOf, startPoints} from "./model_points.js";
 import {startTiles} from "./model_tiles.js";
 import {WHITE} from "./palette.js";
-import {number} from "./words.js";
+import {counted, number} from "./words.js";
 
 const STILL_PX = 4;
 const ACTS = [["left", "Turn left", "←"], ["right", "Turn right", "→"], ["up", "Look from higher", "↑"], ["down", "Look from lower", "↓"],
@@ -32,53 +33,67 @@ export function meshPart(studio, {colour, measured}) {
   const {map, state} = studio;
   const canvas = el("canvas", {
     id: "mesh-canvas", tabindex: "0", role: "application",
-    "aria-label": "Mesh of the sea floor: arrow keys turn it, + and - move nearer and farther, 0 resets the view, Enter picks what is in the middle, Escape drops the picks",
+    "aria-label": "The sea floor in 3D: arrow keys turn it, + and - move nearer and farther, 0 resets the view, Enter picks what is in the middle, Escape drops the picks",
   });
   const told = el("p", {class: "readout"});
   const relief = el("button", {type: "button", class: "word", "data-act": "relief", "aria-pressed": "false", title: "Grey under a lamp from the side: shape without colours"}, "Relief");
-  const tools = el("div", {class: "tools", role: "group", "aria-label": "Turn the mesh"},
+  const tools = el("div", {class: "tools", role: "group", "aria-label": "Turn the model"},
     ACTS.map(([act, label, sign]) => el("button", {type: "button", "data-act": act, title: label, "aria-label": label}, sign)), relief);
   const view = el("div", {class: "view"}, canvas, tools, told);
   const root = el("div", {class: "mesh live", hidden: true}, view);
   const home = el("div", {});
-  const picked = el("p", {class: "note", role: "status"}, "Click a place on the mesh, then another: their distance is measured.");
+  const picked = el("p", {class: "note", role: "status"}, "Click a place on the model, then another: their distance is measured.");
   const large = button("Larger, over the map", () => enlarge(large.getAttribute("aria-pressed") !== "true"), {"aria-pressed": "false"});
   const about = el("p", {class: "note"});
-  const detail = el("select", {}, el("option", {value: "light"}, "Light copy"), el("option", {value: "tiles"}, "Full detail (3D Tiles)"));
-  const choice = el("label", {class: "field", hidden: true}, "Detail of the mesh ", detail);
+  const kinds = el("select");
+  const choice = field("Drawn as", kinds);
+  choice.hidden = true;
   const streamed = el("p", {class: "note"});
   const body = el("div", {}, choice, el("div", {class: "buttons"}, large), home, streamed, picked, about);
   home.append(root);
-  const element = el("details", {hidden: true}, el("summary", {}, "Mesh"), body);
+  const element = el("details", {hidden: true}, el("summary", {}, "In 3D"), body);
   const spots = leaflet.featureGroup();
   let scene = null;
   let lies = null;
   let begun = false;
   let picks = [];
-  let tiles = null;
+  let drawn = null;
+  const started = {};
+
+  const heard = (words) => ({
+    told({parts, coming, bytes: held}) {
+      Object.assign(canvas.dataset, {parts: parts.length, coming, mib: (held / 2 ** 20).toFixed(3)});
+      streamed.textContent = words(parts) + " drawn, " + coming + " on the way, " + number(held / 2 ** 20, "MB", 2) + " held";
+    },
+    failed: (fault) => say("A part is not drawn: " + fault.message, "error"),
+  });
+
+  const starts = {
+    light: () => null,
+    tiles: () => startTiles(scene, lies.tiles, heard((parts) => counted(parts.length, "tile"))),
+    points: async () => {
+      const cloud = await get("/api/model/points");
+      const all = counted(cloud.points, "point");
+      return startPoints(scene, cloud, lies.offset, heard((parts) => parts.reduce((sum, part) => sum + part.count, 0).toLocaleString("en") + " of " + all));
+    },
+  };
 
   async function draw() {
+    const kind = kinds.value;
     drop();
-    streamed.textContent = "";
-    if (detail.value === "light") {
-      scene.show(null);
-      return;
-    }
-    detail.disabled = true;
     try {
-      tiles = tiles || await startTiles(scene, lies.tiles, {
-        told({drawn, coming, bytes: held}) {
-          Object.assign(canvas.dataset, {tiles: drawn, coming});
-          if (detail.value === "tiles") streamed.textContent = drawn + " tiles drawn, " + coming + " on the way, " + Math.round(held / 2 ** 20) + " MB held";
-        },
-        failed: (fault) => say("A tile did not come: " + fault.message, "error"),
-      });
-      scene.show(tiles);
+      started[kind] = started[kind] || starts[kind]();
+      const next = await started[kind];
+      if (kind !== kinds.value) return;
+      drawn?.detail?.clear();
+      drawn = {kind, detail: next};
+      streamed.textContent = "";
+      relief.hidden = kind === "points";
+      scene.show(next);
     } catch (fault) {
-      detail.value = "light";
+      delete started[kind];
+      kinds.value = drawn?.kind || "";
       throw fault;
-    } finally {
-      detail.disabled = false;
     }
   }
 
@@ -94,9 +109,9 @@ export function meshPart(studio, {colour, measured}) {
   }
 
   function shown() {
-    scene.mark(picks, colour);
+    scene.mark(picks.map(({point}) => point), colour);
     spots.clearLayers().addTo(map.leaflet);
-    const places = picks.map((point) => onMap(point, lies));
+    const places = picks.map(({point}) => onMap(point, lies));
     places.forEach(([east, north]) => spots.addLayer(leaflet.circleMarker([north, east], {
       radius: 6, color: WHITE, weight: 2, fillColor: colour, fillOpacity: 1, interactive: false,
     })));
@@ -104,50 +119,58 @@ export function meshPart(studio, {colour, measured}) {
   }
 
   function take(x, y) {
-    const point = scene.pick(x, y);
-    if (!point) {
-      say("Nothing of the mesh is there.", "warn");
+    const hit = scene.pick(x, y);
+    if (!hit) {
+      say("Nothing of the model is there.", "warn");
       return;
     }
-    picks = picks.length === 2 ? [point] : [...picks, point];
+    picks = picks.length === 2 ? [hit] : [...picks, hit];
     const places = shown();
     const last = places[places.length - 1].map((value) => number(value, "", 6)).join(", ");
-    picked.textContent = "Picked " + last + " " + state.unit + (picks.length === 1 ? ": click another place." : "");
+    const sigma = hit.sigma ? ", with a sigma of " + number(hit.sigma, state.unit, 2) + " across the surface" : "";
+    picked.textContent = "Picked " + last + " " + state.unit + sigma + (picks.length === 1 ? ": click another place." : "");
     if (picks.length === 2) measured(places);
   }
 
   async function begin() {
     begun = true;
-    lies = await get("/api/model/mesh");
-    about.textContent = lies.about + (lies.tiles ? " Other viewers of 3D Tiles: " + window.location.origin + lies.tiles
-      : " There are no 3D Tiles of it, to draw it at full detail: mesh_tiles = \"on\" under [reconstruct] makes them with the mesh.");
+    const mesh = state.has.mesh ? await get("/api/model/mesh") : null;
+    const cloud = mesh ? null : await get("/api/model/points");
+    lies = mesh || {offset: cloud.centre, plane: cloud.plane};
+    about.textContent = mesh ? mesh.about + (mesh.tiles ? " Other viewers of 3D Tiles: " + window.location.origin + mesh.tiles
+      : " There are no 3D Tiles of it, to draw it at full detail: mesh_tiles = \"on\" under [reconstruct] makes them with the mesh.")
+      : "There is no mesh yet: the points are those of the dense surface.";
     const context = document.createElement("canvas").getContext("webgl2");
     if (!context) {
-      still("This browser has no WebGL, which turning the mesh needs");
+      still("This browser has no WebGL, which turning the model needs");
       return;
     }
     context.getExtension("WEBGL_lose_context")?.loseContext();
     await loaded("/app/vendor_mesh.js");
     await loaded("/app/mesh.js");
-    const model = await bytes(lies.address);
+    const model = mesh && await bytes(mesh.address);
     root.hidden = false;
     scene = await startMesh(root, canvas, model, {
       told: (text) => { told.textContent = text; },
       lost: () => still("The browser took its graphics memory back"),
+      around: cloud && boxOf(cloud, lies.offset),
     });
-    choice.hidden = !lies.tiles;
+    kinds.append(...[["light", "Mesh, light copy", mesh], ["tiles", "Mesh, full detail (3D Tiles)", mesh?.tiles], ["points", "Points of the dense cloud", state.has.cloud]]
+      .filter(([, , isThere]) => isThere).map(([value, text]) => el("option", {value}, text)));
+    choice.hidden = kinds.length < 2;
     root.dataset.ready = "";
+    await draw();
   }
 
   function still(why) {
     root.hidden = true;
     large.hidden = true;
     choice.hidden = true;
-    picked.textContent = why + ": this is a still picture.";
+    picked.textContent = why + (lies.still ? ": this is a still picture." : ".");
     if (lies.still) home.append(el("img", {src: lies.still, alt: "The mesh seen from above and from the side"}));
   }
 
-  detail.addEventListener("change", () => attempt(draw));
+  kinds.addEventListener("change", () => attempt(draw));
   let down = null;
   canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
   canvas.addEventListener("pointerup", (event) => {
@@ -168,7 +191,7 @@ export function meshPart(studio, {colour, measured}) {
 
   return {
     element,
-    enter() { element.hidden = !state.has.mesh; },
+    enter() { element.hidden = !(state.has.mesh || state.has.cloud); },
     leave() {
       enlarge(false);
       spots.remove();

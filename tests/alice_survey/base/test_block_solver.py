@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from alice_survey.base.block_solver import BlockStep, Equations, Minimum, inverse_of, minimise
@@ -39,7 +40,7 @@ def equations(
     )
 
 
-def dense_free(found: Equations) -> tuple[Array, Array, Array]:
+def dense_free(found: Equations) -> tuple[Array, Array, NDArray[np.intp]]:
     """Matrix and gradient of all unknowns that are free, and which those are."""
     kept = np.flatnonzero(np.append(found.free.ravel(), np.ones(len(found.shared) - 1, bool)))
     slope = np.concatenate([found.border[..., -1].ravel(), found.shared[:-1, -1]])
@@ -144,10 +145,13 @@ def solved(problem: Curves, start: Array, **options: float) -> Minimum[Array, Eq
 def test_it_ends_where_a_plain_minimiser_does(rate: float) -> None:
     problem, far = curves(1.2), np.append(np.full(8, 1.0), rate)
     found = solved(problem, far)
+
+    def misses(x: Array) -> Array:
+        return problem.misses(x).ravel()
+
     plain = least_squares(
-        lambda x: problem.misses(x).ravel(), far, loss="huber", f_scale=1.0, x_scale="jac",
-        xtol=1e-14, ftol=1e-14, gtol=1e-14,
-    )  # fmt: skip
+        misses, far, loss="huber", f_scale=1.0, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
     assert found.is_settled
     assert not found.is_stuck
     np.testing.assert_allclose(found.guess, plain.x, rtol=1e-5)
@@ -159,9 +163,11 @@ def test_a_parameter_that_would_leave_its_range_stays_at_its_bound() -> None:
     found = solved(problem, np.append(np.full(8, 10.0), 2.5))
     assert found.is_settled
     assert found.guess[-1] == 2.0
-    free = least_squares(
-        lambda x: problem.misses(np.append(x, 2.0)).ravel(), found.guess[:-1], loss="huber"
-    )
+
+    def misses(x: Array) -> Array:
+        return problem.misses(np.append(x, 2.0)).ravel()
+
+    free = least_squares(misses, found.guess[:-1], loss="huber")
     np.testing.assert_allclose(found.guess[:-1], free.x, rtol=1e-4)
 
 

@@ -83,7 +83,9 @@ def sketch_map(side: int = 1100) -> SurveyMap:
     depths = floor.convert("L").resize((side // 2, (side - 90) // 2))
     ramp = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in VIRIDIS])
     level = np.linspace(0, 255, len(VIRIDIS))
-    coloured = np.stack([np.interp(depths, level, ramp[:, band]) for band in range(3)], axis=-1)
+    coloured = np.stack(
+        [np.interp(np.asarray(depths), level, ramp[:, band]) for band in range(3)], axis=-1
+    )
     dem = Image.fromarray(coloured.astype(np.uint8))
     seen = Image.new("RGBA", dem.size, (230, 159, 0, 0))
     seen.paste((230, 159, 0, 120), (0, 0, dem.width // 3, dem.height))

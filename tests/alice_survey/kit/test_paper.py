@@ -2,6 +2,7 @@ import io
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pypdf import PdfReader
@@ -50,11 +51,8 @@ def test_text_is_never_markup(report: Report, pdf: bytes) -> None:
 @pytest.mark.slow
 def test_a_screen_reader_gets_what_figures_show(report: Report, pdf: bytes) -> None:
     reader = PdfReader(io.BytesIO(pdf))
-    alts = [
-        str(item["/Alt"])
-        for item in (reader.get_object(n + 1) for n in range(len(reader.xref_objStm) + 4000))
-        if isinstance(item, dict) and "/Alt" in item
-    ]
+    items: list[Any] = [reader.get_object(n + 1) for n in range(len(reader.xref_objStm) + 4000)]
+    alts = [str(item["/Alt"]) for item in items if isinstance(item, dict) and "/Alt" in item]
     assert report.mesh is not None
     assert report.mesh.still.alt in alts
     assert b"pdfuaid" in pdf or reader.xmp_metadata is not None

@@ -4,9 +4,10 @@ from typing import Any
 import pytest
 
 from alice_survey.base.artefacts import write_json
+from alice_survey.kit.document import Verdict
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
-from alice_survey.report.verdicts import Verdict, facts, summary, verdicts
+from alice_survey.report.verdicts import facts, summary, verdicts
 from tests.alice_survey.report.tiny import tiny_workspace
 
 

@@ -124,11 +124,15 @@ def test_the_rig_as_built_is_near_its_drawing_but_not_on_it() -> None:
         design = drawn.cameras[name]
         assert 0.0 < abs(camera.fx_px / design.fx_px - 1.0) < 0.0031
         assert 0.0 < abs(camera.cx_px - design.cx_px) <= 2.6  # 10 px at full resolution
-        assert 0.0 < abs(camera.port.port_distance_m - design.port.port_distance_m) < 0.00101
         assert (
-            0.0 < np.rad2deg(np.arccos(camera.port.normal[2])) < 0.43
+            0.0
+            < abs(camera.parameter("port_distance_m") - design.parameter("port_distance_m"))
+            < 0.00101
+        )
+        assert (
+            0.0 < np.rad2deg(np.arccos(camera.port.axis_cam[2])) < 0.43
         )  # 0.3 degrees about each axis
-        assert -0.06 < camera.lens.k1 < -0.04
+        assert -0.06 < camera.parameter("k1") < -0.04
     turn = built.cam_from_rig["right"].rotation.magnitude()
     assert 0.0 < np.rad2deg(turn) < 0.53  # 0.3 degrees about each axis
     assert 0.0 < abs(built.baseline_m - drawn.baseline_m) < 0.0003

@@ -18,6 +18,7 @@ from alice_survey.base.executor import SERIAL, local_executor
 from alice_survey.base.frames import interpolate_poses, rotation_from_attitude
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.trajectory import Trajectory, read_track, write_track
+from alice_survey.seafloor.renderer import render
 from alice_survey.seafloor.terrain import read_terrain
 from alice_survey.stages import spec
 from camera_calib.rig import read_rig
@@ -183,13 +184,13 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     survey: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fly(tmp_path)
-    real, taken = imaging.render, []
+    taken: list[Any] = []
 
     def dies_at_the_fourth(*args: Any) -> Any:
         if len(taken) == 3:
             raise KeyboardInterrupt
         taken.append(args)
-        return real(*args)
+        return render(*args)
 
     monkeypatch.setattr(imaging, "render", dies_at_the_fourth)
     with pytest.raises(KeyboardInterrupt):
@@ -200,7 +201,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     before = {path.relative_to(path.parents[1]): path.stat().st_mtime_ns for path in left}
 
     again: list[Any] = []
-    monkeypatch.setattr(imaging, "render", lambda *args: again.append(args) or real(*args))
+    monkeypatch.setattr(imaging, "render", lambda *args: again.append(args) or render(*args))
     assert spec("image").make(tmp_path, settings(range_maps=True), SERIAL)
     assert len(again) == 3
     kept = {path: (tmp_path / "images" / path).stat().st_mtime_ns for path in before}

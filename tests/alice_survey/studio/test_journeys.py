@@ -126,7 +126,9 @@ def pictures_with(page: Any, truth: Truth, places: list[Point]) -> PicturePage:
     pictures = PicturePage(page=page, size_px=(camera.width_px, camera.height_px))
     page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
     for number, place in enumerate(places):
-        image, pixel = truth.nearest(place)
+        found = truth.nearest(place)
+        assert found is not None
+        image, pixel = found
         view = pictures.opened(image, *(pixel - 0.5))
         marked = pictures.moved_to(view, *(pixel - 0.5))
         np.testing.assert_allclose(marked, pixel - 0.5, atol=0.06)

@@ -166,7 +166,9 @@ def test_stations_around_a_spot_are_known_as_the_model_states(workspace: Path) -
 def test_a_picture_without_the_spot_is_refused(server: Server, workspace: Path) -> None:
     truth = Truth(workspace)
     place = truth.places(np.random.default_rng(8), 1)[0]
-    image, pixel = truth.nearest(place)
+    found = truth.nearest(place)
+    assert found is not None
+    image, pixel = found
     x, y = pixel - 0.5
     seen = asked(server, "/api/pictures/seeing", image=image, x=x, y=y)
     names = [one["name"] for one in seen["pictures"] if one["name"] != image]

@@ -43,7 +43,9 @@ def ratios_of_picked_pairs(workspace: Path, pairs: int, seed: int) -> np.ndarray
         pictures = PicturePage(page=page, size_px=(564, 451))
         spots: dict[str, np.ndarray] = {}
         for place in places[: 6 + pairs // 5]:
-            image, pixel = truth.nearest(place)
+            found = truth.nearest(place)
+            assert found is not None
+            image, pixel = found
             view = pictures.opened(image, *(pixel - 0.5))
             pictures.moved_to(view, *(pixel - 0.5 + rng.normal(0, MARK_PX, 2)))
             if len(spots) % 2:

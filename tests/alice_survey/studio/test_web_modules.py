@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ import alice_survey.studio
 from tests.alice_survey.kit.node import run_modules
 
 WEB = Path(alice_survey.studio.__file__).with_name("web")
-SQUARE = {"outer": [[0, 0], [10, 0], [10, 8], [0, 8]], "holes": [[[2, 2], [4, 2], [4, 4], [2, 4]]]}
+SQUARE: dict[str, Any] = {
+    "outer": [[0, 0], [10, 0], [10, 8], [0, 8]],
+    "holes": [[[2, 2], [4, 2], [4, 4], [2, 4]]],
+}
 LINE = [[0.0, 0.0], [3.0, 4.0], [3.0, 10.0]]
 SHAPES = {"survey": [SQUARE], "no_go": [], "allowed": [], "corridors": [LINE]}
 OUTER = {"kind": "survey", "index": 0, "ring": 0}
@@ -377,7 +381,7 @@ def test_words_of_figures(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def annotation(kind: str, points: list[list[float]], **more: Any) -> dict[str, Any]:
+def annotation(kind: str, points: Sequence[Sequence[float]], **more: Any) -> dict[str, Any]:
     return {"id": "a", "shape": {"kind": kind, "points": points, "holes": [], **more}}
 
 

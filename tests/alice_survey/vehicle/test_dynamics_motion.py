@@ -137,9 +137,8 @@ def test_coasting_down_follows_the_hyperbola(axis: int, name: str) -> None:
 def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str) -> None:
     """Omega^2 = W BG (M^-1)_ii: with M^-1, as the body is free to sway and surge meanwhile."""
     vehicle = alice(coefficients)
-    start = np.zeros(3)
-    start[axis] = 1e-4
-    states = advance(vehicle, state_of(vehicle, attitude_rad=tuple(start)), 30.0, 0.01)
+    attitude = (1e-4, 0.0, 0.0) if axis == 0 else (0.0, 1e-4, 0.0)
+    states = advance(vehicle, state_of(vehicle, attitude_rad=attitude), 30.0, 0.01)
     angle = attitudes(states)[:, axis]
     time_s = np.arange(len(angle)) * 0.01
     down = np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
@@ -181,7 +180,7 @@ def test_a_vehicle_at_rest_takes_on_a_current_as_it_coasts_down() -> None:
     vehicle = block({"Y_vv": -200.0, "Y_vdot": -70.0})
     current = constant_current(0.4, 90.0)
     states = advance(vehicle, state_of(vehicle, -0.4 * V), 60.0, 0.02, current=current)
-    times = np.arange(len(states)) * 0.02
+    times = np.arange(len(states), dtype=float) * 0.02
     over_ground = ground_velocity(states[::100], times[::100], current)
     lagging = 0.4 / (1.0 + 200.0 * 0.4 * times[::100] / 120.0)
     np.testing.assert_allclose(over_ground[:, 1], 0.4 - lagging, atol=1e-9)

@@ -59,6 +59,11 @@ def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
     np.testing.assert_allclose(lift, -lift[::-1], atol=1e-12)
 
 
+def _triple(place: Array) -> tuple[float, float, float]:
+    x, y, z = place.tolist()
+    return x, y, z
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     nu=st.tuples(*[SPEEDS] * 6),
@@ -73,8 +78,8 @@ def test_the_wrench_is_that_of_vectors_in_space(
     fins = tuple(
         replace(
             fin,
-            shaft_body=tuple(turned.apply(fin.shaft_body).tolist()),
-            positions_body_m=tuple(map(tuple, turned.apply(fin.positions_body_m).tolist())),
+            shaft_body=_triple(turned.apply(fin.shaft_body)),
+            positions_body_m=tuple(map(_triple, turned.apply(fin.positions_body_m))),
             profile_drag=0.01,
         )
         for fin in REMUS.fins

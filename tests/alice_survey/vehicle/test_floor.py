@@ -68,7 +68,7 @@ def test_range_along_a_beam_to_a_slope(
     beam = unit(np.array([*lean, 1.0]))
     gaining = beam[2] - slopes[0] * beam[0] - slopes[1] * beam[1]
     expected = altitude / gaining
-    found = floor_range(floor, north, east, depth, *beam, 30.0)
+    found = floor_range(floor, north, east, depth, beam[0], beam[1], beam[2], 30.0)
     if expected < 29.9:
         assert found == pytest.approx(expected, abs=1e-6)
     elif expected > 30.1:
@@ -96,7 +96,7 @@ def test_a_beam_ends_on_the_near_side_of_a_ridge() -> None:
     beam = unit(np.array([1.0, 0.0, 1.0 / 40.0]))
     meets = (18.0 - 9.0 + 2.0 / 40.0) / (1.0 + 1.0 / 40.0)
     expected = (meets - 2.0) / beam[0]
-    found = floor_range(floor, 2.0, 0.5, 9.0, *beam, 60.0)
+    found = floor_range(floor, 2.0, 0.5, 9.0, beam[0], beam[1], beam[2], 60.0)
     assert found == pytest.approx(expected, abs=1e-6)
-    beyond = floor_range(level_floor(10.0), 2.0, 0.5, 9.0, *beam, 60.0)
+    beyond = floor_range(level_floor(10.0), 2.0, 0.5, 9.0, beam[0], beam[1], beam[2], 60.0)
     assert beyond == pytest.approx(1.0 / beam[2], abs=1e-6)

@@ -1,10 +1,13 @@
 """Colours through a flat port: the design figures, and a rendered pattern made to fit again."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.ndimage import shift as shift_picture
 
 from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
@@ -26,8 +29,8 @@ ALICE = flat_port_camera(
     width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,
     port_distance_m=0.02, glass_thickness_m=0.01, n_water=1.3419,
 )  # fmt: skip
-LEVANT = {"temperature_c": 24.0, "salinity_psu": 39.0, "depth_m": 15.0}
-SEA = {"temperature_c": 20.0, "salinity_psu": 35.0, "depth_m": 10.0}
+LEVANT: dict[str, Any] = {"temperature_c": 24.0, "salinity_psu": 39.0, "depth_m": 15.0}
+SEA: dict[str, Any] = {"temperature_c": 20.0, "salinity_psu": 35.0, "depth_m": 10.0}
 RANGE_M = 2.0
 
 
@@ -60,7 +63,7 @@ def misregistration_px(picture: np.ndarray, channel: int, size: int = 96) -> np.
             window = np.s_[top : top + size, left : left + size]
             inner = np.s_[8:-8, 8:-8]
             patch, moved = green[window], np.zeros(2)
-            slope = np.stack(np.gradient(patch)[::-1], axis=-1)[inner].reshape(-1, 2)
+            slope = np.stack([*np.gradient(patch)][::-1], axis=-1)[inner].reshape(-1, 2)
             for _ in range(12):
                 back = shift_picture(other[window], -moved[::-1], order=5, mode="nearest")
                 step = np.linalg.lstsq(-slope, (back - patch)[inner].ravel(), rcond=None)[0]
@@ -101,7 +104,9 @@ def test_green_keeps_what_was_calibrated() -> None:
     water, port = n_water(20, 35, 10, [620, 540, 450]), n_glass("pmma", [620, 540, 450])
     assert cameras["blue"].n_water - 1.337 == pytest.approx(water[2] - water[1], abs=1e-15)
     assert cameras["red"].n_water - 1.337 == pytest.approx(water[0] - water[1], abs=1e-15)
-    assert cameras["blue"].port.n_glass - 1.49 == pytest.approx(port[2] - port[1], abs=1e-15)
+    assert cameras["blue"].parameter("n_glass") - 1.49 == pytest.approx(
+        port[2] - port[1], abs=1e-15
+    )
     assert changed(cameras["blue"], n_water=1.337, n_glass=1.49) == camera
 
 
@@ -128,7 +133,9 @@ def test_maps_are_exact_between_their_nodes() -> None:
     at = rng.integers([0, 0], [camera.width_px, camera.height_px], (2000, 2))
 
     for name, (x, y) in maps.items():
-        exact = cameras[name].project(cameras["green"].at_depth(at + 0.5, RANGE_M)) - 0.5
+        exact = (
+            cameras[name].project(cameras["green"].at_depth(at.astype(float) + 0.5, RANGE_M)) - 0.5
+        )
         got = np.stack([x[at[:, 1], at[:, 0]], y[at[:, 1], at[:, 0]]], axis=-1)
         # Single precision holds 1.2e-4 at 3000 px.
         np.testing.assert_allclose(got, exact, atol=4e-4)
@@ -142,7 +149,7 @@ def test_a_rendered_pattern_fits_again(dtype: type[np.uint8] | type[np.uint16]) 
     camera = changed(ALICE, port_distance_m=0.05, glass_thickness_m=0.015, normal=tilted).reduced(4)
     cameras = channel_cameras(camera, **LEVANT)
     full = np.iinfo(dtype).max
-    picture = np.round(render(cameras, RANGE_M) * full).astype(dtype)
+    picture: NDArray[Any] = np.round(render(cameras, RANGE_M) * full).astype(dtype)
 
     corrected = undisperse(picture, channel_maps(cameras, RANGE_M))
 

@@ -67,5 +67,5 @@ def test_each_fault_is_one_line(tmp_path: Path) -> None:
         {"plot": tmp_path / "plot.bmp"},
     ):
         with pytest.raises(AliceError) as error:
-            residual_report(1.5, 2.5, **options)  # type: ignore[arg-type]
+            residual_report(1.5, 2.5, **options)
         assert "\n" not in str(error.value)

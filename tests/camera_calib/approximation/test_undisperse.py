@@ -15,7 +15,7 @@ from camera_calib.approximation.dispersion import channel_cameras, channel_maps,
 from camera_calib.approximation.undisperse import undisperse_files
 from camera_calib.rig import design_rig, write_rig
 
-SEA = {"temperature_c": 20.0, "salinity_psu": 35.0, "depth_m": 10.0}
+SEA: dict[str, Any] = {"temperature_c": 20.0, "salinity_psu": 35.0, "depth_m": 10.0}
 RIG = design_rig(CameraConfig(), WaterConfig(), scale=8)
 LEFT = RIG.cameras["left"]
 
@@ -132,7 +132,7 @@ def test_each_fault_is_one_line(tmp_path: Path, rig_path: Path) -> None:
     for pictures, folder, changes, words in cases:
         with pytest.raises(AliceError) as error:
             undisperse_files(
-                pictures, folder, **({"rig": rig_path, "range_m": 2.0} | SEA | changes)
+                pictures, folder, **{"rig": rig_path, "range_m": 2.0, **SEA, **changes}
             )
         assert words in str(error.value)
         assert "\n" not in str(error.value)

@@ -71,8 +71,8 @@ def shoot(folder: Path) -> None:
 def test_a_board_taken_as_flat_gives_another_focal_length(tmp_path: Path) -> None:
     """The table in docs/cameras.md; both calibrations are of the same pictures."""
     shoot(tmp_path / "pictures")
-    off, sigma, rms_px, kinds = {}, {}, {}, ("flat", "sheet")
-    kind: ShapeKind
+    off, sigma, rms_px = {}, {}, {}
+    kinds: tuple[ShapeKind, ...] = ("flat", "sheet")
     for kind in kinds:
         options = CalibrateOptions(
             pictures=str(tmp_path / "pictures"), target=TARGET.description, target_shape=kind,

@@ -15,6 +15,7 @@ from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.base.executor import SERIAL
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
 from camera_calib.calibrate import from_pictures
+from camera_calib.calibrate.by_options import calibrated
 from camera_calib.calibrate.detect_views import detect_views
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
@@ -67,7 +68,7 @@ def wet(truth: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def both(folder: Path) -> dict[str, str]:
+def both(folder: Path) -> dict[str, Any]:
     return {"left": str(folder / "left"), "right": str(folder / "right")}
 
 
@@ -78,7 +79,7 @@ POOL_BOARD = "chessboard 11x8 40mm"
 def real(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Any]:
     """13 pairs of OpenCV's samples, calibrated: the folder, the text and the numbers."""
     folder, out = shared_data / "opencv_stereo", tmp_path_factory.mktemp("real") / "out"
-    pictures = {side: str(folder / f"{side}*.jpg") for side in ("left", "right")}
+    pictures: dict[str, Any] = {side: str(folder / f"{side}*.jpg") for side in ("left", "right")}
     settings = CalibrateOptions(**pictures, target=BOARD)
     return out, *calibrate_pictures(replace(settings, output=out), executor=SERIAL)
 
@@ -163,8 +164,10 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
     for name, camera in rig.cameras.items():
         true = truth.cameras[name]
         assert camera.n_water == 1.34
-        assert camera.port.port_distance_m == pytest.approx(true.port.port_distance_m, abs=2e-3)
-        assert np.arccos(np.dot(camera.port.normal, true.port.normal)) < np.deg2rad(0.2)
+        assert camera.parameter("port_distance_m") == pytest.approx(
+            true.parameter("port_distance_m"), abs=2e-3
+        )
+        assert np.arccos(np.dot(camera.port.axis_cam, true.port.axis_cam)) < np.deg2rad(0.2)
         assert camera.fx_px == pytest.approx(true.fx_px, abs=0.3)
     assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5e-5)
 
@@ -382,7 +385,6 @@ def test_a_camera_of_which_most_pictures_do_not_fit_is_no_calibration(
         ]
         return replace(found, views=tuple(few))
 
-    calibrated = from_pictures.calibrated
     monkeypatch.setattr(from_pictures, "calibrated", with_few)
     settings = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="k2")
     with pytest.raises(CalibrationError, match="only 5 of 12 pictures of right") as caught:

@@ -8,11 +8,11 @@ import pytest
 
 from alice_survey.base.errors import CalibrationError
 from camera_calib.calibrate.by_options import calibrated
+from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.housing import housing_lines
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibrate.text import calibration_text
-from camera_calib.calibration import TargetView
 from camera_calib.judge.judgement import judge
 from camera_calib.judge.verdicts import verdicts
 from camera_calib.ports.dome import DomePort
@@ -29,23 +29,13 @@ from tests.camera_calib.calibration_scenes import (
 )
 
 TRUTH = built_rig()
+TARGET = parse_target("chessboard 11x8 30mm")
 SIZES = {name: (camera.width_px, camera.height_px) for name, camera in TRUTH.cameras.items()}
 NOISE_PX = 0.1
 
 FLAT = FlatPort(port_distance_m=0.025, glass_thickness_m=0.006, n_glass=1.49)
 CENTRED = DomePort(outer_radius_m=0.08, glass_thickness_m=0.006)
 OFF = replace(CENTRED, dome_x_m=0.002, dome_z_m=0.006)
-
-
-class Seen:
-    """Views as `detect_views` gives them."""
-
-    def __init__(self, views: list[TargetView]) -> None:
-        self.views, self.sizes = tuple(views), SIZES
-
-
-class Board:
-    points, is_ambiguous = BOARD, False
 
 
 @cache
@@ -57,10 +47,11 @@ def dry() -> Rig:
     ).rig
 
 
-def through(port: PortValues) -> Seen:
+def through(port: PortValues) -> Detections:
     rng = np.random.default_rng(5)
     wet = replace(TRUTH, cameras={n: replace(c, port=port) for n, c in TRUTH.cameras.items()})
-    return Seen(views_of(wet, board_poses(wet, 10, rng), NOISE_PX, rng))
+    views = views_of(wet, board_poses(wet, 10, rng), NOISE_PX, rng)
+    return Detections(views=tuple(views), sizes=SIZES, rejections=())
 
 
 @pytest.mark.parametrize(
@@ -68,7 +59,7 @@ def through(port: PortValues) -> Seen:
 )
 def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> None:
     settings = CalibrateOptions(water=True, port="auto", glass_mm="6")
-    found = calibrated(settings, through(port), Board(), dry())
+    found = calibrated(settings, through(port), TARGET, dry())
     assert found.housing.chosen == chosen
     for value in found.housing.focal_ratios.values():
         assert value == pytest.approx(ratio, abs=0.01)
@@ -90,7 +81,7 @@ def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> No
 def test_a_dome_taken_for_a_flat_port_is_bad() -> None:
     settings = CalibrateOptions(water=True, glass_mm="6")
     try:
-        found = calibrated(settings, through(CENTRED), Board(), dry())
+        found = calibrated(settings, through(CENTRED), TARGET, dry())
     except CalibrationError as error:
         assert "--port dome" in str(error)
     else:
@@ -100,17 +91,17 @@ def test_a_dome_taken_for_a_flat_port_is_bad() -> None:
 
 def test_a_flat_port_taken_for_a_dome_is_bad() -> None:
     settings = CalibrateOptions(water=True, port="none")
-    found = calibrated(settings, through(FLAT), Board(), dry())
+    found = calibrated(settings, through(FLAT), TARGET, dry())
     said = [v.text for v in verdicts(judge(found, None)) if v.level == "bad"]
     assert any("--port flat" in text for text in said)
 
 
 def test_a_dome_off_its_centre_taken_for_none_contradicts_the_calibration_in_air() -> None:
     settings = CalibrateOptions(water=True, port="none")
-    found = calibrated(settings, through(OFF), Board(), dry())
+    found = calibrated(settings, through(OFF), TARGET, dry())
     said = [v for v in verdicts(judge(found, None)) if "from its prior" in v.text]
     assert [v.level for v in said] == ["bad"]
     right = calibrated(replace(settings, port="dome", glass_mm="6", dome_radius_mm="80"),
-                       through(OFF), Board(), dry())  # fmt: skip
+                       through(OFF), TARGET, dry())  # fmt: skip
     said = [v for v in verdicts(judge(right, None)) if "from its prior" in v.text]
     assert [v.level for v in said] == ["good"]

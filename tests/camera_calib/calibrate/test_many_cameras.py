@@ -42,10 +42,10 @@ def four_cameras() -> Rig:
         "bow": camera(480, 640, 560.0, 0.04),
         "side": camera(720, 540, 540.0, -0.12),
     }
-    turns = {
+    turns: dict[str, list[float]] = {
         "left": [0, 0, 0], "right": [1.0, -2.0, 0.5], "bow": [30, 2, 88], "side": [-3, 35, -4],
     }  # fmt: skip
-    places = {
+    places: dict[str, list[float]] = {
         "left": [0, 0, 0], "right": [0.18, 0.01, 0.0], "bow": [0.05, -0.35, 0.03],
         "side": [-0.4, 0.02, 0.05],
     }  # fmt: skip

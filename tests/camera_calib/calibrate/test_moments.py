@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -186,7 +187,7 @@ def test_videos_without_a_common_trigger_calibrate(tmp_path: Path) -> None:
 
 def test_clocks_need_two_cameras_and_one_numbering(tmp_path: Path) -> None:
     for pictures, target in (({"pictures": "a"}, "9x6"), ({"left": "a", "right": "b"}, "8x6")):
-        places = {}
+        places: dict[str, Any] = {}
         for option, folder in pictures.items():
             (tmp_path / folder).mkdir(exist_ok=True)
             (tmp_path / folder / "1.png").write_bytes(folder.encode())

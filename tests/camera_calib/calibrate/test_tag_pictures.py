@@ -175,7 +175,7 @@ def test_tag_pictures_calibrate_to_their_bound(
         folder = tmp_path / f"out{trial}"
         found = read_rig(folder / "rig.json")
         off = corner_errors(folder / "corners.csv", truth, poses)
-        used = np.isfinite(off).all(axis=-1)
+        used = np.all(np.isfinite(off), axis=-1)
         noise_px = float(np.sqrt(np.nanmean(off**2)))
         bound = cramer_rao(
             truth, TARGET.points, RigidTransform.concatenate(poses), used, freedom, noise_px,

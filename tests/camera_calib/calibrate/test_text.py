@@ -37,7 +37,7 @@ def with_port(normal: tuple[float, float, float], covariance: list[list[float]])
 def test_the_sigma_of_a_tilt_is_the_spread_of_drawn_tilts() -> None:
     covariance = [[4e-6, 1e-6], [1e-6, 1e-6]]
     rig = with_port(tilted(2.0, -3.0), covariance)
-    mean = rig.cameras["left"].port.normal[:2]
+    mean = rig.cameras["left"].port.axis_cam[:2]
     drawn = np.random.default_rng(4).multivariate_normal(mean, covariance, 20_000)
 
     tilt_deg, sigma_deg = port_tilt_deg(rig, "left")

@@ -179,7 +179,12 @@ def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
     assert "3, 7" in fault(path)
     rig = read_colmap(path, ReadOptions(camera="3"))
     (camera,) = rig.cameras.values()
-    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.lens.k1) == (500, 500, 320, -0.1)
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.parameter("k1")) == (
+        500,
+        500,
+        320,
+        -0.1,
+    )
     assert camera.n_water == 1.0
 
 
@@ -258,7 +263,7 @@ def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text("1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1.25 1.5 1.5\n")
     camera = read_colmap(path, ReadOptions()).cameras["1"]
-    assert (camera.port.n_glass, camera.n_water) == (1.2, 1.2)
+    assert (camera.parameter("n_glass"), camera.n_water) == (1.2, 1.2)
 
 
 def test_a_domeport_bends_light_as_the_forks_code_does(tmp_path: Path) -> None:
@@ -295,8 +300,8 @@ def test_a_domeport_bends_light_as_the_forks_code_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(directions, rays, atol=1e-13)
     for target in ("text", "binary/cameras.bin"):
         write_refractive(tmp_path / target, read_colmap(path, ReadOptions()))
-        (after,) = read_colmap(tmp_path / target, ReadOptions()).cameras.values()
-        np.testing.assert_allclose(after.port.values, camera.port.values, rtol=1e-15)
+        (written,) = read_colmap(tmp_path / target, ReadOptions()).cameras.values()
+        np.testing.assert_allclose(written.port.values, camera.port.values, rtol=1e-15)
 
 
 def test_faults_name_file_and_line(tmp_path: Path) -> None:

@@ -262,7 +262,7 @@ def test_a_camera_in_air_fits_itself(tmp_path: Path) -> None:
 
 def test_a_port_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
     FORMATS["kalibr"].write(tmp_path / "c.yaml", IN_AIR)
-    options = {"port_distance_mm": 20.0, "glass_mm": 10.0}
+    options: dict[str, Any] = {"port_distance_mm": 20.0, "glass_mm": 10.0}
     shown = refused(tmp_path / "c.yaml", tmp_path / "rig.json", **options)
     assert "--n-water" in shown
     convert_files(tmp_path / "c.yaml", tmp_path / "rig.json", n_water=1.34, **options)

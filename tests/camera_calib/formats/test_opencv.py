@@ -94,8 +94,11 @@ def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> 
     assert (camera.width_px, camera.height_px) == (640, 480)
     assert camera.fx_px == camera.fy_px == 535.91573396163199
     assert camera.cx_px == pytest.approx(342.28315473308373 + 0.5, abs=1e-12)
-    assert (camera.lens.k1, camera.lens.k3) == (-0.26637260909660682, 0.23839153080878486)
-    assert (camera.lens.k4, camera.lens.s1, camera.n_water) == (0.0, 0.0, 1.0)
+    assert (camera.parameter("k1"), camera.parameter("k3")) == (
+        -0.26637260909660682,
+        0.23839153080878486,
+    )
+    assert (camera.parameter("k4"), camera.parameter("s1"), camera.n_water) == (0.0, 0.0, 1.0)
 
 
 def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_path: Path) -> None:
@@ -115,7 +118,7 @@ def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_
     )
     assert rig.baseline_m == pytest.approx(3.33 * 0.025, abs=1e-15)
     assert list(rig.cameras) == ["left", "right"]
-    assert rig.cameras["right"].lens.k1 == -0.16916358306948096
+    assert rig.cameras["right"].parameter("k1") == -0.16916358306948096
 
 
 def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
@@ -131,7 +134,12 @@ def test_other_common_keys_are_understood(tmp_path: Path, matrix: str, k: str) -
     text = GOOD.replace("camera_matrix", matrix) + f"{k}: [ -0.1, 0.02, 0.001, -0.002 ]\n"
     (camera,) = read_opencv(write(tmp_path / "a.yml", text), ReadOptions()).cameras.values()
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (530, 531, 320, 240)
-    assert (camera.lens.k1, camera.lens.k2, camera.lens.p1, camera.lens.p2) == (
+    assert (
+        camera.parameter("k1"),
+        camera.parameter("k2"),
+        camera.parameter("p1"),
+        camera.parameter("p2"),
+    ) == (
         -0.1,
         0.02,
         0.001,
@@ -163,7 +171,7 @@ def test_a_tilted_sensor_is_refused_and_a_level_one_read(tmp_path: Path) -> None
     coefficients = "distortion_coefficients: [" + ", ".join(["0.001"] * 12)
     level = write(tmp_path / "a.yml", GOOD + coefficients + ", 0., 0. ]\n")
     (camera,) = read_opencv(level, ReadOptions()).cameras.values()
-    assert (camera.lens.k6, camera.lens.s4) == (0.001, 0.001)
+    assert (camera.parameter("k6"), camera.parameter("s4")) == (0.001, 0.001)
     shown = fault(tmp_path / "b.yml", GOOD + coefficients + ", 0.01, 0. ]\n")
     assert "distortion_coefficients" in shown
 

@@ -158,7 +158,12 @@ def test_the_sample_of_the_wiki_is_read(tmp_path: Path) -> None:
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (
         4827.94, 4835.62, 1224.0, 1025.0,
     )  # fmt: skip
-    assert (camera.lens.k1, camera.lens.k2, camera.lens.p1, camera.lens.p2) == (
+    assert (
+        camera.parameter("k1"),
+        camera.parameter("k2"),
+        camera.parameter("p1"),
+        camera.parameter("p2"),
+    ) == (
         -0.41527,
         0.31874,
         -0.00197,
@@ -181,7 +186,7 @@ def test_half_a_pair_says_that_the_other_half_is_left_out(
 ) -> None:
     write_ros(tmp_path / "pair", PAIR)
     rig = read_ros(tmp_path / "pair" / "right.yaml", ReadOptions())
-    assert rig.cameras["right"].lens.k1 == -0.1
+    assert rig.cameras["right"].parameter("k1") == -0.1
     assert "baseline" in capsys.readouterr().err
 
 

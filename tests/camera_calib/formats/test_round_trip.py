@@ -85,8 +85,8 @@ def test_opencv_holds_all_that_a_rig_has(rig: Rig, seed: int) -> None:
         after = read_rig(back)
 
     for name, camera in full.cameras.items():
-        assert after.cameras[name].port.normal == camera.port.normal
-        assert after.cameras[name].port.n_glass == camera.port.n_glass
+        assert after.cameras[name].port.axis_cam == camera.port.axis_cam
+        assert after.cameras[name].parameter("n_glass") == camera.parameter("n_glass")
         np.testing.assert_allclose(
             after.body_from_cam(name).as_matrix(), full.body_from_cam(name).as_matrix(), atol=1e-14
         )

@@ -83,7 +83,7 @@ def test_line_images_are_where_neighbouring_rays_meet(
         sine = math.sin(angle)
         return (
             port_m * math.tan(angle)
-            + glass_m * math.tan(math.asin(sine / camera.port.n_glass))
+            + glass_m * math.tan(math.asin(sine / camera.parameter("n_glass")))
             + altitude_m * math.tan(math.asin(sine / n_water))
         )
 

@@ -154,7 +154,7 @@ def test_depth_precision_is_the_scatter_of_triangulated_points(
 ) -> None:
     rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
     row = rig_fov_table(rig, [altitude_m], PORT)[0]
-    floor_z = 0.03 * rig.cameras["left"].port.normal[2] + altitude_m
+    floor_z = 0.03 * rig.cameras["left"].port.axis_cam[2] + altitude_m
     scatter_m = triangulated_depth_sigma_m(
         rig, floor_z, MATCH_SIGMA_PX, 20_000, np.random.default_rng(4)
     )
@@ -183,7 +183,7 @@ def test_a_focused_point_is_sharp_where_its_rays_seem_to_come_from() -> None:
 def test_overlap_is_the_share_of_random_spots_that_both_cameras_see(kind: str) -> None:
     rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
     first, second = rig.cameras["left"], rig.cameras["right"]
-    floor_z = 0.03 * first.port.normal[2] + 1.0
+    floor_z = 0.03 * first.port.axis_cam[2] + 1.0
     rng = np.random.default_rng(7)
     spots = np.column_stack([rng.uniform(-0.6, 0.6, (60_000, 2)), np.full(60_000, floor_z)])
 
@@ -226,7 +226,7 @@ def test_a_calibrated_rig_is_seen_with_its_distortion_and_tilt() -> None:
     assert abs(row.horizontal_m / straight.horizontal_m - 1) > 0.01
 
     ends = np.array([[0.0, 1355.0], [3384.0, 1355.0]])
-    spots = camera.at_depth(ends, 0.03 * camera.port.normal[2] + 2.0)
+    spots = camera.at_depth(ends, 0.03 * camera.port.axis_cam[2] + 2.0)
     assert row.horizontal_m == pytest.approx(float(np.linalg.norm(spots[1] - spots[0])))
     for end, spot in zip(ends, spots, strict=True):
         np.testing.assert_allclose(project_by_shortest_path(camera, spot), end, atol=1e-5)

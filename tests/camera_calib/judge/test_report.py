@@ -150,7 +150,7 @@ def test_the_json_holds_the_numbers_of_the_page(folder: Path, page: Page) -> Non
     assert port["sigma"] == pytest.approx(1e3 * found.rig.sigmas["right.port_distance_m"])
     tilt = by_name["right.normal_x"]
     assert tilt["unit"] == "deg"
-    sine = found.rig.cameras["right"].port.normal[0]
+    sine = found.rig.cameras["right"].port.axis_cam[0]
     assert tilt["value"] == pytest.approx(np.degrees(np.arcsin(sine)), rel=1e-6)
     assert by_name["left.n_water"]["sigma"] is None
     assert [s["range_m"] for s in data["stereo"]] == pytest.approx(

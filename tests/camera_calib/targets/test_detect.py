@@ -2,6 +2,7 @@
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,6 +54,7 @@ def test_points_are_found_to_a_hundredth_of_a_pixel(text: str) -> None:
         target, picture, true = view(text, turn)
         found = detect_with_reasons(target, picture)
         off.append(misses(found, true))
+        assert found.sigma_px is not None
         sigmas.append(found.sigma_px[np.isfinite(found.sigma_px)])
         count += len(target.points)
 
@@ -106,6 +108,7 @@ def test_parts_of_boards_with_markers_are_found(text: str) -> None:
         assert 0.3 * len(true) < len(off) < 0.9 * len(true)
         assert np.abs(off).max() < 0.1
         # Nothing is found where there is nothing.
+        assert found.pixels is not None
         seen = true[np.isfinite(found.pixels).all(axis=1)]
         assert np.all((seen[:, 0] < shown.shape[1]) & ~((shown is hidden) & (seen > [x, y]).all(1)))
 
@@ -121,6 +124,7 @@ def test_a_chessboard_with_hidden_corners_is_found_by_its_outer_rows() -> None:
     assert 40 <= len(off) < 54
     assert np.abs(off).max() < 0.3  # a corner at the very edge of what hides its neighbours
     assert np.median(np.abs(off)) < 0.01
+    assert found.pixels is not None
     assert np.isnan(found.pixels[3 * 9 + 4]).all()
 
 
@@ -185,7 +189,10 @@ def test_pictures_without_the_target_are_refused_with_a_reason(text: str, name: 
 
 def test_pictures_of_other_kinds_are_faults() -> None:
     target = parse_target(KINDS[0])
-    for wrong in (np.zeros((20, 20)), np.zeros((20, 20, 2), np.uint8), np.zeros((0, 5), np.uint8)):
+    pictures: list[Any] = [
+        np.zeros((20, 20)), np.zeros((20, 20, 2), np.uint8), np.zeros((0, 5), np.uint8)
+    ]  # fmt: skip
+    for wrong in pictures:
         with pytest.raises(CalibrationError):
             detect(target, wrong)
 

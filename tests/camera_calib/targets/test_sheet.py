@@ -3,6 +3,7 @@
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +48,8 @@ def read_pdf(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
 
     words = page.extract_text(visitor_operand_before=visit).strip()
     assert np.allclose(at, [1, 0, 0, 1, 0, 0])
-    assert page["/Resources"]["/Font"]["/F1"]["/BaseFont"] == "/Helvetica"
+    resources: Any = page["/Resources"]
+    assert resources["/Font"]["/F1"]["/BaseFont"] == "/Helvetica"
     width, height = float(page.mediabox.width), float(page.mediabox.height)
     x, y, w, h = np.array(rectangles).T
     boxes = np.column_stack([x, height - y - h, x + w, height - y]) * MM_PER_POINT
@@ -57,12 +59,12 @@ def read_pdf(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
 def read_svg(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
     root = ET.parse(path).getroot()  # noqa: S314, our own file
     space = {"s": "http://www.w3.org/2000/svg"}
-    page = tuple(float(root.attrib[side].removesuffix("mm")) for side in ("width", "height"))
-    assert [float(v) for v in root.attrib["viewBox"].split()] == [0, 0, *page]
+    width, height = (float(root.attrib[side].removesuffix("mm")) for side in ("width", "height"))
+    assert [float(v) for v in root.attrib["viewBox"].split()] == [0, 0, width, height]
     path_data = root.find("s:path", space).attrib["d"]
     boxes = re.findall(r"M([\d.]+) ([\d.]+)H([\d.]+)V([\d.]+)H\1Z", path_data)
     assert "".join(f"M{a} {b}H{c}V{d}H{a}Z" for a, b, c, d in boxes) == path_data
-    return np.array(boxes, dtype=float), page, root.find("s:text", space).text
+    return np.array(boxes, dtype=float), (width, height), root.findtext("s:text", "", space)
 
 
 def check_scale(target: Target, picture: np.ndarray, dpi: float, within_m: float) -> None:
@@ -145,7 +147,7 @@ def test_boards_lie_or_stand_on_paper_and_stay_on_it(paper: str) -> None:
 def test_what_does_not_fit_is_shown_with_what_would(text: str) -> None:
     with pytest.raises(CalibrationError, match="A4") as caught:
         lay_out(parse_target(text), "A4")
-    fitting = re.search(r"'([^']*)'$", str(caught.value))[1]
+    (fitting,) = re.findall(r"'([^']*)'$", str(caught.value))
     lay_out(parse_target(fitting), "A4")
     larger = re.sub(
         r"(\d+x\d+) ([\d.]+)mm", lambda m: f"{m[1]} {float(m[2]) + 0.2:.4g}mm", fitting, count=1

@@ -126,7 +126,9 @@ def test_wrong_files_give_one_clear_line(change: dict[str, object], tmp_path: Pa
 def test_points_run_right_then_down_from_the_first_inner_corner() -> None:
     points = parse_target("chessboard 9x6 25mm").points
     assert points.shape == (54, 3)
-    np.testing.assert_allclose(points[[0, 1, 9]], [[0, 0, 0], [0.025, 0, 0], [0, 0.025, 0]])
+    np.testing.assert_allclose(
+        points[[0, 1, 9]], [[0.0, 0.0, 0.0], [0.025, 0.0, 0.0], [0.0, 0.025, 0.0]]
+    )
 
 
 @pytest.mark.parametrize("text", [k for k in KINDS if k.startswith("charuco")])

@@ -1,7 +1,7 @@
 import json
 import os
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def write(
     return path
 
 
-def zipped(path: Path, members: dict[str, Path | bytes]) -> Path:
+def zipped(path: Path, members: Mapping[str, Path | bytes]) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
             archive.writestr(name, content if isinstance(content, bytes) else content.read_bytes())
@@ -281,7 +281,7 @@ def test_a_pipe_next_to_a_shapefile_is_refused(ending: str, tmp_path: Path) -> N
 
 def test_names_in_an_archive_lead_nowhere(tmp_path: Path, wanted: Area) -> None:
     site = shapefile(tmp_path)
-    members: dict[str, Path | bytes] = {f"../../{p.name}": p for p in tmp_path.glob("site.*")}
+    members: Mapping[str, Path | bytes] = {f"../../{p.name}": p for p in tmp_path.glob("site.*")}
     inner = tmp_path / "deep" / "er"
     inner.mkdir(parents=True)
     file = zipped(inner / "out.shp.zip", members)
@@ -322,7 +322,7 @@ def test_archives_without_the_one_file_are_refused(tmp_path: Path) -> None:
 def test_several_shapefiles_in_a_zip_are_layers(tmp_path: Path, wanted: Area) -> None:
     shapefile(tmp_path, "reef")
     shapefile(tmp_path, "other")
-    members: dict[str, Path | bytes] = {
+    members: Mapping[str, Path | bytes] = {
         p.name: p for name in ("reef", "other") for p in tmp_path.glob(f"{name}.*")
     }
     file = zipped(tmp_path / "both.zip", members)

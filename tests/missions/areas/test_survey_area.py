@@ -260,27 +260,27 @@ def test_settings_refuse_areas_that_cannot_be(area: dict[str, object], named: st
     assert "\n" not in str(fault.value)
 
 
-RING = "LINESTRING (0 0, 20 0, 20 10, 0 10, {})"
+LOOP = "LINESTRING (0 0, 20 0, 20 10, 0 10, {})"
 
 
 @pytest.mark.parametrize("end", ["0 0", "0 0.5"])
 def test_what_a_closed_line_encloses_is_surveyed_on_request(
     end: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    strip = area_of(wkt=RING.format(end)).survey.area
+    strip = area_of(wkt=LOOP.format(end)).survey.area
     said = capsys.readouterr().err
     assert "corridor of 5 m" in said and "closed_lines = 'inside'" in said
     assert strip == pytest.approx(5.0 * 60.0, rel=0.1)
-    inside = area_of(wkt=RING.format(end), closed_lines="inside").survey
+    inside = area_of(wkt=LOOP.format(end), closed_lines="inside").survey
     assert inside.area == pytest.approx(200.0, abs=0.1)
-    assert area_of(wkt=RING.format(end), closed_lines="corridor").survey.area == strip
+    assert area_of(wkt=LOOP.format(end), closed_lines="corridor").survey.area == strip
     assert not capsys.readouterr().err
 
 
 def test_a_line_that_does_not_close_is_a_corridor_without_a_word(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for text in (RING.format("0 3"), "LINESTRING (0 0, 20 0, 0 0)"):
+    for text in (LOOP.format("0 3"), "LINESTRING (0 0, 20 0, 0 0)"):
         strips = [area_of(wkt=text, closed_lines=c).survey.area for c in (None, "inside")]
         assert strips[0] == strips[1] > 90.0
     assert "closes" not in capsys.readouterr().err

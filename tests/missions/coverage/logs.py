@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.frames import Array, rotation_from_attitude
@@ -31,7 +32,7 @@ def log_of(flown: Stations, plan: Plan, rig: Rig) -> BelievedNavigation:
     )
 
 
-def write_triggers(path: Path, time_s: Array, line: Array | None = None) -> None:
+def write_triggers(path: Path, time_s: Array, line: NDArray[np.intp] | None = None) -> None:
     """Write `triggers.csv`, with lines where they are known."""
     header = ("station", "time_s") if line is None else ("station", "time_s", "line")
     columns = [np.arange(len(time_s)), time_s] + ([] if line is None else [line])

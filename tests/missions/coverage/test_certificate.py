@@ -7,6 +7,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
@@ -38,7 +39,7 @@ RIG = design_rig(CameraConfig(), WaterConfig())
 ONCE = Pattern(spacing_m=1.0, step_m=1.0, half_across_m=0.5, half_along_m=0.5)
 
 
-def misjudged_m2(certificate: Certificate, shape: shapely.Geometry) -> float:
+def misjudged_m2(certificate: Certificate, shape: BaseGeometry) -> float:
     """The most that counting middles of cells can be wrong by for a shape.
 
     Only cells that its outline passes through can be: no more than 2 sqrt(2) times its length in

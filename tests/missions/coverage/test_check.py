@@ -8,6 +8,7 @@ import pytest
 import rasterio
 import shapely
 from scipy.spatial.transform import RigidTransform
+from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
@@ -44,7 +45,7 @@ def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
 MISSING = 3
 
 
-def survey(shape: shapely.Geometry) -> Plan:
+def survey(shape: BaseGeometry) -> Plan:
     """A plan over a shape within the box from 0 to 8 and 6 m, with a metre of lines beyond."""
     area = area_of(shape)
     return plan_of(area, lawnmower(8.0, 6.0, 1.0, 0.46, over_m=1.0))
@@ -80,9 +81,10 @@ def workspace_of(folder: Path, plan: Plan) -> Path:
 
 def dived(folder: Path, plan: Plan, flown: Stations) -> Path:
     """A workspace with a plan, and the log and triggers of a dive."""
-    flown = replace(flown, time_s=50.0 + plan.interval_s * np.arange(len(flown)))
+    time_s = 50.0 + plan.interval_s * np.arange(len(flown), dtype=float)
+    flown = replace(flown, time_s=time_s)
     write_navigation(folder / "nav.csv", log_of(flown, plan, RIG), DATUM)
-    write_triggers(folder / "triggers.csv", flown.time_s, flown.line)
+    write_triggers(folder / "triggers.csv", time_s, flown.line)
     return workspace_of(folder, plan)
 
 

@@ -50,7 +50,7 @@ def leaning_flight() -> tuple[Array, Stations]:
     rng = np.random.default_rng(5)
     tilt = np.deg2rad(rng.normal(0, 3, (len(exact), 2)))
     attitude = np.column_stack([tilt, exact.attitude_rad[:, 2]])
-    time_s = 100.0 + plan().interval_s * np.arange(len(exact))
+    time_s = 100.0 + plan().interval_s * np.arange(len(exact), dtype=float)
     flown = replace(
         exact,
         attitude_rad=attitude,

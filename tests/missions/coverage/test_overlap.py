@@ -20,8 +20,8 @@ def middle_row_m(rig: Rig, altitude_m: float) -> float:
     camera = rig.cameras["left"]
     sine = math.sin(math.atan(camera.width_px / 2 / camera.fx_px))
     layers = (
-        (camera.port.port_distance_m, 1.0),
-        (camera.port.glass_thickness_m, camera.port.n_glass),
+        (camera.parameter("port_distance_m"), 1.0),
+        (camera.parameter("glass_thickness_m"), camera.parameter("n_glass")),
         (altitude_m, camera.n_water),
     )
     return 2 * sum(thick * math.tan(math.asin(sine / n)) for thick, n in layers)

@@ -97,7 +97,7 @@ def stars(draw: st.DrawFn) -> Polygon:
     star = Polygon(np.array(radii)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
     inner = star.buffer(-0.4)
     if draw(st.booleans()) and isinstance(inner, Polygon) and not inner.is_empty:
-        star = star.difference(shapely.affinity.scale(inner, 0.6, 0.6))
+        return Polygon(star.exterior, [shapely.affinity.scale(inner, 0.6, 0.6).exterior])
     return star
 
 

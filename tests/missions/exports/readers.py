@@ -175,5 +175,5 @@ def plans(draw: st.DrawFn) -> Plan:
 @st.composite
 def rigs(draw: st.DrawFn) -> Rig:
     """The stereo rig anywhere on the vehicle."""
-    arm = tuple(draw(st.floats(-1.0, 1.0)) for _ in range(3))
-    return design_rig(CameraConfig(position_body_m=arm), WaterConfig())  # type: ignore[arg-type]
+    x, y, z = (draw(st.floats(-1.0, 1.0)) for _ in range(3))
+    return design_rig(CameraConfig(position_body_m=(x, y, z)), WaterConfig())

@@ -9,7 +9,7 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
-from fastkml import Folder, Placemark, kml
+from fastkml import Document, Folder, Placemark, kml
 from fastkml.utils import find_all
 from hypothesis import HealthCheck, given, settings
 
@@ -36,10 +36,13 @@ def ne(plan: Plan, lon_lat: Any) -> np.ndarray:
     return np.array([local_ne(plan.datum, lat, lon) for lon, lat, *_ in lon_lat])
 
 
-def placemarks(path: Path, folder: str) -> list[Placemark]:
-    document = kml.KML.parse(path)
-    (found,) = [f for f in find_all(document, of_type=Folder) if f.name == folder]
-    return list(find_all(found, of_type=Placemark))
+def found(inside: object, kind: type) -> list[Any]:
+    return list(find_all(inside, of_type=kind))
+
+
+def placemarks(path: Path, name: str) -> list[Any]:
+    (folder,) = [f for f in found(kml.KML.parse(path), Folder) if f.name == name]
+    return found(folder, Placemark)
 
 
 @WIDE
@@ -49,7 +52,7 @@ def test_kml_in_fastkml(plan: Plan) -> None:
         write_exports(Path(folder), plan, RIG, formats=["kml"])
         path = Path(folder) / "plan.kml"
         lines, routes = placemarks(path, "Lines"), placemarks(path, "Routes")
-        document = kml.KML.parse(path).features[0]
+        (document,) = found(kml.KML.parse(path), Document)
     assert (document.name or "").strip() == clean(plan.name).strip()
     assert len(lines) == len(plan.lines)
     assert len(routes) == len(plan.dives)

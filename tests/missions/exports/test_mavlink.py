@@ -207,9 +207,9 @@ def test_the_fence_holds_the_vehicle_and_keeps_it_out(
     assert inside.symmetric_difference(survey.buffer(3.552, join_style="mitre")).area < 4.5
     for item in data.mission_items:
         if item.command == dialect.MAV_CMD_NAV_WAYPOINT:
-            place = Point(local_ne(plan.datum, item.x * 1e-7, item.y * 1e-7))
-            assert inside.contains(place)
-            assert not outside.contains(place)
+            flown = Point(local_ne(plan.datum, item.x * 1e-7, item.y * 1e-7))
+            assert inside.contains(flown)
+            assert not outside.contains(flown)
 
 
 def test_a_zone_that_the_reference_point_must_cut_is_shrunk_or_left_out(

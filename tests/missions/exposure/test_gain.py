@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ def scene(median_e: float, falloff: float = 0.0, noisy: bool = True, seed: int =
     return electrons.astype(np.float32)
 
 
-def taken(folder: Path, median_e: float, gain_db: float, count: int = 3, **how: float) -> Path:
+def taken(folder: Path, median_e: float, gain_db: float, count: int = 3, **how: Any) -> Path:
     """Control pictures as the simulator's sensor writes them."""
     for i in range(count):
         picture = develop(scene(median_e, seed=i, **how), 10 ** (gain_db / 20) / FULL_WELL)

@@ -7,7 +7,7 @@ from alice_survey.base.errors import PlanError
 from missions.exposure.settings import imaging_settings
 from missions.exposure.solve import lenses_for_resolution, speeds_for_rate
 from missions.values.footprint import footprint_size_m
-from tests.missions.exposure.surveys import survey
+from tests.missions.exposure.surveys import number_in, survey
 
 DEPTH_M = SurveyConfig().area.seafloor_depth_m
 
@@ -34,9 +34,9 @@ def test_ways_out_of_a_resolution_that_is_too_fine_work() -> None:
         lenses_for_resolution(config, DEPTH_M, 0.22, (12.5, 25.0))
     text = str(fault.value)
     assert 2 <= len(text.splitlines()) <= 4
-    finer = float(re.search(r"resolution ([\d.]+) mm with the 12.5", text)[1])
+    finer = number_in(text, r"resolution ([\d.]+) mm with the 12.5")
     assert lenses_for_resolution(config, DEPTH_M, finer + 5e-4, (12.5,))[0].fits
-    blur = float(re.search(r"allowed_blur_px ([\d.]+)", text)[1])
+    blur = number_in(text, r"allowed_blur_px ([\d.]+)")
     _, blurred = survey(plan={"allowed_blur_px": blur})
     assert lenses_for_resolution(blurred, DEPTH_M, 0.22, (25.0,))[0].snr == pytest.approx(
         5.0, abs=0.05

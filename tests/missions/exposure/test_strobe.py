@@ -1,5 +1,3 @@
-import re
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -7,7 +5,7 @@ from hypothesis import strategies as st
 from alice_survey.base.errors import PlanError
 from missions.exposure.storage import raw_bytes, storage_load
 from missions.exposure.strobe import BUS_V, EFFICACY_LM_W, capacitor_f, duty_limit, strobe_load
-from tests.missions.exposure.surveys import survey
+from tests.missions.exposure.surveys import number_in, survey
 
 
 def test_two_strobes_of_thirty_thousand_lumens() -> None:
@@ -50,10 +48,10 @@ def test_a_duty_cycle_that_is_too_high_gets_ways_out_that_work() -> None:
         strobe_load(config.imaging, config.plan, exposure_s, interval_s)
     text = str(fault.value)
     assert 2 <= len(text.splitlines()) <= 4
-    lead = float(re.search(r"strobe_lead_s ([\d.]+) instead", text)[1])
+    lead = number_in(text, r"strobe_lead_s ([\d.]+) instead")
     changed = config.plan.model_copy(update={"strobe_lead_s": lead})
     assert strobe_load(config.imaging, changed, exposure_s, interval_s).duty > 0.37
-    lumens = float(re.search(r"strobe_lumens (\d+) instead", text)[1])
+    lumens = number_in(text, r"strobe_lumens (\d+) instead")
     dimmed = config.imaging.model_copy(update={"strobe_lumens": lumens})
     load = strobe_load(dimmed, config.plan, exposure_s, interval_s)
     assert 0.98 * load.duty_limit < load.duty <= load.duty_limit

@@ -161,7 +161,9 @@ def test_the_range_of_a_leaning_vehicle_is_the_height_of_the_glass() -> None:
     assert leaning == pytest.approx((2.0 + lever[2]) * math.cos(roll) + lever[1] * math.sin(roll))
 
 
-def messages(time_s: float, place_ned: Array, heading: float) -> tuple[SimpleNamespace, ...]:
+def messages(
+    time_s: float, place_ned: Array, heading: float
+) -> tuple[SimpleNamespace, SimpleNamespace]:
     position = SimpleNamespace(
         time_boot_ms=round(1e3 * time_s), x=place_ned[0], y=place_ned[1], z=place_ned[2],
         vx=0.2, vy=0.0, vz=0.0,

@@ -22,7 +22,9 @@ def logs(draw: st.DrawFn) -> tuple[Array, list[int]]:
     rows[:, 0] += rng.uniform(0, draw(st.sampled_from([0.0, 0.3])) * interval_s, len(rows))
     for _ in range(draw(st.integers(0, 2))):  # gaps of all lengths
         first = int(rng.integers(1, len(rows) - 1))
-        rows = np.delete(rows, slice(first, first + int(rng.integers(1, 40 / interval_s))), axis=0)
+        rows = np.delete(
+            rows, slice(first, first + int(rng.integers(1, int(40 / interval_s)))), axis=0
+        )
     for column in draw(st.lists(st.sampled_from([DEPTH, ROLL, HEADING, ALTITUDE]), max_size=2)):
         how = draw(st.sampled_from(["none", "rare", "from", "until"]))
         lost = {

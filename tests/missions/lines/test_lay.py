@@ -1,6 +1,7 @@
 import dataclasses
 import math
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,7 +152,7 @@ def test_every_part_is_tied_by_cross_lines() -> None:
 def test_the_cost_is_that_of_the_lines_flown_by_hand(costs: Costs) -> None:
     area = area_of(ELL_WITH_HOLES)
     ways, home = Ways(area.allowed), (-2.0, -2.0)
-    kinds = {"cross_lines": 1, "closing_line": True}
+    kinds: dict[str, Any] = {"cross_lines": 1, "closing_line": True}
     lines = lay_lines(area, 0.4, STEREO, ways, costs, home, **kinds)
     cost = full_cost_j(area, 0.4, STEREO, ways, costs, home, **kinds)
     assert flight_by_hand(lines, partial(way_m, ways), costs, home) == pytest.approx(cost, rel=1e-6)

@@ -5,6 +5,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.base.frames import Array
@@ -14,7 +15,7 @@ from missions.values.area import multipolygon
 from tests.oracles_lines import areas, reaches_by_shapely
 
 
-def spans(begins: Array, counts: Array, found: Array, row: int) -> Array:
+def spans(begins: NDArray[np.int64], counts: NDArray[np.int64], found: Array, row: int) -> Array:
     return found[begins[row] : begins[row] + counts[row]]
 
 

@@ -66,7 +66,7 @@ def test_no_sampled_heading_is_much_better(shape: Polygon, costs: Costs) -> None
 def test_lines_turn_into_the_current() -> None:
     area = area_of(box(0, 0, 15, 17))
     ways = Ways(area.allowed)
-    kinds = {"cross_lines": 0, "closing_line": False}
+    kinds: dict[str, Any] = {"cross_lines": 0, "closing_line": False}
     calm = best_heading(area, STEREO, ways, time_costs(0.2), (0.0, 0.0), **kinds)
     current = best_heading(area, STEREO, ways, NORTHWARD, (0.0, 0.0), **kinds)
     assert abs(math.sin(calm.heading_rad)) > 0.99
@@ -87,7 +87,7 @@ def test_the_search_over_areas_with_fill_lines_finds_as_good_a_heading() -> None
     """The search leaves fill lines out until it compares the best headings."""
     area = area_of(ELL_WITH_HOLES)
     ways, home = Ways(area.allowed), (-2.0, -2.0)
-    kinds = {"cross_lines": 1, "closing_line": True}
+    kinds: dict[str, Any] = {"cross_lines": 1, "closing_line": True}
     sweep = best_heading(area, STEREO, ways, time_costs(0.2), home, **kinds)
     sampled = [
         full_cost_j(area, h, STEREO, ways, time_costs(0.2), home, **kinds)

@@ -128,8 +128,8 @@ def send(link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array) -
     mav.attitude_send(stamp_ms, roll, pitch, heading, *truth[10:13])
     place = vehicle.sensors.place[DVL]
     north, east, depth = truth[:3] + turn.apply(place)
-    down = turn.apply([0.0, 0.0, 1.0])
-    reach = floor_range(vehicle.floor, north, east, depth, *down, 75.0)
+    x, y, z = turn.apply([0.0, 0.0, 1.0])
+    reach = floor_range(vehicle.floor, north, east, depth, x, y, z, 75.0)
     mav.rangefinder_send(reach if math.isfinite(reach) else 0.0, 0.0)
     mav.local_position_ned_send(stamp_ms, *(truth[:3] - shift), *truth[7:10])
 

@@ -1,6 +1,7 @@
 """A small plan, and a vehicle in the water that a pilot's loop can fly, tick by tick."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from missions.fly.simulation import flight_settings, mission_setup
 from missions.live.loop import LinkLimits, Odometry
 from missions.live.mission import LiveMission, mission_of
 from missions.values.plan_file import Plan
-from tests.missions.flown_plans import plan_of, walk
+from tests.missions.flown_plans import Move, plan_of, walk
 
 FLOOR_M = 6.0
 START_S = 100.0
@@ -21,7 +22,13 @@ START_S = 100.0
 
 def small_plan() -> Plan:
     """Two lines of 4 m, 1 m apart, in water of 6 m."""
-    moves = [("line", 4.0, 0), ("spot", 90.0), ("go", 1.0), ("spot", 90.0), ("line", 4.0, 1)]
+    moves: list[Move] = [
+        ("line", 4.0, 0),
+        ("spot", 90.0),
+        ("go", 1.0),
+        ("spot", 90.0),
+        ("line", 4.0, 1),
+    ]
     return plan_of([walk((0.0, 0.0), 0.0, moves)])
 
 
@@ -38,13 +45,13 @@ def vehicle_afloat(plan: Plan, survey: SurveyConfig, seed: int = 1) -> Simulated
 class LoopFlight:
     """A loop that flies a simulated vehicle by its true motion; tests spoil what it hears."""
 
-    def __init__(self, survey: SurveyConfig | None = None, **limits: object) -> None:
+    def __init__(self, survey: SurveyConfig | None = None, **limits: Any) -> None:
         survey = survey or SurveyConfig()
         self.plan = small_plan()
         self.vehicle = vehicle_afloat(self.plan, survey)
         self.mission: LiveMission = mission_of(
             self.plan, flight_settings(survey), LinkLimits(**limits)
-        )  # type: ignore[arg-type]
+        )
         self.loop = self.mission.loop
         self.glass: list[Array] = []
         self.clock_offset_s = 0.0

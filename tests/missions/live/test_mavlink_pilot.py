@@ -111,7 +111,7 @@ def test_setpoints_are_velocities_in_ned_and_a_heading(flying: Vehicle) -> None:
     assert target.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
     # Positions, accelerations and the rate of the yaw are not to be followed.
     assert target.type_mask == 0b100111000111
-    command = flying.mission.loop.tick(flying.mission.rows[-1][0])
+    command = flying.mission.loop.tick(float(flying.mission.rows[-1][0]))
     c, s = math.cos(0.3), math.sin(0.3)
     surge, sway, heave = command.velocity_body
     expected = [c * surge - s * sway, s * surge + c * sway, heave]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -38,6 +39,8 @@ bool velocity_valid
 int64 status
 """
 
+Numbers = Sequence[float] | NDArray[np.float64]
+
 
 class Bag:
     """Messages by topic, to be written as a bag of ROS 1 or ROS 2."""
@@ -58,10 +61,11 @@ class Bag:
         more = {"seq": 0} if self.version == 1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **more)
 
-    def point(self, x: float, y: float, z: float, kind: str = "Point") -> Any:
+    def point(self, xyz: Iterable[float], kind: str = "Point") -> Any:
+        x, y, z = map(float, xyz)
         return self.make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
-    def quaternion(self, xyzw: Sequence[float]) -> Any:
+    def quaternion(self, xyzw: Numbers) -> Any:
         x, y, z, w = (float(v) for v in xyzw)
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
@@ -97,7 +101,7 @@ class Bag:
             origin=self.make("cola2_msgs/msg/DecimalLatLon", latitude=41.0, longitude=3.0),
             position=ned((0.0, 0.0, place[2])),
             altitude=altitude_m,
-            body_velocity=self.point(0.5, -0.1, 0.02),
+            body_velocity=self.point((0.5, -0.1, 0.02)),
             orientation=rpy(attitude_rad),
             orientation_rate=rpy((0.01, 0.02, 0.03)),
             position_variance=ned(variances[:3]),
@@ -110,19 +114,19 @@ class Bag:
         stamp_ns: int,
         topic: str,
         frame: str,
-        position: Sequence[float],
-        xyzw: Sequence[float],
-        velocity: Sequence[float] = (0.0,) * 6,
+        position: Numbers,
+        xyzw: Numbers,
+        velocity: Numbers = (0.0,) * 6,
     ) -> None:
         pose = self.make(
             "geometry_msgs/msg/Pose",
-            position=self.point(*map(float, position)),
+            position=self.point(position),
             orientation=self.quaternion(xyzw),
         )
         twist = self.make(
             "geometry_msgs/msg/Twist",
-            linear=self.point(*map(float, velocity[:3]), kind="Vector3"),
-            angular=self.point(*map(float, velocity[3:]), kind="Vector3"),
+            linear=self.point(velocity[:3], kind="Vector3"),
+            angular=self.point(velocity[3:], kind="Vector3"),
         )
         message = self.make(
             "nav_msgs/msg/Odometry",
@@ -151,8 +155,8 @@ class Bag:
         )
         self.add(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, message)
 
-    def add_imu(self, stamp_ns: int, topic: str, frame: str, xyzw: Sequence[float]) -> None:
-        zero = self.point(0.0, 0.0, 0.0, kind="Vector3")
+    def add_imu(self, stamp_ns: int, topic: str, frame: str, xyzw: Numbers) -> None:
+        zero = self.point((0.0, 0.0, 0.0), kind="Vector3")
         message = self.make(
             "sensor_msgs/msg/Imu",
             header=self.header(stamp_ns, frame),
@@ -178,7 +182,7 @@ class Bag:
         self.add(topic, "sensor_msgs/msg/Range", stamp_ns, message)
 
     def add_dvl(
-        self, stamp_ns: int, topic: str, velocity_frd: Sequence[float], altitude_m: float,
+        self, stamp_ns: int, topic: str, velocity_frd: Numbers, altitude_m: float,
         *, valid: bool = True,
     ) -> None:  # fmt: skip
         """What a Water Linked DVL's driver publishes (the fields of dvl_msgs that matter)."""
@@ -188,7 +192,7 @@ class Bag:
             _DVL,
             header=self.header(stamp_ns, "dvl"),
             time=0.1,
-            velocity=self.point(*map(float, velocity_frd), kind="Vector3"),
+            velocity=self.point(velocity_frd, kind="Vector3"),
             fom=0.01,
             altitude=altitude_m,
             velocity_valid=valid,
@@ -196,9 +200,9 @@ class Bag:
         )
         self.add(topic, _DVL, stamp_ns, message)
 
-    def add_twist(self, stamp_ns: int, topic: str, frame: str, velocity: Sequence[float]) -> None:
-        zero = self.point(0.0, 0.0, 0.0, kind="Vector3")
-        linear = self.point(*map(float, velocity), kind="Vector3")
+    def add_twist(self, stamp_ns: int, topic: str, frame: str, velocity: Numbers) -> None:
+        zero = self.point((0.0, 0.0, 0.0), kind="Vector3")
+        linear = self.point(velocity, kind="Vector3")
         twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=zero)
         message = self.make(
             "geometry_msgs/msg/TwistStamped", header=self.header(stamp_ns, frame), twist=twist

@@ -21,7 +21,7 @@ FRD_FROM_FLU = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 def flight(rows: int = 40) -> BagRecord:
     """A climb along a circle."""
     rng = np.random.default_rng(5)
-    time_s = np.arange(rows) * 0.1
+    time_s = np.arange(rows, dtype=float) * 0.1
     place = np.column_stack([5 * np.cos(time_s), 5 * np.sin(time_s), 10.0 - 0.3 * time_s])
     truth = RigidTransform.from_components(
         place, rotation_from_attitude(0.2 * np.sin(time_s), 0.1 * np.cos(time_s), time_s)

@@ -1,6 +1,7 @@
 """Dead reckoning against dense least squares over all unknowns, and against its own sigmas."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ DATUM = Datum(43.0, 5.0)
 def lawnmower(count: int = 400, step_s: float = 0.5, seed: int = 0) -> tuple[Array, Array]:
     """Times and velocities north and east of lines there and back with a drift across."""
     rng = np.random.default_rng(seed)
-    time_s = np.arange(count) * step_s
+    time_s = np.arange(count, dtype=float) * step_s
     line = np.where((time_s // 40).astype(int) % 2 == 0, 0.4, -0.4)
     drift = 0.05 + 0.02 * np.sin(time_s / 17)
     return time_s, np.column_stack([line, drift]) + rng.normal(0, 0.01, (count, 2))
@@ -182,7 +183,8 @@ def test_fixes_of_the_log_tie_it() -> None:
 def test_what_is_missing_is_named(lacks: str) -> None:
     dive = dive_along(0.0)
     if lacks != "start":
-        dive = replace(dive, **{lacks: None})
+        missing: dict[str, Any] = {lacks: None}
+        dive = replace(dive, **missing)
     words = {"velocity_body": "velocity", "attitude": "attitude", "start": "--start-at"}[lacks]
     with pytest.raises(NavigationError, match=words):
         with_dead_reckoning(dive, TrackErrors(), None)

@@ -22,7 +22,7 @@ FIX = (DATUM.latitude_deg, DATUM.longitude_deg, 0.0)
 
 def circle() -> tuple[Array, Array, Array]:
     """Times, headings (rad) and places (N, 2) of a circle to starboard that starts northwards."""
-    time_s = np.arange(COUNT) * STEP_S
+    time_s = np.arange(COUNT, dtype=float) * STEP_S
     heading = SPEED_MPS / RADIUS_M * time_s
     return time_s, heading, RADIUS_M * np.column_stack([np.sin(heading), 1 - np.cos(heading)])
 

@@ -9,6 +9,7 @@ import pytest
 import shapely
 from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, box
+from shapely.geometry.base import BaseGeometry
 
 from alice_survey.base.config import parse_config
 from alice_survey.base.errors import PlanError
@@ -99,7 +100,7 @@ def _as_string(line: Line) -> LineString:
     return LineString([line.start_ne_m, line.end_ne_m])
 
 
-def _seen_by(plan: Plan, rig: Rig, dive: Dive) -> shapely.Geometry:
+def _seen_by(plan: Plan, rig: Rig, dive: Dive) -> BaseGeometry:
     """What the first camera's pictures of a dive see."""
     outline = footprint_outline(plan, rig)
     lines = plan.lines[dive.first_line : dive.last_line + 1]

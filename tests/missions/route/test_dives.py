@@ -14,6 +14,7 @@ from alice_survey.base.errors import PlanError
 from missions.route.dives import DEAREST_TIE, split_dives
 from missions.route.turns import legs_alone, line_table, route_of, route_through
 from missions.route.ways import Ways
+from missions.values.area import multipolygon
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
 from missions.values.plan_file import Dive
@@ -135,7 +136,7 @@ def test_tied_dives_share_a_line_and_no_such_parting_is_better(
 def test_ways_home_round_a_hole_count_whole() -> None:
     """Home behind a wall: dives are no longer than what their routes take."""
     wall = shapely.box(3, -5.9, 3.2, 30)
-    ways = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 60, 40).difference(wall)]))
+    ways = Ways(multipolygon(shapely.box(-6, -6, 60, 40).difference(wall)))
     lines = [
         Line(kind="survey", start_ne_m=(n, 0.0), end_ne_m=(n, 12.0), stations=25)
         for n in (4.0, 5.0, 6.0, 7.0)
@@ -198,7 +199,7 @@ def test_thousands_of_lines_are_parted() -> None:
 @pytest.mark.parametrize("turns", ["auto", "arcs", "spot", "sway"])
 def test_ways_along_single_lines_are_the_routes_through_them(turns: Any) -> None:
     room = shapely.box(-6, -6, 60, 40).difference(shapely.box(-3, 3, 4.5, 5))
-    ways, lines = Ways(shapely.MultiPolygon([room])), _lines(8, length_m=2.5)
+    ways, lines = Ways(multipolygon(room)), _lines(8, length_m=2.5)
     for line in list(lines):
         (n, e), (n_2, e_2) = line.start_ne_m, line.end_ne_m
         lines.append(replace(line, start_ne_m=(n, e + 6.0), end_ne_m=(n_2, e_2 + 6.0)))

@@ -68,7 +68,7 @@ def test_motion_keeps_its_course_over_ground() -> None:
     courses = np.linspace(0, 2 * np.pi, 19)
     current = np.array([0.07, -0.05])
     for manner in ("held", "crab"):
-        moved = motion(courses, 0.2, current, manner)  # type: ignore[arg-type]
+        moved = motion(courses, 0.2, current, manner)
         heading = courses + moved.crab_rad
         north = moved.nu[:, 0] * np.cos(heading) - moved.nu[:, 1] * np.sin(heading) + current[0]
         east = moved.nu[:, 0] * np.sin(heading) + moved.nu[:, 1] * np.cos(heading) + current[1]

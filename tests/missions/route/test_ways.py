@@ -99,7 +99,7 @@ def test_arcs_are_inside_as_their_samples_are(
             curvature_per_m=side / radius,
             line=-1,
         )
-        holds = arc_inside(fence, *place, heading, leg.curvature_per_m, leg.length_m)
+        holds = arc_inside(fence, *leg.start_ne_m, heading, leg.curvature_per_m, leg.length_m)
 
         places, bend = sampled_leg(leg, 300)
         track = LineString(places)

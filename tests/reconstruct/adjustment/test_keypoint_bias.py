@@ -23,7 +23,9 @@ def test_changes_of_a_lens_move_pixels_radially_by_the_sigma() -> None:
         squares, along = [], []
         for _ in range(200):
             step = rng.multivariate_normal(np.zeros(len(names)), covariance)
-            values = {f: camera.parameter(f) + s for f, s in zip(fields, step, strict=False)}
+            values: dict[str, float] = {
+                f: camera.parameter(f) + s for f, s in zip(fields, step, strict=False)
+            }
             shift = camera.with_parameters(values).project(starts + 2.0 * rays) - grid
             out = grid - [camera.parameter("cx_px"), camera.parameter("cy_px")]
             squares.append((shift**2).sum(axis=1).mean())

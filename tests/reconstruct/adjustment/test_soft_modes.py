@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -143,8 +144,10 @@ def strip(jump_m: float, seed: int, noise_m: float = 0.004) -> Scene:
 
 def mute(scene: Scene) -> Scene:
     """The same with a log that says nothing of the shape."""
-    vague = {"sigma_depth_m": 50.0, "sigma_horizontal_m": 50.0, "sigma_attitude_deg": 60.0,
-             "sigma_heading_deg": 60.0}  # fmt: skip
+    vague: dict[str, Any] = {
+        "sigma_depth_m": 50.0, "sigma_horizontal_m": 50.0, "sigma_attitude_deg": 60.0,
+        "sigma_heading_deg": 60.0,
+    }  # fmt: skip
     return replace(scene, records=[replace(record, **vague) for record in scene.records])
 
 

@@ -398,7 +398,7 @@ def _relative_misses(
     shared = found.shared
     assert shared is not None
     points = np.array([mapped.model.points3D[int(n)].xyz for n in found.point_ids])
-    rows = KDTree(points).query(shared.places)[1]
+    rows = np.asarray(KDTree(points).query(shared.places)[1])
     i, j = rng.permutation(len(rows))[:200].reshape(2, 100)
     motion = shared.motions[i] - shared.motions[j]
     noise = found.point_noise[rows[i]] + found.point_noise[rows[j]]
@@ -418,7 +418,7 @@ def test_what_points_share_is_nearly_all_that_poses_do(tmp_path: Path) -> None:
         assert shared is not None
         points = np.array([mapped.model.points3D[int(n)].xyz for n in found.point_ids])
         away, rows = KDTree(points).query(shared.places)
-        assert away.max() == 0.0
+        assert np.max(away) == 0.0
         pose = np.trace((found.point_cov - found.point_noise)[rows], axis1=1, axis2=2)
         seen = np.trace(spread(shared.motions, shared.covariance), axis1=1, axis2=2)
         share = seen / pose

@@ -62,7 +62,7 @@ def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) 
     amid = np.abs(places[:, 0] - half_m) < 0.005
     assert amid.sum() > 50
     port = scene.rig.cameras["left"].port
-    d, g, n = port.port_distance_m, port.glass_thickness_m, port.n_water
+    d, g, n = map(port.parameter, ("port_distance_m", "glass_thickness_m", "n_water"))
     _, y, z = places[amid].T
     in_water = z - d - g
     # The ways in air and glass are 3 % of all: c as if all were water is right to a thousandth.

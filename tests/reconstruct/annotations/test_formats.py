@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,8 +87,8 @@ def test_slits_keep_the_area_and_are_found_again(shape: DrawnShape) -> None:
 def test_masks_are_packed_unpacked_and_outlined_exactly(data: st.DataObject) -> None:
     rows, columns = data.draw(st.integers(1, 24)), data.draw(st.integers(1, 24))
     seed = data.draw(st.integers(0, 2**16))
-    mask = np.random.default_rng(seed).random((rows, columns)) < data.draw(st.floats(0, 1))
-    mask = mask.astype(np.uint8)
+    chosen = np.random.default_rng(seed).random((rows, columns)) < data.draw(st.floats(0, 1))
+    mask = chosen.astype(np.uint8)
     runs = encoded(mask)
     assert sum(runs) == mask.size
     assert unpacked(packed(runs)) == runs
@@ -302,7 +303,7 @@ def test_a_file_with_one_wrong_value_is_read_or_one_line(
         assert all(np.isfinite(one.shape.area) for one in found.annotations)
 
 
-def _places(node: object) -> list[tuple[object, object]]:
+def _places(node: object) -> list[tuple[Any, Any]]:
     keys = (
         node.items()
         if isinstance(node, dict)

@@ -84,12 +84,12 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
     scene = Scene(depth_of=sloped_with_step, paint=speckle())
     views = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]), heading_deg)
     one, other = views[0], views[1]
-    looks = [(normalise(render(v, scene)), EVERYWHERE) for v in (one, other)]
+    here, there = ((normalise(render(v, scene)), EVERYWHERE) for v in (one, other))
     rng = np.random.default_rng(1)
     place = rng.uniform(-0.3, 0.9, (200, 2))
     points = np.column_stack([place, sloped_with_step(*place.T)])
 
-    found = pair_depth((one, other), looks, points)
+    found = pair_depth((one, other), (here, there), points)
     depth, sigma = found.depth, found.sigma(0.3)
 
     true = one.world_from_cam.inv().apply(hits(one, scene).reshape(-1, 3))[:, 2]
@@ -104,13 +104,13 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
 def test_masked_pixels_get_no_depth():
     scene = Scene(depth_of=flat, paint=speckle())
     one, other, *_ = stereo_views(np.array([0.0, 0.35]), np.array([0.0, 0.0]), 0.0)
-    greys = [normalise(render(v, scene)) for v in (one, other)]
+    left, right = (normalise(render(v, scene)) for v in (one, other))
     masked = EVERYWHERE.copy()
     masked[:, :200] = False
     points = np.array([[0.1, 0.1, DEPTH_M + 0.05], [0.0, 0.2, DEPTH_M - 0.05]] * 3)
     here, there, free = (
-        pair_depth((one, other), tuple(zip(greys, usable, strict=True)), points).depth
-        for usable in ((masked, EVERYWHERE), (EVERYWHERE, masked), (EVERYWHERE, EVERYWHERE))
+        pair_depth((one, other), ((left, seen), (right, matched)), points).depth
+        for seen, matched in ((masked, EVERYWHERE), (EVERYWHERE, masked), (EVERYWHERE, EVERYWHERE))
     )
     assert np.isfinite(free[:, :200]).any()
     assert not np.isfinite(here[:, :200]).any()

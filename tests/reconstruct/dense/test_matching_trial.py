@@ -65,7 +65,8 @@ def matched(workspace: Path, model, scale: float, folder: Path) -> list[tuple[Vi
 
 
 def test_clear_pictures_are_matched_as_they_are_and_better_than_assumed(survey, tmp_path):
-    scale, sigma_px = conditions(*survey, tmp_path / "store")
+    workspace, model = survey
+    scale, sigma_px = conditions(workspace, model, tmp_path / "store")
     assert scale == 1.0
     assert 0.15 <= sigma_px < 0.3
 

@@ -192,7 +192,7 @@ def drawn(depth: np.ndarray, one: View, other: View, step: float) -> np.ndarray:
     """Slow twin of `draw`."""
     rows, columns = np.nonzero(np.isfinite(depth))
     pixels = (np.column_stack([columns, rows]) + 0.5) * step
-    points = one.at_depth(pixels, depth[rows, columns].astype(float))
+    points = one.at_depth(pixels.astype(float), depth[rows, columns].astype(float))
     corners = np.floor(other.project(points) / step - 0.5).astype(int)
     found = np.full(depth.shape, np.nan)
     for (left, top), z in zip(corners, other.world_from_cam.inv().apply(points)[:, 2], strict=True):

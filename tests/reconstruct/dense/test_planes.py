@@ -14,6 +14,7 @@ from alice_survey.base.errors import ReconstructionError, heard
 from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from reconstruct.evaluate.elevation import elevation_in
+from reconstruct.views.model import SparseModel
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -38,7 +39,7 @@ def config(*planes: str) -> SurveyConfig:
     )
 
 
-def survey() -> tuple[list, object]:
+def survey() -> tuple[list, SparseModel]:
     along, aside = np.meshgrid([-0.05, 0.3, 0.65], [0.1, 0.6])
     views = stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
     return views, sparse_model(views, SCENE)

@@ -11,7 +11,8 @@ from reconstruct.dense.points import (
     points_in_box,
     points_of_pixels,
 )
-from reconstruct.dense.view_store import WHOLE, ViewStore
+from reconstruct.dense.view_store import ViewStore
+from reconstruct.pictures.undistorted import WHOLE
 from reconstruct.views.model import enu_from_cam
 from reconstruct.views.range_shift import no_shift
 from tests.oracles_dense import (
@@ -180,7 +181,7 @@ def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp
     store.save_colour(7, colour)
     chosen = np.isfinite(depth) & (rng.random(depth.shape) > 0.3)
     rows, columns = np.nonzero(chosen)
-    pixels = np.column_stack([columns, rows]) + 0.5
+    pixels = np.column_stack([columns, rows]).astype(float) + 0.5
     world = view.at_depth(pixels, depth[rows, columns].astype(float))
     np.testing.assert_allclose(points_of_pixels(view, depth, chosen), world, rtol=0, atol=1e-11)
     blocks = block_bounds(np.isfinite(depth), points_of_pixels(view, depth, np.isfinite(depth)))
@@ -200,6 +201,7 @@ def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp
         side = 0.15 * np.ptp(east)
         box = (middle[0] - side, middle[0] + side, middle[1] - side, middle[1] + side)
         part = part_in_box(view, OFFSET, box, blocks)
+        assert part is not None
         found, whole = points(box, part), points(box, WHOLE)
         for name in ("enu", "normals", "sigmas", "views"):
             np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))

@@ -19,7 +19,7 @@ SCENE = Scene(depth_of=flat, paint=position_code)
 
 
 def small_model() -> SparseModel:
-    return sparse_model(stereo_views(0.3 * np.arange(4), np.zeros(4)), SCENE, points=300)
+    return sparse_model(stereo_views(0.3 * np.arange(4.0), np.zeros(4)), SCENE, points=300)
 
 
 @pytest.fixture(scope="module")

@@ -153,8 +153,8 @@ def test_depth_through_a_tilted_port_is_exact(base_m: float):
     disparity = (grid - right)[:, 0].reshape(pair.height_px, pair.width_px).astype(np.float32)
 
     depth = depth_in_reference(one, other, pair, disparity)
-    views = [replace(view, shift=no_shift(*view.pinhole.size_px)) for view in (one, other)]
-    central = depth_in_reference(*views, pair, disparity)
+    here, there = (replace(v, shift=no_shift(*v.pinhole.size_px)) for v in (one, other))
+    central = depth_in_reference(here, there, pair, disparity)
 
     known = np.isfinite(depth)
     assert known.mean() > 0.3

@@ -62,7 +62,7 @@ def test_compare_equals_its_slow_twin():
     assert len(rows) > 0.5 * rest.size
     chosen = slice(None, None, 997)
     rows, columns = rows[chosen], columns[chosen]
-    pixels = np.column_stack([columns, rows]) + 0.5
+    pixels = np.column_stack([columns, rows]).astype(float) + 0.5
 
     def warped(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = other.view.project(one.view.at_depth(pixels, 1 / inverse)) - 0.5
@@ -150,7 +150,7 @@ def test_what_no_other_station_sees_rests_on_the_pair_with_a_larger_sigma():
     sigma = np.full_like(start, 0.01)
     one, ahead, pair, ahead_right = looks(far=True)
     apart = [ahead, ahead_right]
-    pixels = np.indices(true.shape)[::-1].reshape(2, -1).T + 0.5
+    pixels = np.indices(true.shape, dtype=float)[::-1].reshape(2, -1).T + 0.5
     points = one.view.at_depth(pixels, true.ravel().astype(np.float64))
     there = [in_frame(other.view, points).reshape(true.shape) for other in (pair, *apart)]
     alone = ndimage.binary_erosion(there[0] & ~there[1] & ~there[2], iterations=6)

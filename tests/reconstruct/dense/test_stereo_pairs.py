@@ -19,7 +19,7 @@ SCENE = Scene(depth_of=flat, paint=position_code)
 
 
 def line(stations: int = 5) -> list:
-    along = 0.4 * np.arange(stations)
+    along = 0.4 * np.arange(stations, dtype=float)
     return stereo_views(along, np.zeros(stations), heading_deg=0.0)
 
 

@@ -81,7 +81,7 @@ def test_a_ball_is_covered_from_all_sides_without_gaps():
     assert abs(np.mean(off)) < 0.1 * SIGMA_M
     assert 0.3 < np.sqrt(np.mean((off / found["sigma"]) ** 2)) < 1.2
     gap = cKDTree(found["enu"]).query(radius * normals[::40])[0]
-    assert gap.max() < 1.5 * CELL_M
+    assert np.max(gap) < 1.5 * CELL_M
     outwards = np.einsum("nk,nk->n", found["enu"], found["normal"]) / (radius + off)
     assert outwards.min() > 0.99
 
@@ -130,7 +130,7 @@ def test_both_sides_of_a_thin_wall_stay_apart():
     rng = np.random.default_rng(5)
     north = np.array([0.0, 1.0, 0.0])
     one, other = patch(north, rng), patch(-north, rng)
-    front = Points(**{**vars(one), "enu": one.enu + np.float32([0, 0.02, 0])})
+    front = Points(**{**vars(one), "enu": one.enu + np.array([0, 0.02, 0], np.float32)})
     found = fuse_surface(
         Points(**{name: np.concatenate([getattr(front, name), getattr(other, name)])[
             np.argsort(np.concatenate([front.views, other.views]), kind="stable")]

@@ -46,7 +46,9 @@ def survey(
     height = relief(easts, norths, mound_m)
     for _ in range(20):  # the height at which a vertical of the survey's frame meets the relief
         world = world_from_own.apply(np.stack([easts, norths, height], -1).reshape(-1, 3))
-        height = height + (relief(*world[:, :2].T, mound_m) - world[:, 2]).reshape(height.shape)
+        height = height + (relief(world[:, 0], world[:, 1], mound_m) - world[:, 2]).reshape(
+            height.shape
+        )
     noise = sigma_m * np.random.default_rng(seed).normal(size=height.shape)
     return Elevation(
         height=height + noise, sigma=np.full(height.shape, sigma_m), west=0.0, north=4.0, cell=CELL

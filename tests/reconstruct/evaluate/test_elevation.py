@@ -75,8 +75,8 @@ def test_cells_are_those_of_the_file_that_is_there_now(tmp_path: Path) -> None:
         stored(tmp_path, values)
         wide = np.pad(values, 600, constant_values=np.nan)
         for _ in range(20):
-            row, column = rng.integers(-300, ROWS), rng.integers(-300, COLUMNS)
-            rows, columns = rng.integers(1, 500, 2)
+            row, column = int(rng.integers(-300, ROWS)), int(rng.integers(-300, COLUMNS))
+            rows, columns = rng.integers(1, 500, 2).tolist()
             found = read_cells(tmp_path / "dem.tif", row, column, rows, columns)
             there = wide[row + 600 :, column + 600 :][:rows, :columns]
             np.testing.assert_allclose(found[: len(there), : there.shape[1]], there, rtol=1e-6)
@@ -96,14 +96,16 @@ def test_a_wall_hides_what_is_behind_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("window", [(0, 0, 10, 12), (-3, -4, 9, 11), (495, 390, 12, 20)])
-def test_cells_beyond_a_raster_are_unknown(tmp_path: Path, window: tuple[int, ...]) -> None:
+def test_cells_beyond_a_raster_are_unknown(
+    tmp_path: Path, window: tuple[int, int, int, int]
+) -> None:
     values = np.arange(ROWS * COLUMNS, dtype=np.float64).reshape(ROWS, COLUMNS)
     stored(tmp_path, values)
     row, column, rows, columns = window
     wide = np.pad(values, 30, constant_values=np.nan)
     expected = wide[row + 30 : row + 30 + rows, column + 30 : column + 30 + columns]
     np.testing.assert_array_equal(read_cells(tmp_path / "dem.tif", *window), expected)
-    coarse = read_cells(tmp_path / "dem.tif", *window, 3)
+    coarse = read_cells(tmp_path / "dem.tif", *window, every=3)
     assert coarse.shape == (rows // 3, columns // 3)
     blocks = expected[: rows // 3 * 3, : columns // 3 * 3].reshape(rows // 3, 3, columns // 3, 3)
     np.testing.assert_array_equal(coarse, np.where(np.isnan(blocks).any((1, 3)), np.nan,

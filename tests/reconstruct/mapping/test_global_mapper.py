@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,6 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL, local_executor
+from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import model_groups
 from reconstruct.mapping.global_mapper import average_poses, station_groups
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
@@ -17,7 +19,7 @@ from tests.reconstruct.mapping.test_mapper import camera_rms, pupils, seen_by_pi
 from tests.reconstruct.scenes import Scene, make_scene
 
 
-def pinhole_rig(scene: Scene, lenses: dict) -> dict:
+def pinhole_rig(scene: Scene, lenses: Mapping[str, PinholeWarp]) -> dict[str, RigidTransform]:
     return {n: lenses[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
 
 

@@ -278,7 +278,7 @@ def test_a_station_that_collapsed_onto_another_is_registered_again(
     """As COLMAP's adjustment of a first pair of arbitrary scale leaves it now and then."""
     mapper, begun_from = pycolmap.incremental_mapping, []
 
-    def collapsing(database, images, output, options, **rest):  # type: ignore[no-untyped-def]
+    def collapsing(database, images, output, options, **rest):
         begun_from.append(rest.get("input_path"))
         found = mapper(database, images, output, options, **rest)
         if len(begun_from) == 1:

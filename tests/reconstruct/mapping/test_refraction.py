@@ -10,6 +10,7 @@ import pytest
 
 from alice_survey.base.frames import Array
 from camera_calib.ports.dome import DomePort
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, adjust_freely, refract
 from reconstruct.mapping.working_range import WorkingDistances, warp_record
@@ -38,13 +39,15 @@ def scene_at(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> Scene:
 
 
 @cache
-def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapped, object]:
+def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapped, Observations]:
     scene = scene_at(port_m, tilt_deg, noise_px)
     seen, warps = warped_scene(scene)
     return near_truth(scene, seen, warps, np.random.default_rng(1)), seen
 
 
-def exact(scene: Scene, start: tuple[Mapped, object], folder: Path) -> tuple[Mapped, Convergence]:
+def exact(
+    scene: Scene, start: tuple[Mapped, Observations], folder: Path
+) -> tuple[Mapped, Convergence]:
     return refract(start[0], start[1], folder)
 
 

@@ -79,7 +79,10 @@ def test_a_part_keeps_what_every_cell_wants() -> None:
             xy = np.array([k.xy for k in here.points2D if k.has_point3D()]).reshape(-1, 2)
             counts.append(
                 np.histogram2d(
-                    *xy.T, bins=8, range=((0, image.camera.width), (0, image.camera.height))
+                    xy[:, 0],
+                    xy[:, 1],
+                    bins=8,
+                    range=((0, image.camera.width), (0, image.camera.height)),
                 )[0]
             )
         every, kept = counts

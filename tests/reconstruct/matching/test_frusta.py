@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
@@ -23,17 +23,15 @@ def forward_rig() -> Rig:
     """Of the scenes, looking ahead with the image's top up."""
     rig = make_scene(lines=1, stations=2, points=20).rig
     ahead = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    return replace(rig, body_from_rig=RigidTransform.from_components([0, 0, 0], ahead_of(ahead)))
-
-
-def ahead_of(matrix: Array) -> object:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(matrix)
+    return replace(
+        rig, body_from_rig=RigidTransform.from_components([0, 0, 0], Rotation.from_matrix(ahead))
+    )
 
 
 def records_at(
-    places_ned: Array, headings_deg: Sequence[float], cameras: Sequence[str] = ("left", "right")
+    places_ned: Array,
+    headings_deg: Sequence[float] | Array,
+    cameras: Sequence[str] = ("left", "right"),
 ) -> list[ImageRecord]:
     geodetic = DATUM.geodetic_from_ned(np.asarray(places_ned, dtype=np.float64))
     return [

@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from reconstruct.matching import matches as matching
@@ -59,7 +60,9 @@ def test_too_few_descriptors_give_no_match(n: int, m: int) -> None:
     ).shape == (0, 2)
 
 
-def pair_task(folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, Array]) -> PairTask:
+def pair_task(
+    folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, NDArray[np.int64]]
+) -> PairTask:
     """Two pictures of one camera with features (pixels and descriptors) saved in a folder."""
     paths = [folder / "a.npz", folder / "b.npz"]
     for path, (pixels, descriptors) in zip(paths, sides, strict=True):

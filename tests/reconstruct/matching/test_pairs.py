@@ -92,7 +92,7 @@ def test_footprints_have_the_size_of_the_exact_port_camera() -> None:
     level = [replace(r, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0) for r in scene.records[:2]]
     left, right = footprints(level, scene.rig, DATUM)
     camera = scene.rig.cameras["left"]
-    depth = ALTITUDE_M + camera.port.port_distance_m + camera.port.glass_thickness_m
+    depth = ALTITUDE_M + camera.parameter("port_distance_m") + camera.parameter("glass_thickness_m")
     corners = camera.at_depth(camera.border(8), depth)
     across, along = np.ptp(corners[:, 0]), np.ptp(corners[:, 1])
     south, west, north, east = left.bounds
@@ -141,9 +141,9 @@ def test_cameras_that_see_nothing_together_are_paired_across_stations() -> None:
     shared = {(i, j): len(np.intersect1d(scene.ids[i], scene.ids[j])) for i, j in (*sure, *maybe)}
     cameras: dict[frozenset[str], list[int]] = {}
     for i, j in sure:
-        one, other = scene.records[i], scene.records[j]
-        if one.station != other.station:
-            cameras.setdefault(frozenset((one.camera, other.camera)), []).append(shared[i, j])
+        here, there = scene.records[i], scene.records[j]
+        if here.station != there.station:
+            cameras.setdefault(frozenset((here.camera, there.camera)), []).append(shared[i, j])
     assert set(cameras) >= {frozenset(("fore", "aft")), frozenset(("fore", "beside"))}
     assert frozenset(("aft", "beside")) not in cameras
     assert len(cameras[frozenset(("fore", "aft"))]) >= 5
@@ -298,7 +298,9 @@ def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
 def test_pictures_that_see_the_horizon_are_paired_by_order_and_looks(off_nadir_deg: float) -> None:
     scene = make_scene(lines=1, stations=70, points=50)
     tilt = RigidTransform.from_rotation(Rotation.from_euler("x", off_nadir_deg, degrees=True))
-    rig = replace(scene.rig, body_from_rig=scene.rig.body_from_rig * tilt)
+    upright = scene.rig.body_from_rig
+    assert upright is not None
+    rig = replace(scene.rig, body_from_rig=upright * tilt)
     assert not placed_pictures(scene.records, rig, DATUM)
     sure, maybe = choose_pairs(scene.records, rig, DATUM, alike=[(0, 60)])
     assert set(sure) == neighbours(scene.records, NEIGHBOURS)

@@ -1,5 +1,6 @@
 """Shares of cells against shapely, and sums over several polygons against draws of errors."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def test_the_sigma_of_a_sum_is_that_of_draws(sigmas: Sigmas, tmp_path: Path) -> 
         area = figures_of_all(surface, parts)[0]
         missed.append(area.value - true)
         stated.append(area.sigma)
-        apart.append(np.hypot(*(figures_of_all(surface, [one])[0].sigma for one in parts)))
+        apart.append(math.hypot(*(figures_of_all(surface, [one])[0].sigma for one in parts)))
     ratio = float(np.sqrt(np.mean(np.square(missed))) / np.mean(stated))
     assert 0.7 < ratio < 1.4  # 40 draws know a sigma to 11 %
     together = np.mean(stated) / np.mean(apart)

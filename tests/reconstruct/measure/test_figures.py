@@ -184,12 +184,12 @@ def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> 
     stated = defaultdict(list)
     for _ in range(40):
         surface, moved = drawn.draw(rng)
-        line = named(measure_line(surface, moved(places).tolist()))
+        lengths = named(measure_line(surface, moved(places).tolist()))
         corners = moved(np.array(SLANTED)).tolist()
-        region = named(measure_polygon(surface, corners, -10.05)[0])
+        areas = named(measure_polygon(surface, corners, -10.05)[0])
         found = {
-            **{f"line {name}": one for name, one in line.items()},
-            **region,
+            **{f"line {name}": one for name, one in lengths.items()},
+            **areas,
             "rim": named(measure_polygon(surface, corners, "rim")[0])["volume"],
         }
         for name, one in found.items():

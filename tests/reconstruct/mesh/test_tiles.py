@@ -78,7 +78,7 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     uv = array(primitive["attributes"]["TEXCOORD_0"], 2)
     (image,) = tree["images"]
     page = cv2.imdecode(np.frombuffer(view(image["bufferView"]), np.uint8), cv2.IMREAD_COLOR)
-    enu = place[:, [0, 2, 1]] * np.float32([1, -1, 1])  # as 3D Tiles turns y up to z up
+    enu = place[:, [0, 2, 1]] * np.array([1, -1, 1], np.float32)  # as 3D Tiles turns y up to z up
     return enu, array(primitive["indices"], 1).reshape(-1, 3).astype(np.int32), uv, page
 
 

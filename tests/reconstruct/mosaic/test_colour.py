@@ -1,6 +1,7 @@
 """Known lamp, water and range, and whether the survey's pictures determine them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,7 +102,8 @@ def oblique_chain() -> tuple[LightSamples, list[PictureMeasures]]:
             ahead - 0.25 * view, heights[view]
         )
 
-    rows, facts = [], []
+    rows: list[tuple[Any, ...]] = []
+    facts = []
     for view in range(count):
         for other in range(view + 1, min(view + 5, count)):
             ahead = 0.25 * view + rng.uniform(0.5, 5, 400)
@@ -188,7 +190,7 @@ def test_a_card_makes_light_its_reflectance(wanted: Colour) -> None:
 def test_few_pictures_leave_the_haze_and_no_overlaps_leave_all() -> None:
     samples, facts = survey(0.4)
     full = solve_colour("water", samples, facts)
-    few = solve_colour("water", part(samples, (samples.views < 8).all(axis=1)), facts[:8])
+    few = solve_colour("water", part(samples, np.all(samples.views < 8, axis=1)), facts[:8])
     assert few.water is not None
     assert (few.water.share == 0).all()
     assert set(few.notes) - set(full.notes)
@@ -228,8 +230,7 @@ def test_one_pass_over_pixels_equals_the_steps_over_pictures(wanted: Colour) -> 
     ranges = rng.uniform(1.6, 2.4, (7, 9)).astype(np.float32)
     ranges[2, 3] = np.nan
     factor = np.full((3, 3, 3), 1.3, np.float32)
-    places = np.column_stack([(x.ravel() + 0.5) / 640, (y.ravel() + 0.5) / 480])
-    places = places.astype(np.float32)
+    places = np.column_stack([(x.ravel() + 0.5) / 640, (y.ravel() + 0.5) / 480]).astype(np.float32)
     lifted = model.corrected(light, "left", IMAGES[3], places, ranges) * 1.3
     expected = np.minimum(encoded(((lifted - model.black) / (1 - model.black)).clip(0, 4)), 600)
     found = light.copy()

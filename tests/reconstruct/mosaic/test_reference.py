@@ -8,7 +8,7 @@ import pytest
 
 from alice_survey.base.errors import WorkspaceError
 from reconstruct.mosaic.picture_measures import linear_table
-from reconstruct.mosaic.reference import read_references
+from reconstruct.mosaic.reference import ReferencePatch, read_references
 from tests.oracles_dense import Scene, flat, sparse_model, stereo_views, write_workspace
 
 CARD = (60, 120, 180)
@@ -32,7 +32,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def references(workspace: Path, rows: str) -> tuple[object, ...]:
+def references(workspace: Path, rows: str) -> tuple[ReferencePatch, ...]:
     (workspace / "colour_reference.csv").write_text(HEADER + rows)
     return read_references(workspace, [IMAGE])
 

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from reconstruct.dense.cloud import write_cloud, write_cloud_json
 from reconstruct.mosaic import run
 from reconstruct.mosaic.picture_measures import encoded, linear_table
 from reconstruct.mosaic.run import _dispersion
+from reconstruct.mosaic.writers import write_tiles
 from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
@@ -277,14 +279,14 @@ def test_labels_beyond_65535_stay_apart(
 ):
     """The same survey whose views are the last of 70,000 is painted the same, by other numbers."""
     before = 70_000
-    views_of, write = run._seen_views, run.write_tiles
+    views_of: Any = run._seen_views
 
     def later_views(*arguments):
         return [replace(entry, number=entry.number + before) for entry in views_of(*arguments)]
 
-    def write_all(*arguments):
-        *others, names, threads = arguments
-        return write(*others, [*map(str, range(before)), *names], threads)
+    def write_all(rough, source, grid, frame, groups, names, threads):
+        every = [*map(str, range(before)), *names]
+        return write_tiles(rough, source, grid, frame, groups, every, threads)
 
     monkeypatch.setattr(run, "_seen_views", later_views)
     monkeypatch.setattr(run, "write_tiles", write_all)

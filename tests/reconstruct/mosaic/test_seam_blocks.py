@@ -1,6 +1,7 @@
 """Blocks whose seams are solved at once stay small where many pictures see each spot."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,9 +67,10 @@ def test_cells_of_neighbours_are_where_they_lie(tmp_path: Path) -> None:
         label = rows[:, None] * columns + across + 1
         np.save(label_path_of_core(survey, block.core), label.astype(np.int32))
     for block, cores in in_passes(blocks)[1]:
+        nothing: Any = None
         task = PaintTask(
-            survey=survey, block=block, views=(), colour=None, even=True, settled=cores
-        )  # type: ignore[arg-type]
+            survey=survey, block=block, views=(), colour=nothing, even=True, settled=cores
+        )
         settled = settled_around(task)
         rows = np.arange(settled.shape[0]) + block.window.row_off // CELL_PX
         across = np.arange(settled.shape[1]) + block.window.col_off // CELL_PX

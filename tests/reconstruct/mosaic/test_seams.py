@@ -30,8 +30,8 @@ def test_labels_are_close_to_the_best_of_all() -> None:
 def test_a_seam_goes_around_what_two_views_show_differently() -> None:
     rows, columns = 24, 40
     east = np.arange(columns) / columns
-    qualities = np.stack([np.tile(1.2 - east, (rows, 1)), np.tile(0.2 + east, (rows, 1))])
-    qualities = qualities.astype(np.float32)
+    falling, rising = np.tile(1.2 - east, (rows, 1)), np.tile(0.2 + east, (rows, 1))
+    qualities = np.stack([falling, rising]).astype(np.float32)
     number, share, row_of = candidates(qualities, np.array([7, 9], np.int32))
     thing = np.zeros((rows, columns), bool)
     thing[8:16, 16:26] = True  # astride the line at which the qualities are equal

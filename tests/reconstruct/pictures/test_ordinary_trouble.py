@@ -188,11 +188,9 @@ class _FakeHeif(ImageFile.ImageFile):
 
 @pytest.fixture
 def heif(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    module = ModuleType("pillow_heif")
-    module.register_heif_opener = (
-        lambda: Image.register_open(  # type: ignore[attr-defined]
-            "HEIF", _FakeHeif, lambda head: head[:4] == b"HEIC"
-        )
+    module: Any = ModuleType("pillow_heif")
+    module.register_heif_opener = lambda: Image.register_open(
+        "HEIF", _FakeHeif, lambda head: head[:4] == b"HEIC"
     )
     monkeypatch.setitem(sys.modules, "pillow_heif", module)
     can_read_heic.cache_clear()

@@ -81,7 +81,7 @@ def test_warped_pictures_carry_their_own_coordinates(lens: PinholeWarp, tmp_path
     pinhole = lens.pinhole
     assert warped.shape == (pinhole.height_px, pinhole.width_px, 3)
     rows, columns = np.nonzero(valid)
-    source = lens.from_pinhole(np.stack([columns, rows], axis=1) + 0.5) - 0.5
+    source = lens.from_pinhole(np.stack([columns, rows], axis=1).astype(float) + 0.5) - 0.5
     inner = np.all((source > 2) & (source < [WIDTH - 3, HEIGHT - 3]), axis=1)
     assert inner.mean() > 0.9
     shown = warped[rows, columns, :2][inner].astype(float) / [0.75, 1.0]

@@ -34,8 +34,8 @@ def two_dives(seed: int, jump_m: float, *, restart: bool = True) -> list[ImageRe
 def test_long_gaps_lie_between_dives() -> None:
     time = np.array([0.0, 2.5, 5.0, 65.0, 67.5, 1000.0, 1002.0])
     assert dives_of(time).tolist() == [0, 0, 0, 0, 0, 1, 1]
-    assert dives_of(100.0 * np.arange(5)).tolist() == [0] * 5
-    assert dives_of(400.0 * np.arange(5)).tolist() == [0] * 5
+    assert dives_of(100.0 * np.arange(5.0)).tolist() == [0] * 5
+    assert dives_of(400.0 * np.arange(5.0)).tolist() == [0] * 5
 
 
 @pytest.mark.parametrize("restart", [True, False])

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -244,7 +245,7 @@ def test_a_patch_that_navigation_does_not_place_is_left_out(
     mapped = mapped_apart(scene, tmp_path, 3)
     of_frame = dict(zip(frames_of(mapped.model), model_groups(mapped.model), strict=True))
     blind = {station - 1 for station, group in of_frame.items() if group == 1}
-    silent = {"latitude_deg": np.nan, "longitude_deg": np.nan}
+    silent: dict[str, Any] = {"latitude_deg": np.nan, "longitude_deg": np.nan}
     records = [replace(r, **silent) if r.station in blind else r for r in scene.records]
     found = join_groups(mapped, records, scene.rig, DATUM)
     left = {scene.records[n - 1].station for n, i in found.model.images.items() if i.has_pose}

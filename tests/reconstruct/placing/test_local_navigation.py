@@ -124,9 +124,11 @@ def placed_by_one_camera(
     scene = replace(
         whole,
         rig=part_of_rig(whole.rig, ["left"]),
-        **{name: [getattr(whole, name)[i] for i in mono]
-           for name in ("records", "ned_from_cam", "pixels", "ids")},
-    )  # fmt: skip
+        records=[whole.records[i] for i in mono],
+        ned_from_cam=[whole.ned_from_cam[i] for i in mono],
+        pixels=[whole.pixels[i] for i in mono],
+        ids=[whole.ids[i] for i in mono],
+    )
     seen, warps = warped_scene(scene)
     model = near_truth(scene, seen, warps, np.random.default_rng(1), (0.0, 0.0)).model
     back = truth.rotation.inv()

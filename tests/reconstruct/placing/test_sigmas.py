@@ -1,6 +1,7 @@
 """The sigmas that a placement states are those of its errors, however correlated errors are."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def place(
     poses = [truth.inv() * pose * n for pose, n in zip(cameras, noise, strict=True)]
     floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
     centres = np.stack([pose.translation for pose in poses])
-    options = {"known_scale": 1.0} | options
+    options.setdefault("known_scale", 1.0)
     fit = fit_navigation(
         records, poses, BODY_FROM_CAM, DATUM, level(truth.inv().apply(floor), centres),
         **options,  # type: ignore[arg-type]
@@ -230,7 +231,7 @@ def test_a_drift_of_depths_is_named_and_costs_the_depth(
 
 def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:
     body = flight(1, 20)
-    unknown = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), np.nan)
+    unknown: dict[str, Any] = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), np.nan)
     records = [replace(r, **unknown) for r in flown(body, 6, 1.0)]
     fit, error, sigma = place(body, records, 1)
     about_line, about_slope, heading = np.rad2deg(sigma[3:6])

@@ -24,7 +24,9 @@ from tests.oracles_mesh import SIZE, port_rig, station_pictures, surface_points
 BASELINE_SIGMA_M = 2e-4
 
 
-def write_pair(folder: Path, rig: Rig, noise: float = 2.0, seed: int = 1) -> tuple[Path, ...]:
+def write_pair(
+    folder: Path, rig: Rig, noise: float = 2.0, seed: int = 1
+) -> tuple[Path, Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "a.png", folder / "b.png", folder / "rig.json"
     for path, picture in zip(paths, station_pictures(rig, noise, seed), strict=False):

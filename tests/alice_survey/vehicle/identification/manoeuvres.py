@@ -83,7 +83,7 @@ def fly(
     ned_from_body = Rotation.from_quat(states[:, 3:7])
     drift = ned_from_body.inv().apply(np.array([*current, 0.0]))
     return vehicle_log(
-        np.arange(rows) * ROW_S,
+        np.arange(rows, dtype=float) * ROW_S,
         source="simulated",
         position_ned=states[:, :3],
         quaternion_xyzw=states[:, 3:7],

@@ -181,11 +181,11 @@ def test_logs_without_what_a_fit_needs_are_refused(change: dict[str, Any], named
         "rpm": {t.name: np.zeros(20) for t in known.thrusters},
     }
     with pytest.raises(VehicleError, match=named):
-        make_windows(vehicle_log(np.arange(20) * 0.1, **{**enough, **change}), known)
+        make_windows(vehicle_log(np.arange(20.0) * 0.1, **{**enough, **change}), known)
 
 
 def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[str]) -> None:
-    known, time_s = vehicle_from("alice"), np.arange(60) * 0.1
+    known, time_s = vehicle_from("alice"), np.arange(60.0) * 0.1
     rpm = {t.name: np.full(60, 600.0) for t in known.thrusters}
     rpm["port"][10:14] = np.nan
     rpm["port"][30:50] = np.nan

@@ -46,7 +46,7 @@ def test_a_process_is_known_by_its_autocovariance() -> None:
 @pytest.mark.parametrize("count", [1, 6, 60])
 def test_information_is_that_of_the_written_out_matrix(count: int) -> None:
     rng = np.random.default_rng(4)
-    lags = 0.8 ** np.arange(count)
+    lags = 0.8 ** np.arange(count, dtype=float)
     runs = [rng.normal(size=(rows, 3)) for rows in (40, 25)]
     expected = sum(dense_information(run, lags) for run in runs)
     np.testing.assert_allclose(correlated_information(runs, lags), expected, rtol=1e-10, atol=1e-9)

@@ -28,7 +28,7 @@ ROWS, STEP_S = 41, 0.05
 
 
 def a_record(rng: np.random.Generator) -> Record:
-    time_s = np.arange(ROWS) * STEP_S
+    time_s = np.arange(ROWS, dtype=float) * STEP_S
     attitude = rotation_from_attitude(
         0.1 * np.sin(time_s), 0.1 * np.cos(time_s), 0.5 + 0.2 * time_s
     ).as_quat()
@@ -84,7 +84,7 @@ def test_a_window_is_what_the_simulators_equations_give() -> None:
     truth = vehicle_from("alice")
     parameters = free_parameters(truth, ("X_uu",))
     rps, load = np.array([25.0, -10.0, 12.0, 30.0, -20.0]), np.array([3.0, -2, 4, 0.1, 0.5, -1])
-    time_s = np.arange(201) * STEP_S
+    time_s = np.arange(201.0) * STEP_S
     record = Record(
         time_s, np.tile(rps, (201, 1)), np.tile(load, (201, 1)), np.tile(a_start()[:4], (201, 1)),
         np.zeros((201, 6)),
@@ -153,7 +153,7 @@ def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:
     truth = vehicle_from("alice")
     parameters = free_parameters(truth, ("X_uu",))
     lag = np.array([t.time_constant_s for t in truth.thrusters])
-    coarse_s, fine_s = np.arange(11) * 0.2, np.arange(201) * 0.01
+    coarse_s, fine_s = np.arange(11.0) * 0.2, np.arange(201.0) * 0.01
     asked = np.array([30.0, 10.0, -20.0, 40.0, -40.0])
 
     def record(time_s: Array) -> Record:

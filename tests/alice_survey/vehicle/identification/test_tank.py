@@ -139,7 +139,8 @@ def test_fits_to_different_runs_differ_by_their_sigmas(
     """Fits with one prior share its error, which does not set them apart."""
     scores = []
     for a, b in itertools.combinations(single[1], 2):
-        variance = sum(np.diag(fit.covariance - fit.prior_covariance) for fit in (a, b))
+        own = [np.diag(fit.covariance - fit.prior_covariance) for fit in (a, b)]
+        variance = np.sum(own, axis=0)
         free = ~(a.at_bound | b.at_bound)
         scores += ((a.values - b.values)[free] / np.sqrt(variance[free])).tolist()
     assert len(scores) > 60

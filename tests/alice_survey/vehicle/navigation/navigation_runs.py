@@ -177,7 +177,7 @@ def track(
         )
         return np.stack([heading, pitch, roll], axis=1), velocity, rates
 
-    time_s = np.arange(count) * dt_s
+    time_s = np.arange(count, dtype=float) * dt_s
     angles, velocity, rates = at(time_s)
     middle = at(time_s[:-1] + dt_s / 2)[1]
     steps = dt_s / 6 * (velocity[:-1] + 4 * middle + velocity[1:])

@@ -36,7 +36,7 @@ def runs(name: str) -> list[Run]:
 def test_errors_are_as_large_as_the_covariance_says(name: str, states: slice) -> None:
     nees = np.array([run.nees(states) for run in runs(name)])
     size = states.stop - states.start
-    low, high = chi2.ppf([0.025, 0.975], RUNS * size) / RUNS
+    low, high = (chi2.ppf(share, RUNS * size) / RUNS for share in (0.025, 0.975))
     mean = nees.mean(axis=0)
     assert np.mean((mean > low) & (mean < high)) >= 0.9
 

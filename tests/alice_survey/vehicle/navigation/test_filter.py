@@ -146,7 +146,7 @@ def twin_update(
     measured: list[Array] = []
     variance: list[float] = []
 
-    def add(reading: Callable[[oracle.Belief], Array], values: Array, each: Array) -> None:
+    def add(reading: Callable[..., Array], values: Array, each: Array) -> None:
         asked.append(reading)
         measured.append(values)
         variance.extend(each.tolist())

@@ -28,6 +28,7 @@ from alice_survey.vehicle.pilot.path import Path, path_from_legs
 from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
 from alice_survey.vehicle.sea import Current, constant_current, current_at
 
+Controller = Literal["sway", "los"]
 TICK_S = 0.05
 STEPS = 5
 DEEPEST_M = 40.0
@@ -215,7 +216,7 @@ def with_stops(moves: Sequence[Move], heading_rad: float = 0.0, speed_mps: float
 def launch(
     path: Path,
     name: str = "alice",
-    controller: Literal["sway", "los"] = "sway",
+    controller: Controller = "sway",
     *,
     current: tuple[float, float] = (0.0, 0.0),
     at_ned: tuple[float, float, float] = (0.0, 0.0, 0.0),

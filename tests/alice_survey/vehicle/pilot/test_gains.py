@@ -132,8 +132,8 @@ def test_slopes_are_those_of_the_forces(u: float, v: float, w: float, r: float) 
 def test_authority_is_reached_and_not_exceeded_by_any_thrusts(axis: int) -> None:
     craft, rng = vehicle_from("alice"), np.random.default_rng(axis)
     matrix = craft.configuration_matrix[list(DEGREES)]
-    upper = rng.uniform(10.0, 80.0, matrix.shape[1])
-    lower = -rng.uniform(10.0, 40.0, matrix.shape[1])
+    upper = rng.uniform(10.0, 80.0, (matrix.shape[1],))
+    lower = -rng.uniform(10.0, 40.0, (matrix.shape[1],))
     least, most = g.authority(matrix, lower, upper, axis)
     # Thrusts that push the other axes not at all form the null space of their rows: sample it.
     others = np.delete(matrix, axis, axis=0)
@@ -215,7 +215,7 @@ def test_gains_of_a_bare_axis_are_kept_where_they_damp_the_coupled_loop() -> Non
 @pytest.mark.parametrize("decay_share", [0.0, 0.5, 1.0])
 def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
     """Of the linear loop; with less drag than is fed forward, too."""
-    from scipy.signal import TransferFunction, step
+    from scipy.signal import step
 
     row = gains_of(name).axes[g.SURGE]
     body = gains_of(name).body
@@ -224,7 +224,7 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
 
     def overshoot(weight: float) -> float:
         top = [row[g.RATE] * weight + decay * decay_share, row[g.PLACE]]
-        _, out = step(TransferFunction(top, [*plant, row[g.PLACE]]), N=4000)
+        _, out = step((top, [*plant, row[g.PLACE]]), N=4000)
         return float(out.max()) - 1.0
 
     assert overshoot(row[g.WEIGHT]) < 0.05

@@ -12,7 +12,13 @@ from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot import safety
 from alice_survey.vehicle.pilot.memory import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
-from tests.alice_survey.vehicle.pilot.pilot_runs import Rows, launch, lawnmower, straight
+from tests.alice_survey.vehicle.pilot.pilot_runs import (
+    Controller,
+    Rows,
+    launch,
+    lawnmower,
+    straight,
+)
 from tests.oracles_guidance import los_offset_m
 
 
@@ -135,11 +141,13 @@ def test_a_far_vehicle_with_sway_comes_back_in_any_current() -> None:
 
 
 @pytest.mark.parametrize(("name", "controller"), [("alice", "sway"), ("sparus2", "los")])
-def test_the_start_is_reached_from_afar_against_the_current(name: str, controller: str) -> None:
+def test_the_start_is_reached_from_afar_against_the_current(
+    name: str, controller: Controller
+) -> None:
     path = lawnmower(2, 6.0)
     flight = launch(
         path, name, controller, current=(0.1, 150.0), at_ned=(-6.0, 14.0, 0.0), heading_rad=2.0
-    )  # type: ignore[arg-type]
+    )
     rows = flight.fly(300.0)
     assert rows.phases()[:3] == [DIVE, APPROACH, FOLLOW]
     first = rows.on_lines()
@@ -221,14 +229,14 @@ def test_a_slope_is_followed_without_lag(slope: float) -> None:
 
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 def test_fast_paths_slow_down_for_turns_that_are_too_tight(name: str) -> None:
-    controller = "sway" if name == "alice" else "los"
+    controller: Controller = "sway" if name == "alice" else "los"
     flight = launch(
         lawnmower(3, 8.0, speed_mps=0.5),
         name,
         controller,
         following=True,
         at_ned=(-0.5, 0.0, 0.0),
-    )  # type: ignore[arg-type]
+    )
     rows = flight.fly(110.0)
     yaw = flight.gains.axes[g.YAW, g.FASTEST]
     on_arcs = rows.report[(rows.report[:, slot.LEG].astype(int) % 4) == 3]
