@@ -34,6 +34,9 @@ _DOUBT = 0.25
 now: the whole window counts as this share of half a line spacing."""
 _OFF_PICTURES = 3.0
 """So many intervals off the route the vehicle is looked for elsewhere."""
+_ALONG = 0.5
+"""A vehicle begins a line where it goes along it for a picture's interval at this share of the
+plan's pace or more (inferred): one that turns over a line on its way down does not."""
 PRIOR_SIGMA = 0.1
 """Sigma of the pace before any line was flown (twelve simulated flights of ALICE, in currents up to
 0.3 m/s, took 1.02 to 1.14 of the time of their plans)."""
@@ -167,7 +170,7 @@ class Progress:
         """
         self._costs, self._depth_m = costs, plan.seafloor_depth_m - plan.altitude_m
         self._near_m = plan.line_spacing_m / 2
-        self._patience_s = _OFF_PICTURES * plan.interval_s
+        self._interval_s = plan.interval_s
         self._asked = dive
         self.pace = FlightPace()
         self.plan, self.dive = plan, 0 if dive is None else dive
@@ -179,6 +182,8 @@ class Progress:
         self._time_s: float | None = None
         self._off_since_s: float | None = None
         self._reference: tuple[float, float] | None = None
+        self._seen: tuple[int, float, float] | None = None
+        """Dive, planned seconds and time of where it may have begun."""
         self._times = [self._timed(one) for one in plan.dives]
 
     def _timed(self, dive: Dive) -> RouteTimes:
@@ -225,11 +230,11 @@ class Progress:
             self.is_on_route = self.is_on_route and self._off_since_s is None
             if self._off_since_s is None:
                 self._off_since_s = time_s
-            if time_s - self._off_since_s < self._patience_s and self.has_begun:
+            if time_s - self._off_since_s < _OFF_PICTURES * self._interval_s and self.has_begun:
                 return
             self.is_on_route = False
             elsewhere = self._anywhere(place_ne, heading_rad)
-            if elsewhere is None:
+            if elsewhere is None or not (self.has_begun or self._begins(time_s, *elsewhere)):
                 return
             self.dive, found = elsewhere
             self._reference = None
@@ -287,6 +292,17 @@ class Progress:
                 score = (apart_s, index, at_s)
                 best = score if best is None else min(best, score)
         return None if best is None else (best[1], best[2])
+
+    def _begins(self, time_s: float, dive: int, at_s: float) -> bool:
+        """Whether a vehicle goes along the line that it is over, for the first time of a dive."""
+        if self._seen is not None and self._seen[0] == dive and self._seen[1] <= at_s:
+            passed_s = time_s - self._seen[2]
+            if passed_s < self._interval_s:
+                return False
+            if at_s - self._seen[1] >= _ALONG * passed_s:
+                return True
+        self._seen = (dive, at_s, time_s)
+        return False
 
     def _measure_pace(self, before_s: float, time_s: float) -> None:
         """Note the time that was taken where the middle of a line is passed.

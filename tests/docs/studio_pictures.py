@@ -11,10 +11,15 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tests.alice_survey.kit.browser import chromium
 from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.journey_page import begun_page, button
+from tests.alice_survey.studio.test_follow_browser import SimulatedDive
 from tests.alice_survey.studio.test_model_browser import click
 from tests.docs.pages import DOCS
+from tests.missions.follow.dives import text_of
 
 WIDE, NARROW = {"width": 1280, "height": 800}, {"width": 400, "height": 800}
 WAIT_MS = 60_000
@@ -29,21 +34,29 @@ def main() -> None:
     out.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(shutil.copytree(workspace, Path(scratch) / "reef"))
+        dive = SimulatedDive.read(copy)
+        until_s = float(np.mean(dive.on_lines[2]))
+        (copy / "nav.csv").write_bytes(text_of(dive.between(0.0, until_s)))
         with serving(copy) as server, chromium() as browser:
             page = browser.new_page(viewport=WIDE, reduced_motion="reduce")
             page.set_default_timeout(WAIT_MS)
             page.goto(server.address)
             page.wait_for_selector("body[data-ready]")
-            for name in ("model", "pictures", "run", "plan"):
+            before = {"model": measure, "pictures": open_pictures, "follow": follow}
+            for name in ("follow", "model", "pictures", "run", "plan"):
                 page.locator(f"#tab-{name}").click()
                 page.wait_for_timeout(4000)
-                {"model": measure, "pictures": open_pictures}.get(name, lambda _: None)(page)
+                before.get(name, lambda _: None)(page)
                 photograph(page, out / f"{name}.jpg")
             page = browser.new_page(viewport=NARROW, reduced_motion="reduce")
             page.goto(f"{server.address}#plan")
             page.wait_for_selector("#panel-plan[data-read]", timeout=WAIT_MS)
             page.wait_for_timeout(3000)
             photograph(page, out / "narrow.jpg")
+        with serving(Path(scratch) / "bay") as server, begun_page(WIDE) as (page, _):
+            page.goto(server.address)
+            button(page, "Plan a survey").click()
+            photograph(page, out / "begin.jpg")
 
 
 def measure(page: Any) -> None:
@@ -71,6 +84,14 @@ def open_pictures(page: Any) -> None:
     page.locator("#map-canvas").focus()
     page.keyboard.press("Enter")
     page.locator(".picture-view[data-ready]").nth(3).wait_for(timeout=WAIT_MS)
+    page.wait_for_timeout(1500)
+
+
+def follow(page: Any) -> None:
+    """A dive that has lost a stretch of its second line, with lines that close the hole."""
+    page.get_by_label("Navigation CSV of this workspace").select_option("nav.csv")
+    button(page, "Follow it").click()
+    page.wait_for_selector("#panel-follow button.primary:enabled", timeout=WAIT_MS)
     page.wait_for_timeout(1500)
 
 

@@ -2,7 +2,7 @@
 
 import base64
 import binascii
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,6 +25,13 @@ from reconstruct.pictures.preview import cameras_in, preview_import
 _MOST_BYTES = 12 << 20
 _COLOUR = '[reconstruct]\ncolour = "{}"\n'
 """Settings of a survey of real pictures that has no others."""
+_TRIAL: Values = {
+    "seafloor": {"grid_m": 0.02},
+    "imaging": {"scale": 6, "pool_views": 12},
+    "reconstruct": {"max_features": 1200},
+}
+"""Settings that take a few square metres from plan to report within minutes; the number of features
+is what pictures of a quarter of a megapixel hold."""
 _SINGLE = tuple(suffix for suffix in SUFFIXES if suffix != ".shp")
 """Kinds of area files that are one file."""
 
@@ -48,6 +55,7 @@ class _NewSurvey(Config):
     seafloor_depth_m: float | None = None
     focal_mm: float | None = None
     area: _DroppedArea | None = None
+    trial: bool = False
 
 
 class _NewPictures(Config):
@@ -85,7 +93,10 @@ class _StartPage:
         asked = call.read(_NewSurvey)
         workspace = self.studio.workspace.folder
         area = ("latitude_deg", "longitude_deg", "length_m", "width_m", "seafloor_depth_m")
-        values = {"area": _given(asked, area), "camera": _given(asked, ("focal_mm",))}
+        values: dict[str, Mapping[str, Any]] = {
+            "area": _given(asked, area), "camera": _given(asked, ("focal_mm",)),
+            **(_TRIAL if asked.trial else {}),
+        }  # fmt: skip
         if (asked.latitude_deg is None) != (asked.longitude_deg is None):
             raise AliceError("latitude and longitude go together: give both, or neither")
         if (workspace / "survey.toml").exists():

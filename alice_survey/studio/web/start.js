@@ -38,6 +38,7 @@ function planForm(studio) {
   const along = numeric({min: 0.1, max: 10000, value: "15"});
   const across = numeric({min: 0.1, max: 10000, value: "17"});
   const lens = el("select", {}, el("option", {value: "12.5"}, "12.5 mm: sees 2 m across from 2 m"), el("option", {value: "25"}, "25 mm: half as wide, twice as fine"));
+  const trial = el("input", {type: "checkbox", onchange: () => { [along.value, across.value] = trial.checked ? ["2", "2"] : ["15", "17"]; }});
   const file = el("input", {type: "file", accept: AREA_FILES});
   const place = el("fieldset", {class: "drop"}, el("legend", {}, "Where is it?"),
     el("div", {class: "row"}, field("Latitude, degrees", latitude), field("Longitude, degrees", longitude)),
@@ -59,6 +60,8 @@ function planForm(studio) {
     el("h2", {}, "Plan a survey"),
     field("Its name", name, "letters, digits and spaces"), place,
     field("Depth of the sea floor, m", depth, "about; a chart can be given later"),
+    el("div", {class: "field"}, el("label", {}, trial, " A small one, to try the program"),
+      el("small", {}, "2 x 2 m, pictures at a sixth of their resolution: from plan to report in a few minutes")),
     el("details", {}, el("summary", {}, "Size and camera"),
       el("div", {class: "row"}, field("Length, m", along), field("Width, m", across)),
       el("p", {}, "The area starts as this rectangle; draw it as it is in the Plan tab."),
@@ -73,7 +76,7 @@ function planForm(studio) {
       name: name.value.trim(), seafloor_depth_m: valueOf(depth), focal_mm: Number(lens.value),
       latitude_deg: chosen ? null : valueOf(latitude), longitude_deg: chosen ? null : valueOf(longitude),
       length_m: chosen ? null : valueOf(along), width_m: chosen ? null : valueOf(across),
-      area: chosen ? {name: chosen.name, base64: await base64(chosen)} : null,
+      area: chosen ? {name: chosen.name, base64: await base64(chosen)} : null, trial: trial.checked,
     }));
     make.disabled = false;
     if (made) reloadAt("plan");

@@ -1,53 +1,70 @@
-"""A dive followed in the browser while a process writes its log, and its hole closed."""
+"""A dive from an empty folder on, followed while its log grows, and its hole closed."""
 
 import json
-import subprocess
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 
-from tests.alice_survey.kit.browser import Heard, chromium
+from alice_survey.base.frames import Array
+from missions.values.plan_file import read_plan
 from tests.alice_survey.studio.client import ask, serving
-from tests.alice_survey.studio.test_follow import GAP, LINE_S, PLAN, ROWS, workspace_of
+from tests.alice_survey.studio.journey_page import (
+    NARROW,
+    WIDE,
+    begun_page,
+    button,
+    is_accessible,
+    opened,
+    survey_begun,
+    survey_flown,
+)
 from tests.missions.follow.dives import rows_along, text_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
-WRITER = """
-import sys, time
-log, part, pause = sys.argv[1], sys.argv[2], float(sys.argv[3])
-data = open(part, "rb").read()
-with open(log, "ab", buffering=0) as out:
-    for first in range(0, len(data), 1500):  # in the middle of lines
-        out.write(data[first:first + 1500])
-        time.sleep(pause)
-"""
 
 
-HOLES_LEFT = """() => {
-    const text = document.querySelector("[data-figure=holes]").firstChild.textContent;
-    return text === "none" || parseFloat(text) < 0.15;
-}"""
+@dataclass(frozen=True)
+class SimulatedDive:
+    """What a simulated dive has logged, but for a stretch of its second line."""
+
+    rows: Array
+    on_lines: list[Array]
+    """Times of the pictures of each line."""
+
+    @classmethod
+    def read(cls, workspace: Path) -> "SimulatedDive":
+        flight = workspace / "flight"
+        rows = np.loadtxt(flight / "navigation.csv", delimiter=",", skiprows=1, usecols=range(8))
+        triggers = np.loadtxt(flight / "triggers.csv", delimiter=",", skiprows=1)
+        lines = range(int(triggers[:, 2].max()) + 1)
+        on_lines = [triggers[triggers[:, 2] == line, 1] for line in lines]
+        lost = np.quantile(on_lines[1], [0.1, 0.9])
+        is_lost = (rows[:, 0] > lost[0]) & (rows[:, 0] < lost[1])
+        return cls(rows[~is_lost][::5], on_lines)
+
+    def between(self, begin_s: float, end_s: float) -> Array:
+        return self.rows[(self.rows[:, 0] >= begin_s) & (self.rows[:, 0] < end_s)]
 
 
-def written(log: Path, rows: Any, pause_s: float) -> subprocess.Popen[bytes]:
-    """Start a process that appends rows to a log."""
-    part = log.with_suffix(".part")
-    text = text_of(rows)
-    part.write_bytes(text.split(b"\n", 1)[1] if log.exists() else text)
-    return subprocess.Popen([sys.executable, "-c", WRITER, str(log), str(part), str(pause_s)])
+def phase(page: Any, words: str) -> None:
+    """Wait until the page says that the vehicle does this."""
+    page.wait_for_selector(f"#panel-follow .now:has-text('{words}')")
 
 
 def figure(page: Any, name: str) -> str:
     return str(page.inner_text(f'[data-figure="{name}"]')).split("\n")[0]
 
 
-def violations(page: Any) -> list[str]:
-    found = Axe().run(page).response["violations"]
-    return [f"{one['id']}: {one['nodes'][0]['html'][:200]}" for one in found]
+def figure_is(page: Any, name: str, start: str) -> None:
+    """Wait until a figure begins with these words."""
+    page.wait_for_function(
+        "([name, start]) => document.querySelector(`[data-figure=${name}]`)"
+        ".textContent.startsWith(start)",
+        arg=[name, start],
+    )
 
 
 def opaque(page: Any) -> int:
@@ -69,69 +86,64 @@ def opaque(page: Any) -> int:
     )
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 900), (400, 850)])
-def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, width: int, height: int) -> None:
-    folder = workspace_of(tmp_path / "reef")
-    log = folder / "nav.csv"
-    kept = ROWS[~GAP]
-    until_s = 100.0 + 3.5 * (LINE_S + 5.0)
-    heard = Heard()
-    with serving(folder, log=str(log)) as server, chromium() as browser:
-        page = browser.new_page(
-            viewport={"width": width, "height": height}, reduced_motion="reduce",
-            accept_downloads=True,
-        )  # fmt: skip
-        heard.listen(page)
-        page.goto(server.address + "#follow")
-        page.wait_for_selector("#panel-follow .now:has-text('first position')", timeout=60_000)
+@pytest.mark.parametrize("size", [WIDE, NARROW], ids=["1280", "400"])
+def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, int]) -> None:
+    reef = tmp_path / "reef"
+    with serving(reef) as server, begun_page(size) as (page, heard):
+        survey_begun(page, server.address, length_m=3.0, width_m=3.0)
+        survey_flown(page)
+        plan = read_plan(reef / "plan" / "plan.json")
+        dive = SimulatedDive.read(reef)
+        first_s, third_s = (float(np.mean(dive.on_lines[line])) for line in (0, 2))
+        end_s = float(dive.on_lines[-1].max()) + 3.0
+        log = reef / "nav.csv"
 
-        writer = written(log, kept[kept[:, 0] < until_s], 0.5)
-        page.wait_for_selector("#panel-follow .now:has-text('On line 1')", timeout=60_000)
-        page.wait_for_selector("img.follow-block", timeout=60_000)
+        def come(*rows: Array) -> None:
+            text = text_of(np.concatenate(rows)).split(b"\n", 1)[1]
+            for part in (text[:-20], text[-20:]):  # in the middle of a line
+                with log.open("ab") as file:
+                    file.write(part)
+
+        log.write_bytes(text_of(dive.rows[:1]))
+        opened(page, "Follow")
+        page.get_by_label("Navigation CSV of this workspace").select_option("nav.csv")
+        button(page, "Follow it").click()
+        come(dive.between(0.01, first_s))
+        phase(page, "On line 1")
+        page.wait_for_selector("img.follow-block")
         early = opaque(page)
-        page.wait_for_selector("#panel-follow .now:has-text('On line 4')", timeout=60_000)
-        assert writer.wait(30) == 0
-        assert opaque(page) > 1.5 * early > 0
+        come(dive.between(first_s, third_s))
+        phase(page, "On line 3")
         page.wait_for_function(
-            "() => parseFloat(document.querySelector('[data-figure=holes]').textContent) > 2"
+            "() => parseFloat(document.querySelector('[data-figure=holes]').textContent) > 0.4"
         )
-        assert figure(page, "lines") == f"{len(PLAN.lines) - 3} of {len(PLAN.lines)}"
-        page.wait_for_selector("#panel-follow p:has-text('for 2.')", timeout=90_000)
-        assert violations(page) == []
-        page.screenshot(path=str(tmp_path / f"hole-{width}.png"), full_page=width < 700)
-        # Nothing comes any more.
-        page.wait_for_selector("#panel-follow .now.bad:has-text('No news for')", timeout=60_000)
-        page.screenshot(path=str(tmp_path / f"silent-{width}.png"), full_page=width < 700)
-        assert violations(page) == []
+        assert float(figure(page, "holes").split()[0]) < 1.2
+        assert opaque(page) > 1.5 * early > 0
+        assert figure(page, "lines") == f"{len(plan.lines) - 2} of {len(plan.lines)}"
+        page.wait_for_selector("#panel-follow button.primary:enabled")
+        is_accessible(page, tmp_path / "hole.png")
+        # Nothing comes for a while.
+        page.wait_for_selector("#panel-follow .now.bad:has-text('No news for')")
+        is_accessible(page, tmp_path / "silent.png")
 
         offered = json.loads(ask(server, "/api/follow/proposal").text)["proposal"]
         with page.expect_download() as waiting:
-            page.click("#panel-follow button.primary")
+            button(page, "Accept and download").click()
         assert waiting.value.suggested_filename == "holes.zip"
-        page.wait_for_function(HOLES_LEFT)
+        figure_is(page, "lines", f"{len(plan.lines) - 2 + len(offered['lines'])} of")
         # The rest of the plan, and then the lines accepted.
-        rest = kept[kept[:, 0] >= until_s]
-        again = rows_along(offered["route_ne"], PLAN, float(rest[-1, 0]) + 0.5)
-        writer = written(log, np.concatenate([rest, again]), 0.1)
-        page.wait_for_selector("#panel-follow .now:has-text('On line')", timeout=60_000)
-        assert writer.wait(60) == 0
+        come(dive.between(third_s, end_s), rows_along(offered["route_ne"], plan, end_s + 0.5))
+        figure_is(page, "lines", "0 of")
         page.wait_for_function(
-            "() => document.querySelector('[data-figure=lines]').textContent.startsWith('0 ')",
-            timeout=60_000,
+            "() => /^(none|0.0 m²)/.test(document.querySelector('[data-figure=holes]').textContent)"
         )
         assert float(figure(page, "overlap").split()[0]) > 99.0
-        assert page.evaluate(HOLES_LEFT)
-        page.screenshot(path=str(tmp_path / f"closed-{width}.png"), full_page=width < 700)
-        assert violations(page) == []
+        is_accessible(page, tmp_path / "closed.png")
         # A finished log is flown again, for training.
-        page.click("#panel-follow summary:has-text('Choose a log')")
-        page.click("#panel-follow button:has-text('Stop')")
-        page.wait_for_selector("#panel-follow .now:has-text('No dive is followed')")
-        page.screenshot(path=str(tmp_path / f"choose-{width}.png"), full_page=width < 700)
-        assert violations(page) == []
-        page.select_option("#panel-follow select >> nth=-1", "50")
-        page.click("#panel-follow button:has-text('Replay it')")
-        page.wait_for_selector("#panel-follow .now:has-text('On line 2')", timeout=60_000)
-        overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")
-        assert overflow <= 0
-    assert heard.complaints == []
+        page.get_by_text("Choose a log", exact=True).click()
+        button(page, "Stop").click()
+        phase(page, "No dive is followed")
+        page.get_by_label("Pace of a replay").select_option("200")
+        button(page, "Replay it").click()
+        phase(page, "On line 2")
+        assert heard.complaints == []

@@ -1,7 +1,12 @@
-"""Whole journeys through the studio, from an empty folder to a result."""
+"""Whole journeys through the studio, from an empty folder to a result, at 1280 and 400 px.
+
+A dive is followed from an empty folder on in `test_follow_browser.py`.
+"""
 
 import csv
+import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,90 +14,190 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.studio.client import FOLDED, serving
+from reconstruct.placing.control_file import read_control, read_picks
+from tests.alice_survey.kit.browser import Heard
+from tests.alice_survey.studio.client import ask, serving
+from tests.alice_survey.studio.journey_page import (
+    LONG_MS,
+    NARROW,
+    WIDE,
+    begun_page,
+    button,
+    is_accessible,
+    made,
+    opened,
+    survey_begun,
+    survey_flown,
+)
+from tests.alice_survey.studio.picture_page import PicturePage, said
 from tests.alice_survey.studio.test_model_browser import click, kept
 from tests.alice_survey.studio.test_model_browser import named as figures
-from tests.alice_survey.studio.test_pictures_browser import moved_to, said
+from tests.alice_survey.studio.test_pictures import Truth
 from tests.alice_survey.studio.test_plan_browser import PlanPage
 from tests.docs import given_divers as dive
 
+Point = NDArray[np.float64]
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
-WIDE, NARROW = {"width": 1280, "height": 900}, {"width": 400, "height": 850}
-LONG_MS = 400_000
-WAIT_MS = 60_000
+AT_BOTH = pytest.mark.parametrize("journey", [WIDE, NARROW], indirect=True, ids=["1280", "400"])
 
 
 @pytest.fixture
 def journey(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Heard]]:
     """A page, 1280 px wide unless a test says otherwise, and what it complains about."""
-    size = getattr(request, "param", WIDE)
-    with chromium() as browser:
-        page = browser.new_page(viewport=size, reduced_motion="reduce")
-        page.set_default_timeout(WAIT_MS)
-        heard = Heard()
-        heard.listen(page)
-        page.add_init_script(FOLDED)
-        yield page, heard
-        page.close()
+    with begun_page(getattr(request, "param", WIDE)) as page_and_heard:
+        yield page_and_heard
 
 
-def button(page: Any, name: str) -> Any:
-    return page.get_by_role("button", name=name, exact=True)
-
-
-def made(page: Any, stage: str) -> None:
-    """Wait until a stage is made."""
-    page.wait_for_selector(f"[data-stage={stage}][data-state='up to date']", timeout=LONG_MS)
-
-
-def is_accessible(page: Any) -> None:
-    """No violations that axe knows, and nothing wider than the screen."""
-    found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
-    assert [(one["id"], one["nodes"][0]["target"]) for one in found] == []
-    width = page.viewport_size["width"]
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-
-
-@pytest.mark.parametrize("journey", [WIDE, NARROW], indirect=True, ids=["1280", "400"])
+@AT_BOTH
 def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path: Path) -> None:
     page, heard = journey
     reef = tmp_path / "reef"
     with serving(reef) as server:
         page.goto(server.address)
+        page.wait_for_selector(".start")
+        is_accessible(page, tmp_path / "start.png")
         button(page, "Plan a survey").click()
+        assert page.get_by_label("Its name").input_value() == "reef"
         page.get_by_label("Latitude, degrees").fill("43.05")
         page.get_by_label("Longitude, degrees").fill("5.92")
         page.get_by_label("Depth of the sea floor, m").fill("12")
+        assert not (reef / "survey.toml").exists()
         with page.expect_navigation():
             button(page, "Make the survey").click()
-        page.wait_for_selector("#panel-plan[data-read]", timeout=WAIT_MS)
+        page.wait_for_selector("#panel-plan[data-read]")
         plan = PlanPage(page=page, heard=heard)
-        plan.page.wait_for_timeout(500)
+        plan.settled()
         page.get_by_role("button", name=re.compile("^Delete")).first.click()
         page.wait_for_timeout(500)
         plan.draw("Survey area", ((2.0, 2.0), (2.0, 5.0), (4.5, 5.0), (4.5, 2.0)))
-        is_accessible(page)
-        button(page, "Save").click()
-        page.wait_for_function(
-            "() => document.getElementById('status').textContent.startsWith('Saved')",
-            timeout=WAIT_MS,
-        )
-        page.get_by_role("tab", name="Run").click()
-        made(page, "plan")
-        page.get_by_label("Start: Fly the plan").click()
-        made(page, "fly")
-        is_accessible(page)
+        is_accessible(page, tmp_path / "drawn.png")
+        survey_flown(page)
+        page.get_by_role("heading", name="Fly the plan: done").wait_for()
+        page.get_by_text("Log", exact=True).click()
+        page.get_by_text("run finished: exit code 0").wait_for()
+        page.get_by_text("Earlier runs").click()
+        page.get_by_role("row").nth(2).wait_for()
+        assert "of disk" in page.locator("section[aria-label=Start]").inner_text()
+        is_accessible(page, tmp_path / "flown.png")
+        with page.expect_popup() as popup:
+            page.get_by_role("link", name="the plan as a page").click()
+        popup.value.wait_for_load_state()
+        assert popup.value.title().startswith("reef")
+        popup.value.close()
         assert heard.complaints == []
     with (reef / "flight" / "triggers.csv").open(newline="") as rows:
         assert len(list(csv.DictReader(rows))) > 10
 
 
-Point = NDArray[np.float64]
+@pytest.fixture(scope="module")
+def modelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stereo survey from an empty folder to its model, made once through the page.
+
+    Its first half is seen at 1280 px, the second at 400.
+    """
+    folder = tmp_path_factory.mktemp("stereo")
+    with serving(folder / "reef") as server, begun_page(WIDE) as (page, heard):
+        survey_begun(page, server.address, length_m=1.3, width_m=1.5)
+        survey_flown(page)
+        page.set_viewport_size(NARROW)
+        button(page, "Make all that is left").click()
+        done = page.get_by_role("heading", name="Make all that is left: done")
+        done.wait_for(timeout=LONG_MS)
+        made(page, "mesh")
+        is_accessible(page, folder / "modelled.png", (WIDE, NARROW))
+        assert heard.complaints == []
+    return folder / "reef"
+
+
+def truth_of(workspace: Path, count: int) -> tuple[Truth, list[Point]]:
+    """The rendered truth, and places of it that many pictures show."""
+    truth, rng = Truth(workspace), np.random.default_rng(21)
+    places = [place for place in truth.places(rng, 12) if truth.nearest(place) is not None]
+    places.sort(key=lambda place: float(np.abs(place[:2] - [0.6, 0.45]).max()))
+    return truth, places[:count]
+
+
+def pictures_with(page: Any, truth: Truth, places: list[Point]) -> PicturePage:
+    """Pick places in the picture that shows each nearest its middle, and save them as P0, P1..."""
+    camera = next(iter(truth.rig.cameras.values()))
+    pictures = PicturePage(page=page, size_px=(camera.width_px, camera.height_px))
+    page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
+    for number, place in enumerate(places):
+        found = truth.nearest(place)
+        assert found is not None
+        image, pixel = found
+        view = pictures.opened(image, *(pixel - 0.5))
+        marked = pictures.moved_to(view, *(pixel - 0.5))
+        np.testing.assert_allclose(marked, pixel - 0.5, atol=0.06)
+        assert pictures.found_in_others() > 2
+        page.get_by_text("found, sigma").nth(2).wait_for()
+        pictures.saved(f"P{number}")
+    return pictures
+
+
+@AT_BOTH
+def test_a_stereo_dive_gives_a_length_beside_its_truth(
+    journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
+) -> None:
+    page, heard = journey
+    workspace = Path(shutil.copytree(modelled, tmp_path / "reef"))
+    with serving(workspace) as server:
+        page.goto(server.address + "#pictures")
+        truth, ends = truth_of(workspace, 2)
+        pictures = pictures_with(page, truth, ends)
+        value, sigma = pictures.length("P0", "P1")
+        assert abs(value - float(np.linalg.norm(ends[0] - ends[1]))) < 4.0 * sigma < 0.004
+        is_accessible(page, tmp_path / "length.png")
+        assert heard.complaints == []
+
+
+@AT_BOTH
+def test_control_points_are_picked_and_their_residuals_shown(
+    journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
+) -> None:
+    page, heard = journey
+    workspace = Path(shutil.copytree(modelled, tmp_path / "reef"))
+    with serving(workspace) as server:
+        page.goto(server.address + "#pictures")
+        truth, places = truth_of(workspace, 3)
+        pictures_with(page, truth, places)
+        stored = read_picks(workspace / "picks.csv")
+        for number in range(3):
+            mine = [pick for pick in stored if pick.point == f"P{number}"]
+            (hand,) = (pick for pick in mine if not pick.matched_to)
+            assert hand.sigma_px == 0.05
+            assert {pick.matched_to for pick in mine} == {"", hand.image}
+
+        known = np.array(places)
+        known[2, 0] += 0.5  # is wrong
+        for number, place in enumerate(known):
+            page.get_by_text("Add a known point or length").click()
+            page.get_by_label("Point", exact=True).select_option(f"P{number}")
+            for label, coordinate in zip(("North, m", "East, m", "Depth, m"), place, strict=True):
+                page.get_by_label(label, exact=True).fill(f"{coordinate:.4f}")
+            button(page, "Save to control.csv").click()
+            button(page, f"Delete point P{number}").wait_for()
+        control = read_control(workspace / "control.csv").points
+        assert [(one.name, one.use) for one in control] == [(f"P{n}", "control") for n in range(3)]
+        spots = json.loads(ask(server, "/api/picks").text)["points"]
+        rows = page.get_by_role("row").filter(has=page.get_by_label(re.compile("^Delete point")))
+        for row, spot, place in zip(rows.all_inner_texts(), spots, known, strict=True):
+            shown = [float(text) for text in re.findall(r"now (.*?)(?:;|$)", row)[0].split(",")]
+            off = np.array([spot["spot"][axis] for axis in ("n", "e", "down")]) - place
+            np.testing.assert_allclose(np.abs(shown), 1000 * np.abs(off), rtol=0.01, atol=0.2)
+            assert ("BAD" in row) == (spot["name"] == "P2")
+        is_accessible(page, tmp_path / "control.png")
+
+        button(page, "Open P1").click()
+        page.wait_for_selector(".picture-view[data-ready]")
+        is_accessible(page, tmp_path / "picks.png")
+        button(page, "Delete P2").click()
+        said(page, "Took P2")
+        assert {pick.point for pick in read_picks(workspace / "picks.csv")} == {"P0", "P1"}
+        assert heard.complaints == []
 
 
 def pose(frame: int) -> tuple[Point, Rotation]:
@@ -131,32 +236,11 @@ def pick(page: Any, name: str, frames: list[int], point: Point, images: list[str
     """Pick a point of the floor in the picture that shows it nearest its middle, and save it."""
     half = np.array([dive.WIDTH, dive.HEIGHT]) / 2
     at = min(frames, key=lambda frame: float(np.abs(seen(frame, point) - half).max()))
-    image, (x, y) = images[frames.index(at)], seen(at, point)
-    page.get_by_text("Start from a picture").click()
-    page.get_by_label("Find").fill(image)
-    button(page, image).click()
-    view = page.locator(".picture-view[data-ready]").first
-    view.wait_for(timeout=WAIT_MS)
-    box = view.bounding_box()
-    scale = min(box["width"] / dive.WIDTH, box["height"] / dive.HEIGHT)
-    off = (np.array([x, y]) + 0.5 - half) * scale
-    view.click(position={"x": box["width"] / 2 + off[0], "y": box["height"] / 2 + off[1]})
-    page.wait_for_function(
-        "() => document.querySelectorAll('.picture-view[data-ready]').length > 3", timeout=WAIT_MS
-    )
-    page.get_by_text("Start from a picture").click()
-    moved_to(page, view, x, y)
-    page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
-    page.keyboard.press("Tab")
-    view.focus()
-    page.keyboard.press("Shift+ArrowLeft")
-    page.keyboard.press("Shift+ArrowRight")
-    button(page, "Find it in all others").click()
-    said(page, "Found in")
-    page.get_by_label("Name of the point").fill(name)
-    button(page, "Save the point").click()
-    said(page, f"Saved {name}")
-    button(page, "Back to the map").click()
+    pictures = PicturePage(page=page, size_px=(dive.WIDTH, dive.HEIGHT))
+    view = pictures.opened(images[frames.index(at)], *seen(at, point))
+    pictures.moved_to(view, *seen(at, point))
+    pictures.found_in_others()
+    pictures.saved(name)
 
 
 def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
@@ -168,11 +252,13 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
     bar = [floor(0.5, 0.2), floor(1.7, 0.9)]
     coral = [floor(0.8, 0.9), floor(1.5, 0.3)]
     with serving(workspace) as server:
+        page.set_viewport_size(NARROW)
         page.goto(server.address)
         button(page, "I have pictures").click()
         page.get_by_label("Folder of the pictures").fill(str(tmp_path / "card"))
         button(page, "Look into it").click()
         page.get_by_text(f"Found: {len(frames)} pictures").wait_for()
+        is_accessible(page, tmp_path / "found.png", (WIDE, NARROW))
         button(page, "Import them").click()
         page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
         button(page, "Reconstruct the sea floor").click()
@@ -180,8 +266,10 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
 
         with (workspace / "images" / "manifest.csv").open(newline="") as rows:
             images = sorted(row["image"] for row in csv.DictReader(rows))
-        page.get_by_role("tab", name="Pictures").click()
+        opened(page, "Pictures")
+        page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
         for number, point in enumerate((*bar, *coral)):
+            page.set_viewport_size((WIDE, NARROW)[number % 2])
             pick(page, f"end {number}", frames, point, images)
         for number in range(2):
             page.get_by_label(f"end {number}", exact=True).check()
@@ -190,31 +278,28 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
         button(page, "Set the scale").click()
         page.locator("#status", has_text="reconstruct").wait_for()
         assert (workspace / "scale.json").is_file()
-        page.get_by_role("tab", name="Run").click()
+        opened(page, "Run")
         page.wait_for_selector("[data-stage=placing]:not([data-state='up to date'])")
         button(page, "Reconstruct the sea floor").click()
         made(page, "mesh")
 
-        page.set_viewport_size(NARROW)
         page.reload()
-        page.get_by_role("tab", name="Pictures").click()
+        opened(page, "Pictures")
         true = float(np.linalg.norm(coral[1] - coral[0]))
-        for size in (NARROW, WIDE):
-            page.set_viewport_size(size)
-            for number in (2, 3):
-                page.get_by_label(f"end {number}", exact=True).check()
-            page.wait_for_selector("[data-value]", timeout=WAIT_MS)
-            is_accessible(page)
+        for number in (2, 3):
+            page.get_by_label(f"end {number}", exact=True).check()
+        page.wait_for_selector("[data-value]")
+        is_accessible(page, tmp_path / "coral.png", (WIDE, NARROW))
         shown = page.locator("[data-value]")
         off = float(shown.get_attribute("data-value")) - true
         assert abs(off) < 4.0 * float(shown.get_attribute("data-sigma"))
         assert abs(off) < 0.01 * true
 
-        page.get_by_role("tab", name="Model").click()
+        opened(page, "Model")
         for number, size in enumerate((NARROW, WIDE), start=1):
             page.set_viewport_size(size)
             measured_coral(page, number)
-            is_accessible(page)
+            is_accessible(page, tmp_path / "area.png")
         assert heard.complaints == []
 
 

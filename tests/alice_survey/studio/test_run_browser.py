@@ -1,4 +1,4 @@
-"""The first start and the Run tab in Chromium: a survey flown, pictures imported."""
+"""The first start and the Run tab in Chromium: a job stopped, a map dropped, pictures imported."""
 
 import json
 import sys
@@ -52,49 +52,6 @@ def is_accessible(page: Any) -> None:
 
 def named(page: Any, name: str) -> Any:
     return page.get_by_role("button", name=name, exact=True)
-
-
-def test_a_survey_from_an_empty_folder_is_planned_and_flown(page: Any, tmp_path: Path) -> None:
-    reef = tmp_path / "reef"
-    with serving(reef) as server:
-        page.goto(server.address)
-        page.wait_for_selector(".start")
-        is_accessible(page)
-        named(page, "Plan a survey").click()
-        assert page.get_by_label("Its name").input_value() == "reef"
-        page.get_by_label("Latitude, degrees").fill("43.05")
-        page.get_by_label("Longitude, degrees").fill("5.92")
-        page.get_by_label("Depth of the sea floor, m").fill("12")
-        page.get_by_text("Size and camera").click()
-        page.get_by_label("Length, m", exact=True).fill("1.3")
-        page.get_by_label("Width, m", exact=True).fill("1.5")
-        is_accessible(page)
-        assert not (reef / "survey.toml").exists()
-        with page.expect_navigation():
-            named(page, "Make the survey").click()
-        page.wait_for_selector("#panel-plan[data-read]", timeout=LONG_MS)
-        page.goto(server.url + "#run")
-        page.wait_for_selector("[data-stage=plan][data-state=missing]")
-        assert page.get_by_label("Start: Fly the plan").count() == 0
-        page.get_by_label("Start: Plan the survey").click()
-        page.get_by_text("running for").wait_for(timeout=LONG_MS)
-        page.wait_for_selector("[data-stage=plan][data-state=working]", timeout=LONG_MS)
-        page.wait_for_selector("[data-stage=plan][data-state='up to date']", timeout=LONG_MS)
-        page.get_by_role("heading", name="Plan the survey: done").wait_for()
-        page.get_by_label("Start: Fly the plan").click()
-        page.wait_for_selector("[data-stage=fly][data-state='up to date']", timeout=LONG_MS)
-        page.get_by_text("Log", exact=True).click()
-        page.get_by_text("run finished: exit code 0").wait_for()
-        page.get_by_text("Earlier runs").click()
-        page.get_by_role("row").nth(2).wait_for()
-        assert "of disk" in page.locator("section[aria-label=Start]").inner_text()
-        is_accessible(page)
-        with page.expect_popup() as popup:
-            page.get_by_role("link", name="the plan as a page").click()
-        popup.value.wait_for_load_state()
-        assert popup.value.title().startswith("reef")
-        popup.value.close()
-    assert json.loads((reef / "plan" / "plan.json").read_text())["stations"] > 3
 
 
 def test_a_job_is_seen_again_and_stopped(page: Any, tmp_path: Path) -> None:

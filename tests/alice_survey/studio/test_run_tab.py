@@ -164,8 +164,17 @@ def test_a_survey_is_begun_from_its_place_and_depth(server: Server, tmp_path: Pa
     assert (made.area.seafloor_depth_m, made.camera.focal_mm) == (22.5, 25.0)
     assert made.vehicle.name == "alice"
     assert (made.area.length_m, made.area.width_m) == (8.0, 6.0)
+    assert (made.imaging.scale, made.reconstruct.max_features) == (1, 8000)
     assert call(server, "/api/start/survey", values).status == 409  # there is one now
     assert load_config(tmp_path / "reef" / "survey.toml") == made
+
+
+def test_a_small_survey_to_try_has_small_pictures(server: Server, tmp_path: Path) -> None:
+    values = {"name": "Try", "length_m": 2, "width_m": 2, "trial": True}
+    assert call(server, "/api/start/survey", values).status == 200
+    made = load_config(tmp_path / "reef" / "survey.toml")
+    assert (made.imaging.scale, made.reconstruct.max_features) == (6, 1200)
+    assert (made.area.length_m, made.camera.width_px) == (2.0, 3384)
 
 
 def test_a_survey_is_begun_from_a_file_that_was_dropped(server: Server, tmp_path: Path) -> None:

@@ -74,6 +74,19 @@ def test_the_dive_is_found_by_its_lines_and_the_others_count_as_flown() -> None:
     assert progress.left == list(range(2, len(plan.lines)))
 
 
+def test_turning_over_a_line_on_the_way_down_begins_nothing() -> None:
+    progress = Progress(PLAN, COSTS)
+    last = PLAN.lines[-1]
+    place, way = np.array(last.end_ne_m), np.subtract(last.end_ne_m, last.start_ne_m)
+    along = math.atan2(way[1], way[0])
+    for i, turned in enumerate(np.linspace(-0.6, 0.6, 40)):
+        progress.add(0.5 * i, place + 0.02 * i * way / np.linalg.norm(way) / 40, along + turned)
+    assert not progress.has_begun
+    assert len(progress.left) == len(PLAN.lines)
+    fly(progress, PLAN.dives[0].route, until_m=2.0, start_s=40.0)
+    assert progress.line == 0
+
+
 def test_a_line_that_is_left_out_is_behind_and_one_flown_late_is_found_again() -> None:
     progress = Progress(PLAN, COSTS)
     route = PLAN.dives[0].route

@@ -47,6 +47,24 @@ def test_the_command_line_says_once_what_there_is_and_writes_the_lines(reef: Pat
     assert "3 done" in text
 
 
+def test_holes_of_the_last_rows_are_found_when_nothing_comes_any_more(reef: Path) -> None:
+    kept = ROWS[~GAP]
+    log = reef / "nav.csv"
+    log.write_bytes(text_of(kept[:50]))
+    session = DiveSession(reef, settings(reef, None, needed=False), str(log))
+    assert session.step(0.0) > 0
+    with log.open("ab") as file:
+        file.write(text_of(kept[50:][kept[50:, 0] < UNTIL_S]).split(b"\n", 1)[1])
+    assert session.step(0.01) > 0  # too soon after the first look for another
+    assert session.holes == ()
+    assert session.step(1000.0) == 0
+    assert 1.0 < sum(hole.area_m2 for hole in session.holes) < 4.0
+    found = session.holes
+    assert session.step(2000.0) == 0
+    assert session.holes is found  # nothing new, nothing looked for
+    session.close()
+
+
 def test_what_cannot_be_followed_is_said_in_a_line(reef: Path, tmp_path: Path) -> None:
     config = settings(reef, None, needed=False)
     with pytest.raises(NavigationError, match="port"):
