@@ -185,7 +185,8 @@ def test_control_points_are_picked_and_their_residuals_shown(
         spots = json.loads(ask(server, "/api/picks").text)["points"]
         rows = page.get_by_role("row").filter(has=page.get_by_label(re.compile("^Delete point")))
         for row, spot, place in zip(rows.all_inner_texts(), spots, known, strict=True):
-            shown = [float(text) for text in re.findall(r"now (.*?)(?:;|$)", row)[0].split(",")]
+            now = re.findall(r"now ([−\d., ]+)", row)[0].replace("−", "-")
+            shown = [float(text) for text in now.strip(", ").split(",")]
             off = np.array([spot["spot"][axis] for axis in ("n", "e", "down")]) - place
             np.testing.assert_allclose(np.abs(shown), 1000 * np.abs(off), rtol=0.01, atol=0.2)
             assert ("BAD" in row) == (spot["name"] == "P2")
