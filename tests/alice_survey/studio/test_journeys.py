@@ -173,15 +173,17 @@ def test_control_points_are_picked_and_their_residuals_shown(
 
         known = np.array(places)
         known[2, 0] += 0.5  # is wrong
+        uses = ("control", "control", "check")
         for number, place in enumerate(known):
             page.get_by_text("Add a known point or length").click()
             page.get_by_label("Point", exact=True).select_option(f"P{number}")
+            page.get_by_label("Use as").select_option(uses[number])
             for label, coordinate in zip(("North, m", "East, m", "Depth, m"), place, strict=True):
                 page.get_by_label(label, exact=True).fill(f"{coordinate:.4f}")
             button(page, "Save to control.csv").click()
             button(page, f"Delete point P{number}").wait_for()
         control = read_control(workspace / "control.csv").points
-        assert [(one.name, one.use) for one in control] == [(f"P{n}", "control") for n in range(3)]
+        assert [(one.name, one.use) for one in control] == [(f"P{n}", uses[n]) for n in range(3)]
         spots = json.loads(ask(server, "/api/picks").text)["points"]
         rows = page.get_by_role("row").filter(has=page.get_by_label(re.compile("^Delete point")))
         for row, spot, place in zip(rows.all_inner_texts(), spots, known, strict=True):
