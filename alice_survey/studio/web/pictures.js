@@ -16,6 +16,11 @@ export function tab(studio) {
   let chosen = [];
   let wall = null;
   let checking = 0;
+  const saved = new Set();  /* tokens of the files as this page has written them */
+  const own = ({token}) => {
+    saved.add(token);
+    return token;
+  };
 
   const name = el("input", {type: "text", value: "", maxlength: "100", autocomplete: "off"});
   const sigma = el("input", {type: "number", min: "0.01", max: "20", step: "any", value: "0.3"});
@@ -183,13 +188,13 @@ export function tab(studio) {
     const point = name.value.trim();
     if (!point) throw new Error("give the point a name");
     const done = await send("/api/picks/save", {token: held.token, points: [point], picks: used().map(asPick)});
-    held.token = done.token;
+    held.token = own(done);
     await load();
     say("Saved " + point + " to picks.csv.");
   }
 
   async function removePoint(point) {
-    await send("/api/picks/save", {token: held.token, points: [point], picks: []});
+    held.token = own(await send("/api/picks/save", {token: held.token, points: [point], picks: []}));
     chosen = chosen.filter((one) => one !== point);
     await load();
     say("Took " + point + " out of picks.csv.");
@@ -293,7 +298,7 @@ export function tab(studio) {
 
   async function saveControl(rows, names) {
     const done = await send("/api/control/save", {token: control.token, rows, names});
-    control.token = done.token;
+    control.token = own(done);
     await load();
     say("Saved to control.csv. Run the reconstruction for the model to use it.");
   }
@@ -320,7 +325,7 @@ export function tab(studio) {
 
   /* A while later, when a page knows what it has saved itself. */
   on("picks", ({file, token}) => setTimeout(() => {
-    if (panel.hidden || !file || token === held.token || token === control.token) return;
+    if (saved.delete(token) || panel.hidden || !file || token === held.token || token === control.token) return;
     say(file + " was changed by another page: loaded again.", "warn");
     attempt(load);
   }, 500));

@@ -171,24 +171,32 @@ def test_control_points_are_picked_and_their_residuals_shown(
             assert hand.sigma_px == 0.05
             assert {pick.matched_to for pick in mine} == {"", hand.image}
 
-        known = np.array(places)
-        known[2, 0] += 0.5  # is wrong
-        for number, place in enumerate(known):
+        def save_known(number: int, place: Point) -> None:
             page.get_by_text("Add a known point or length").click()
             page.get_by_label("Point", exact=True).select_option(f"P{number}")
             for label, coordinate in zip(("North, m", "East, m", "Depth, m"), place, strict=True):
                 page.get_by_label(label, exact=True).fill(f"{coordinate:.4f}")
             button(page, "Save to control.csv").click()
             button(page, f"Delete point P{number}").wait_for()
+
+        for number, place in enumerate(places):
+            save_known(number, place)
         control = read_control(workspace / "control.csv").points
         assert [(one.name, one.use) for one in control] == [(f"P{n}", "control") for n in range(3)]
-        spots = json.loads(ask(server, "/api/picks").text)["points"]
         rows = page.get_by_role("row").filter(has=page.get_by_label(re.compile("^Delete point")))
-        for row, spot, place in zip(rows.all_inner_texts(), spots, known, strict=True):
-            shown = [float(text) for text in re.findall(r"now (.*?)(?:;|$)", row)[0].split(",")]
+        rows.filter(has_text="fitted").nth(2).wait_for()
+        spots = json.loads(ask(server, "/api/picks").text)["points"]
+        for row, spot, place in zip(rows.all_inner_texts(), spots, places, strict=True):
+            now, fitted = (
+                np.array([float(text) for text in re.split(", ", one.strip())])
+                for one in re.findall(r"(?:now|fitted) ([-\d., ]+)", row.replace("−", "-"))
+            )
             off = np.array([spot["spot"][axis] for axis in ("n", "e", "down")]) - place
-            np.testing.assert_allclose(np.abs(shown), 1000 * np.abs(off), rtol=0.01, atol=0.2)
-            assert ("BAD" in row) == (spot["name"] == "P2")
+            np.testing.assert_allclose(np.abs(now), 1000 * np.abs(off), rtol=0.01, atol=0.2)
+            assert np.abs(fitted).max() < 5.0
+            assert "BAD" not in row
+        save_known(0, places[0] + [0.5, 0.0, 0.0])
+        rows.filter(has_text="BAD").first.wait_for()
         is_accessible(page, tmp_path / "control.png")
 
         button(page, "Open P1").click()
