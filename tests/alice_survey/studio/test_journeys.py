@@ -271,6 +271,7 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
         page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
         button(page, "Reconstruct the sea floor").click()
         made(page, "mesh")
+        page.get_by_role("heading", name="Reconstruct the sea floor: done").wait_for()
 
         with (workspace / "images" / "manifest.csv").open(newline="") as rows:
             images = sorted(row["image"] for row in csv.DictReader(rows))
