@@ -79,7 +79,7 @@ def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path:
         page.get_by_text("Log", exact=True).click()
         page.get_by_text("run finished: exit code 0").wait_for()
         page.get_by_text("Earlier runs").click()
-        page.get_by_role("row").nth(2).wait_for()
+        page.get_by_role("row").nth(1).wait_for()
         assert "of disk" in page.locator("section[aria-label=Start]").inner_text()
         is_accessible(page, tmp_path / "flown.png")
         with page.expect_popup() as popup:
@@ -271,6 +271,7 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
         page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
         button(page, "Reconstruct the sea floor").click()
         made(page, "mesh")
+        page.get_by_role("heading", name="Reconstruct the sea floor: done").wait_for()
 
         with (workspace / "images" / "manifest.csv").open(newline="") as rows:
             images = sorted(row["image"] for row in csv.DictReader(rows))
