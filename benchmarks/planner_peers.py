@@ -19,7 +19,7 @@ from shapely.geometry import LineString, Polygon
 
 from alice_survey.base.frames import Array
 from missions.lines.lay import lay_lines
-from missions.route.turns import route_through
+from missions.route.turns import legs_through, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import Area
 from missions.values.costs import time_costs
@@ -80,7 +80,12 @@ def own_plan(area: Area, repeats: int) -> Way:
         began = time.process_time()
         ways = Ways(area.allowed)
         lines = own_lines(area, ways)
-        route_through(lines, _TURN_RADIUS_M, _RUN_IN_M, ways=ways, costs=time_costs(_SPEED_MPS))
+        route_of(
+            legs_through(
+                line_table(lines), _TURN_RADIUS_M, _RUN_IN_M, ways=ways,
+                costs=time_costs(_SPEED_MPS),
+            )
+        )  # fmt: skip
         best = min(best, time.process_time() - began)
     places = [lines[0].start_ne_m, lines[0].end_ne_m]
     for before, after in pairwise(lines):

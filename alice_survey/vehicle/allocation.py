@@ -405,15 +405,7 @@ def allocate_rpi(
     weighs thrusters alone; here rows are scaled by the axes' weights too, without which it falls
     shorter still (all weights 1 is the paper's).
 
-    Args:
-        matrix: (6, n) B, wrench per thrust.
-        wrench: (6,) wanted, N and N m.
-        lower: (n,) least thrust, N.
-        upper: (n,) greatest thrust, N; the same as `lower` of a thruster that has failed.
-        axes: (6,) weights of the axes' misses; 0 of an axis that is not requested.
-        weights: (n,) positive; the cost is the sum of weight times thrust squared.
-        thrust: (n,) is written, N.
-        scratch: work arrays.
+    Arguments as of `allocate_exact`.
 
     Returns:
         Number of solutions computed.

@@ -17,6 +17,7 @@ from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotat
 from camera_calib.rig import Rig
 from missions.follow.rows import Piece, Reordered, row_of_text
 from missions.live.loop import Odometry
+from missions.live.mavlink_pilot import mavlink_to
 
 UDP_PORT = 14600
 """Where datagrams are taken by default; MAVLink's are 14550 and on."""
@@ -153,18 +154,7 @@ class MavlinkSource:
         Raises:
             VehicleError: pymavlink is not installed, or the address cannot be opened.
         """
-        try:
-            from pymavlink import mavutil
-        except ImportError:
-            raise VehicleError(
-                "pymavlink is not installed: pip install 'alice-survey[mavlink]'"
-            ) from None
-        try:
-            self._link = mavutil.mavlink_connection(url, dialect="ardupilotmega")
-        except (OSError, ValueError, IndexError) as error:
-            raise VehicleError(
-                f"{url}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
-            ) from None
+        self._link = mavlink_to(url)
         self.name = f"MAVLink on {url}"
         self.left_out: Counter[str] = Counter()
         self._datum, self._rows = datum, OdometryRows(datum, altimeter_from_glass_m)

@@ -25,7 +25,7 @@ from missions.coverage.stations import Stations, stations_of_lines
 from missions.fly.refly import again_over, to_see
 from missions.lines.fill import LEFT_SHARE, lines_over
 from missions.lines.lay import ordered
-from missions.route.turns import route_through
+from missions.route.turns import legs_through, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
 from missions.values.costs import Costs, leg_costs
@@ -256,10 +256,11 @@ def _flown(flying: Flying, lines: tuple[Line, ...]) -> _OrderedLines | None:
     plan, costs = flying.plan, flying.costs
     try:
         order = ordered(lines, flying.ways, costs, flying.start_ne)
-        route = route_through(
-            order, plan.turn_radius_m, plan.run_in_m, ways=flying.ways, costs=costs,
+        legs = legs_through(
+            line_table(order), plan.turn_radius_m, plan.run_in_m, ways=flying.ways, costs=costs,
             turns=flying.settings.turns, home_ne=plan.home_ne_m, start_ne=flying.start_ne,
         )  # fmt: skip
+        route = route_of(legs)
     except PlanError:
         return None
     energy_j, time_s = (float(np.sum(part)) for part in leg_costs(route, costs))

@@ -52,6 +52,30 @@ _ASKED_BEFORE_SETTING = 3
 _WAIT_S = 0.005
 
 
+def mavlink_to(address: str, **settings: int) -> Any:
+    """Open a connection of pymavlink to ArduSub.
+
+    Args:
+        address: of pymavlink, such as udpin:127.0.0.1:14550.
+        settings: more of `mavutil.mavlink_connection`.
+
+    Raises:
+        VehicleError: pymavlink is not installed, or the address cannot be opened.
+    """
+    try:
+        from pymavlink import mavutil
+    except ImportError:
+        raise VehicleError(
+            "pymavlink is not installed: pip install 'alice-survey[mavlink]'"
+        ) from None
+    try:
+        return mavutil.mavlink_connection(address, dialect="ardupilotmega", **settings)
+    except (OSError, ValueError, IndexError) as error:
+        raise VehicleError(
+            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
+        ) from None
+
+
 def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) -> None:
     """Fly a mission with ArduSub until it is over or interrupted.
 
@@ -64,20 +88,7 @@ def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) ->
         VehicleError: pymavlink is not installed, the address cannot be opened, or, with `sim_time`,
             the vehicle is silent.
     """
-    try:
-        from pymavlink import mavutil
-    except ImportError:
-        raise VehicleError(
-            "pymavlink is not installed: pip install 'alice-survey[mavlink]'"
-        ) from None
-    try:
-        link = mavutil.mavlink_connection(
-            address, dialect="ardupilotmega", source_component=_ONBOARD_COMPUTER
-        )
-    except (OSError, ValueError, IndexError) as error:
-        raise VehicleError(
-            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
-        ) from None
+    link = mavlink_to(address, source_component=_ONBOARD_COMPUTER)
     pilot = MavlinkPilot(mission, link.mav, sim_time=sim_time)
     heard, most_s = time.monotonic(), FIRST_S
     try:

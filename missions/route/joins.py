@@ -1,7 +1,7 @@
 """From one line to the next: arcs, a turn on the spot, or a step sideways, whichever costs least.
 
 Compiled, for plans of many thousand lines. All that is tried here is direct: a way round corners of
-the allowed area is for the caller (`turns.route_through`).
+the allowed area is for the caller (`turns.legs_through`).
 """
 
 import math

@@ -30,52 +30,6 @@ _WANTED = {"auto": joins.NONE, "arcs": joins.ARCS, "spot": joins.SPOT, "sway": j
 _FREE = math.nan
 
 
-def route_through(
-    lines: Sequence[Line],
-    turn_radius_m: float,
-    run_in_m: float,
-    *,
-    ways: Ways | None = None,
-    costs: Costs | None = None,
-    turns: Turns = "auto",
-    home_ne: tuple[float, float] | None = None,
-    start_ne: tuple[float, float] | None = None,
-    first_line: int = 0,
-) -> Route:
-    """The route along all lines in order.
-
-    Args:
-        lines: in the order of flight.
-        turn_radius_m: of every arc.
-        run_in_m: straight before each line, and after it where arcs follow; after a stop it is left
-            out where it is not inside the allowed area.
-        ways: inside the allowed area; None: nothing is forbidden.
-        costs: what to keep low; None: time, at the paper's speed.
-        turns: how to turn wherever that is possible; auto: the cheapest way.
-        home_ne: where the route begins and ends; None: at the first line's run-in, and run-out
-            behind the last.
-        start_ne: where it begins, if that is not home.
-        first_line: index of the first of these lines in the plan.
-
-    Raises:
-        PlanError: there is no line, a line has no length or leaves the allowed area, or two places
-            are in parts of it that are not connected.
-    """
-    return route_of(
-        legs_through(
-            line_table(lines),
-            turn_radius_m,
-            run_in_m,
-            ways=ways,
-            costs=costs,
-            turns=turns,
-            home_ne=home_ne,
-            start_ne=start_ne,
-            first_line=first_line,
-        )
-    )
-
-
 def line_table(lines: Sequence[Line]) -> Array:
     """North and east of the start and the end of each line, and its heading, (N, 5)."""
     return np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
@@ -98,7 +52,28 @@ def legs_through(
     start_ne: tuple[float, float] | None = None,
     first_line: int = 0,
 ) -> Array:
-    """As `route_through`, of a `line_table` and with (L, 8) legs, columns as of `joins.COLUMNS`."""
+    """The legs of the route along all lines in order.
+
+    Args:
+        table: the lines in the order of flight, as `line_table` has them.
+        turn_radius_m: of every arc.
+        run_in_m: straight before each line, and after it where arcs follow; after a stop it is left
+            out where it is not inside the allowed area.
+        ways: inside the allowed area; None: nothing is forbidden.
+        costs: what to keep low; None: time, at the paper's speed.
+        turns: how to turn wherever that is possible; auto: the cheapest way.
+        home_ne: where the route begins and ends; None: at the first line's run-in, and run-out
+            behind the last.
+        start_ne: where it begins, if that is not home.
+        first_line: index of the first of these lines in the plan.
+
+    Returns:
+        (L, 8), columns as of `joins.COLUMNS`; `route_of` makes the route of them.
+
+    Raises:
+        PlanError: there is no line, a line has no length or leaves the allowed area, or two places
+            are in parts of it that are not connected.
+    """
     if not len(table):
         raise PlanError("there is no line to fly")
     fence = OPEN_WATER if ways is None else ways.fence
@@ -150,7 +125,7 @@ def legs_alone(
     Args:
         table: the lines, as `line_table` has them.
         turn_radius_m: of every arc.
-        run_in_m: as of `route_through`, as is all else.
+        run_in_m: as of `legs_through`, as is all else.
         ways: inside the allowed area.
         costs: what to keep low.
         turns: how to turn.

@@ -347,8 +347,3 @@ ALICE = Geometry(
         ),
     ),
 )
-
-PROPELLER_X_M = -0.573
-"""Position of the surge propellers of SPARUS II (model)."""
-ALICE_PROPELLER_X_M = round(PROPELLER_X_M + _MOVED_M, 3)
-"""The same of ALICE, moved with the pods."""

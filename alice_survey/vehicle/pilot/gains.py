@@ -92,6 +92,10 @@ PASSING_DAMPING = 0.2
 """Reduction of the heading loop's damping below the survey's speed (inferred)."""
 KEPT_RAD = math.radians(10.0)
 """Tolerance within which a heading counts as kept."""
+_TICK_S = 0.05
+"""Of the control; half of it is added to the lag (a held value is half a tick old)."""
+_MOST_TURN_RAD_S = math.radians(30.0)
+"""Greatest commanded yaw rate, if the thrusters allow it."""
 _NO_FORCE = 1e-6
 """A force or moment of less is none, N or N m."""
 _RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
@@ -138,28 +142,20 @@ class Gains(NamedTuple):
         return bool(self.axes[HEAVE, MASS] == 0.0)
 
 
-def gains_for(
-    vehicle: Vehicle,
-    speed_mps: float,
-    tick_s: float = 0.05,
-    navigation_hz: float = 5.0,
-    most_turn_rad_s: float = math.radians(30.0),
-) -> Gains:
+def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) -> Gains:
     """Gains for a vehicle.
 
     Args:
         vehicle: inertia, damping, thrusters.
         speed_mps: survey speed, at which damping is linearised, without drift or turning.
-        tick_s: of the control; half of it is added to the lag (a held value is half a tick old).
         navigation_hz: rate of the navigation's velocities (DVL).
-        most_turn_rad_s: greatest commanded yaw rate, if the thrusters allow it.
 
     Raises:
         VehicleError: surge, heave or yaw cannot be controlled, or yaw not damped at that speed; or
             a vehicle with fins has vertical thrusters too, or does not fly level at that speed.
     """
     if vehicle.fins:
-        return _gains_of_fins(vehicle, speed_mps, tick_s, navigation_hz, most_turn_rad_s)
+        return _gains_of_fins(vehicle, speed_mps, navigation_hz)
     plant = vehicle.plant
     count = len(vehicle.thrusters)
     lower, upper = np.zeros(count), np.zeros(count)
@@ -188,10 +184,10 @@ def gains_for(
                 f"({least:.2g} to {most:.2g}): it cannot fly a survey"
             )
         lag_s = effective_lag_s(configuration, lower, upper, slowness_s, axis, gyradius_m)
-        lag_s += tick_s / 2
+        lag_s += _TICK_S / 2
         decay = float(damping[degree, degree]) / inertia
         if axis >= STEERED:  # attitude and its rates are known at every tick
-            omega, rate, place = placed(lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * tick_s))
+            omega, rate, place = placed(lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * _TICK_S))
             axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
             axes[axis, INTEGRAL] = _integral(rate, place, omega, decay)
             continue
@@ -214,17 +210,11 @@ def gains_for(
         axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
         if rate > 0.0:
             axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
-    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], most_turn_rad_s)
+    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], _MOST_TURN_RAD_S)
     return Gains(plant.body, plant.fins, np.zeros(0), 0.0, axes)
 
 
-def _gains_of_fins(
-    vehicle: Vehicle,
-    speed_mps: float,
-    tick_s: float,
-    navigation_hz: float,
-    most_turn_rad_s: float,
-) -> Gains:
+def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> Gains:
     """Gains for a vehicle that fins steer; as `gains_for`."""
     plant, count = vehicle.plant, len(vehicle.thrusters)
     if np.any(np.abs(vehicle.configuration_matrix[[2, 4]]) > _NO_FORCE):
@@ -250,7 +240,7 @@ def _gains_of_fins(
     ])  # fmt: skip
     slope = linear_damping(plant.body, cruise) + fin_slope(plant.fins, cruise)
     gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
-    slow_hz, quick_hz = navigation_hz, 1.0 / tick_s
+    slow_hz, quick_hz = navigation_hz, 1.0 / _TICK_S
     axes = np.zeros((6, 11))
     for row, axis in enumerate(used):
         degree = _DEGREE[axis]
@@ -265,7 +255,7 @@ def _gains_of_fins(
                 f"{speed_mps:g} m/s ({least:.2g} to {most:.2g}): it cannot fly a survey"
             )
         lag_s = effective_lag_s(matrix[list(_DEGREE)], lower, upper, slowness_s, axis, gyradius_m)
-        lag_s += tick_s / 2
+        lag_s += _TICK_S / 2
         decay = float(slope[degree, degree]) / inertia
         known_hz = slow_hz if axis in (SURGE, YAW) else quick_hz
         fastest_rad_s = 2 * math.pi * known_hz / SAMPLES_PER_PERIOD
@@ -290,7 +280,7 @@ def _gains_of_fins(
             axes[axis, FASTEST] = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
             if rate > 0.0:
                 axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
-    axes[YAW, FASTEST] = min(speed_mps / radius_m, most_turn_rad_s)
+    axes[YAW, FASTEST] = min(speed_mps / radius_m, _MOST_TURN_RAD_S)
     level = keeps(vehicle, speed_mps)
     level_rad = 0.0 if level is None else level.pitch_rad
     return Gains(plant.body, plant.fins, np.zeros(len(vehicle.fins)), level_rad, axes)

@@ -131,12 +131,8 @@ def test_an_example_like_that_of_the_wiki_is_read(
     assert (first.width_px, first.height_px, first.n_water) == (752, 480, 1.0)
     # 1e-05, without a dot, is text to a YAML 1.1 parser
     lens = first.lens
-    assert (
-        lens.parameter("k1"),
-        lens.parameter("k2"),
-        lens.parameter("p1"),
-        lens.parameter("p2"),
-    ) == (-0.27695497, 0.06712482, 8.7538e-4, 1e-05)
+    found = [lens.parameter(name) for name in ("k1", "k2", "p1", "p2")]
+    assert found == [-0.27695497, 0.06712482, 8.7538e-4, 1e-05]
     assert rig.cameras["cam2"].parameter("k1") == 0.0
     # The chain: cam1 at (0, -0.1, 0) of cam0, cam2 at (0, 0.5, 0) of cam1, whose y is cam0's x.
     centre = rig.cam_from_rig["stereo_cam1"].inv().translation

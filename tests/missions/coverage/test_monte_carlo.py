@@ -11,8 +11,8 @@ from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
 from missions.fly.monte_carlo import MonteCarlo, monte_carlo
 from missions.fly.simulation import flight_settings
-from missions.route.turns import route_through
 from missions.values.plan_file import Plan
+from tests.missions.route.routes import route_through
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
 DEPTH_M = 8.0

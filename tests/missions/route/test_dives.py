@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import PlanError
 from missions.route.dives import DEAREST_TIE, split_dives
-from missions.route.turns import legs_alone, line_table, route_of, route_through
+from missions.route.turns import legs_alone, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
 from missions.values.plan_file import Dive
+from tests.missions.route.routes import route_through
 from tests.oracles_energy import best_parting
 from tests.oracles_route import inside, route_cost
 

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from missions.route.joins import COLUMNS, price
-from missions.route.turns import route_through
 from missions.values.costs import Costs, leg_costs, mean_power, time_costs
 from missions.values.legs import Leg, Route
+from tests.missions.route.routes import route_through
 from tests.oracles_route import lawn, route_cost, route_cost_by_steps, sampled_leg, turn_counts
 
 angles = st.floats(-7.0, 7.0)

@@ -10,12 +10,13 @@ from shapely.geometry import MultiPolygon, box
 from alice_survey.base.errors import PlanError
 from missions.route.fence import TOUCH_M
 from missions.route.joins import LONGEST_SWAY_M
-from missions.route.turns import Turns, route_through
+from missions.route.turns import Turns
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
 from missions.values.costs import Costs, time_costs
 from missions.values.legs import Route
 from missions.values.line import Line
+from tests.missions.route.routes import route_through
 from tests.oracles_route import (
     farthest_outside_m,
     lawn,
