@@ -320,7 +320,7 @@ def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) ->
             picture = bag.make(
                 kind, header=bag.header(stamp, taken["camera"]), format="png", data=data
             )
-            bag.add(f"/camera/{row['camera']}/compressed", kind, stamp, picture)
+            bag.add(f"/camera/{taken['camera']}/compressed", kind, stamp, picture)
     bag.write(path)
 
 
