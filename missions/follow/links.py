@@ -17,7 +17,7 @@ from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotat
 from camera_calib.rig import Rig
 from missions.follow.rows import Piece, Reordered, row_of_text
 from missions.live.loop import Odometry
-from missions.live.mavlink_pilot import mavlink_to
+from missions.live.mavlink_link import mavlink_to
 
 UDP_PORT = 14600
 """Where datagrams are taken by default; MAVLink's are 14550 and on."""

@@ -116,7 +116,7 @@ class DiveSession:
         self._heard_wall_s: float | None = None
         self._expected: Certificate | None = None
         self.holes: tuple[Hole, ...] = ()
-        self._look_wall_s, self._is_looked = -math.inf, False
+        self._look_wall_s, self._is_current = -math.inf, False
 
     def close(self) -> None:
         """Let go of the source."""
@@ -145,9 +145,9 @@ class DiveSession:
             for window in self.follower.add(pieces):
                 self.blocks.touch(window)
             if came:
-                self._heard_wall_s, self._is_looked = wall_s, False
+                self._heard_wall_s, self._is_current = wall_s, False
             is_due = self.follower.fix is not None and wall_s >= self._look_wall_s
-            if is_due and not self._is_looked:
+            if is_due and not self._is_current:
                 self.look(wall_s)
             return came
 
@@ -164,7 +164,7 @@ class DiveSession:
             self._expected, self.holes = self.follower.expected()
             took_s = time.perf_counter() - began
             self._look_wall_s = wall_s + max(_LEAST_S, _BUSY * took_s)
-            self._is_looked = True
+            self._is_current = True
 
     def propose(self) -> Proposal | None:
         """Lines that close the holes, in `may_take_s` or what the dive has to spare."""

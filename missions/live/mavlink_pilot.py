@@ -24,6 +24,7 @@ from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.simulated_vehicle import TICK_S
 from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState, Odometry
+from missions.live.mavlink_link import mavlink_to
 from missions.live.mission import LiveMission
 
 GUIDED, SURFACE = 4, 9
@@ -50,30 +51,6 @@ _ASK_S = 1.0
 _ASKED_BEFORE_SETTING = 3
 """A vehicle that does not state its origin so many times has none: it is given the datum."""
 _WAIT_S = 0.005
-
-
-def mavlink_to(address: str, **settings: int) -> Any:
-    """Open a connection of pymavlink to ArduSub.
-
-    Args:
-        address: of pymavlink, such as udpin:127.0.0.1:14550.
-        settings: more of `mavutil.mavlink_connection`.
-
-    Raises:
-        VehicleError: pymavlink is not installed, or the address cannot be opened.
-    """
-    try:
-        from pymavlink import mavutil
-    except ImportError:
-        raise VehicleError(
-            "pymavlink is not installed: pip install 'alice-survey[mavlink]'"
-        ) from None
-    try:
-        return mavutil.mavlink_connection(address, dialect="ardupilotmega", **settings)
-    except (OSError, ValueError, IndexError) as error:
-        raise VehicleError(
-            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
-        ) from None
 
 
 def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) -> None:

@@ -5,7 +5,7 @@ import math
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -62,8 +62,8 @@ _JSON = "application/json"
 
 
 def prepare_planning() -> None:
-    """Load what plans, and compile it where that is not done: about 20 s after an installation."""
-    with _quiet(), suppress(AliceError):
+    """Import and compile the planner before a page asks for it: 20 s after an installation."""
+    with _quiet():
         preview(SurveyConfig())
 
 

@@ -32,10 +32,10 @@ function isSeen(box, clip) {
 
 /* Draws the parts below `root` whose error is at most `mostPx` on the screen, children on top of their parent (`adds`)
    or in place of it. `load` gives the model and the bytes of a part, or what a link stands for; `drop` gives the memory of
-   a model back. `told` gets the parts drawn, the number of those on the way and the bytes held; `failed` the fault of one
+   a model back. `progress` gets the parts drawn, the number of those on the way and the bytes held; `failed` the fault of one
    that did not come, which is not asked for again: its parent stands for it. Above MOST_MIB, or the canvas' attribute
    data-most-mib, parts out of view go, longest unseen first, and what is left is drawn coarser until it fits. */
-export function startDetail({camera, canvas, draw}, root, {adds, mostPx, load, drop, told, failed}) {
+export function startDetail({camera, canvas, draw}, root, {adds, mostPx, load, drop, progress, failed}) {
   const group = new three.Scene();
   const held = new Set();
   let wanted = new Set();
@@ -90,7 +90,7 @@ export function startDetail({camera, canvas, draw}, root, {adds, mostPx, load, d
     }
     const next = [...wanted].filter((part) => !part.model && !part.isBusy && !part.isBad).sort((a, b) => a.depth - b.depth);
     next.slice(0, AT_ONCE - loading).forEach(fetched);
-    told({parts: shown(), coming: next.filter((part) => !part.isBusy).length + loading, bytes: sumOf(held)});
+    progress({parts: shown(), coming: next.filter((part) => !part.isBusy).length + loading, bytes: sumOf(held)});
   }
 
   function forget(part) {

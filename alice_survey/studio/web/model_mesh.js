@@ -61,7 +61,7 @@ export function meshPart(studio, {colour, measured}) {
   const started = {};
 
   const heard = (words) => ({
-    told({parts, coming, bytes: held}) {
+    progress({parts, coming, bytes: held}) {
       Object.assign(canvas.dataset, {parts: parts.length, coming, mib: (held / 2 ** 20).toFixed(3)});
       streamed.textContent = words(parts) + " drawn, " + coming + " on the way, " + number(held / 2 ** 20, "MB", 2) + " held";
     },

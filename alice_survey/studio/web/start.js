@@ -38,7 +38,11 @@ function planForm(studio) {
   const along = numeric({min: 0.1, max: 10000, value: "15"});
   const across = numeric({min: 0.1, max: 10000, value: "17"});
   const lens = el("select", {}, el("option", {value: "12.5"}, "12.5 mm: sees 2 m across from 2 m"), el("option", {value: "25"}, "25 mm: half as wide, twice as fine"));
-  const trial = el("input", {type: "checkbox", onchange: () => { [along.value, across.value] = trial.checked ? ["2", "2"] : ["15", "17"]; }});
+  let usual = null;
+  const trial = el("input", {type: "checkbox", onchange: () => {
+    if (trial.checked) usual = [along.value, across.value];
+    [along.value, across.value] = trial.checked ? ["2", "2"] : usual;
+  }});
   const file = el("input", {type: "file", accept: AREA_FILES});
   const place = el("fieldset", {class: "drop"}, el("legend", {}, "Where is it?"),
     el("div", {class: "row"}, field("Latitude, degrees", latitude), field("Longitude, degrees", longitude)),

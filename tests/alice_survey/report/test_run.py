@@ -3,7 +3,6 @@ import re
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from alice_survey.stages import spec
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.mount import with_mount
 from camera_calib.rig import design_rig, write_rig
-from tests.alice_survey.report.tiny import tiny_workspace
+from tests.alice_survey.report.tiny import plane_of, tiny_workspace
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +85,6 @@ def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit:
     assert shown["axes"] == ["y", "x"]
 
 
-def plane_of(name: str, tilt: str) -> dict[str, Any]:
-    return {
-        "name": name, "about": f"facing 180 deg, tilt {tilt} deg", "origin_enu": [0, 0, 0],
-        "right_enu": [1, 0, 0], "up_enu": [0, 0, 1], "out_enu": [0, -1, 0], "frame": "ned",
-        "unit": "m", "vertical_datum": "sea surface",
-    }  # fmt: skip
-
-
 def test_every_plane_is_shown_by_its_name(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     assert spec("report").make(workspace, SurveyConfig(), SERIAL)
@@ -144,6 +135,7 @@ def test_a_known_mount_is_drawn_and_an_unknown_one_is_not(
     write_rig(workspace / "sparse" / "rig.json", rig)
     assert spec("report").make(workspace, config, SERIAL)
     page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert f"The rig is as imported with the pictures: {rig.source}." in page
     assert ("How the cameras are mounted" in page) == (mount is not None)
     if mount is not None:
         assert f"0.0 deg from {mount}" in page

@@ -20,6 +20,17 @@ SLOPE = 0.25
 SIGMA_M = 0.0005
 
 
+def plane_of(
+    name: str, tilt: str = "0", origin_enu: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> dict[str, Any]:
+    """The JSON values of an upright plane that faces south."""
+    return {
+        "name": name, "about": f"facing 180 deg, tilt {tilt} deg", "origin_enu": origin_enu,
+        "right_enu": [1.0, 0.0, 0.0], "up_enu": [0.0, 0.0, 1.0], "out_enu": [0.0, -1.0, 0.0],
+        "frame": "ned", "unit": "m", "datum": None, "vertical_datum": f"the plane '{name}'",
+    }  # fmt: skip
+
+
 def tiny_workspace(
     folder: Path, *, scaled: bool = True, placed: bool = True, **changes: dict[str, Any]
 ) -> Path:

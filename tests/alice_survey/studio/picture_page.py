@@ -86,7 +86,7 @@ class PicturePage:
         """The length between two points and its sigma, as shown."""
         ticked = self.page.locator(".points input:checked")
         while ticked.count():
-            ticked.first.click()  # the table is drawn anew
+            ticked.first.click()  # the table is drawn again
         for name in (first, second):
             self.page.get_by_label(name, exact=True).check()
         self.page.wait_for_function(

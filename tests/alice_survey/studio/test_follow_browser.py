@@ -104,9 +104,12 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
                 with log.open("ab") as file:
                     file.write(part)
 
-        log.write_bytes(text_of(dive.rows[:1]))
         opened(page, "Follow")
-        page.get_by_label("Navigation CSV of this workspace").select_option("nav.csv")
+        logs = page.get_by_label("Navigation CSV of this workspace")
+        logs.wait_for()
+        log.write_bytes(text_of(dive.rows[:1]))  # it comes while the page is open
+        logs.focus()
+        logs.select_option("nav.csv")
         button(page, "Follow it").click()
         come(dive.between(0.01, first_s))
         phase(page, "On line 1")

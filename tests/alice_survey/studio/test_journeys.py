@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from alice_survey.studio.server import Server
 from reconstruct.placing.control_file import read_control, read_picks
 from tests.alice_survey.kit.browser import Heard
 from tests.alice_survey.studio.client import ask, serving
@@ -138,14 +140,21 @@ def pictures_with(page: Any, truth: Truth, places: list[Point]) -> PicturePage:
     return pictures
 
 
+@contextmanager
+def pictures_shown(page: Any, modelled: Path, folder: Path) -> Iterator[tuple[Server, Path]]:
+    """Show the pictures of a copy of a model; what serves it, and its workspace."""
+    workspace = Path(shutil.copytree(modelled, folder / "reef"))
+    with serving(workspace) as server:
+        page.goto(server.address + "#pictures")
+        yield server, workspace
+
+
 @AT_BOTH
 def test_a_stereo_dive_gives_a_length_beside_its_truth(
     journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
 ) -> None:
     page, heard = journey
-    workspace = Path(shutil.copytree(modelled, tmp_path / "reef"))
-    with serving(workspace) as server:
-        page.goto(server.address + "#pictures")
+    with pictures_shown(page, modelled, tmp_path) as (_, workspace):
         truth, ends = truth_of(workspace, 2)
         pictures = pictures_with(page, truth, ends)
         value, sigma = pictures.length("P0", "P1")
@@ -159,9 +168,7 @@ def test_control_points_are_picked_and_their_residuals_shown(
     journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
 ) -> None:
     page, heard = journey
-    workspace = Path(shutil.copytree(modelled, tmp_path / "reef"))
-    with serving(workspace) as server:
-        page.goto(server.address + "#pictures")
+    with pictures_shown(page, modelled, tmp_path) as (server, workspace):
         truth, places = truth_of(workspace, 3)
         pictures_with(page, truth, places)
         stored = read_picks(workspace / "picks.csv")

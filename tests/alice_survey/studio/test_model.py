@@ -14,7 +14,7 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.frames import Datum
 from alice_survey.studio.server import Server
-from tests.alice_survey.report.tiny import CELL_M, SIGMA_M, SLOPE, tiny_workspace
+from tests.alice_survey.report.tiny import CELL_M, SIGMA_M, SLOPE, plane_of, tiny_workspace
 from tests.alice_survey.studio.client import ask, call, serving
 
 RISE = math.hypot(1.0, SLOPE)
@@ -153,11 +153,7 @@ def test_a_model_without_scale_is_in_its_own_units(tmp_path: Path) -> None:
 
 def test_a_plane_that_is_not_level_has_its_own_axes(tmp_path: Path) -> None:
     folder = tiny_workspace(tmp_path)
-    write_json(folder / "dense" / "plane.json", {
-        "name": "wall", "about": "facing 180 deg, tilt 0 deg", "origin_enu": [0.0, 0.0, 0.0],
-        "right_enu": [1.0, 0.0, 0.0], "up_enu": [0.0, 0.0, 1.0], "out_enu": [0.0, -1.0, 0.0],
-        "frame": "ned", "unit": "m", "datum": None, "vertical_datum": "the plane 'wall'",
-    })  # fmt: skip
+    write_json(folder / "dense" / "plane.json", plane_of("wall"))
     with serving(folder) as server:
         about = ask(server, "/api/model/about").json
         assert about["axes"] == ["right", "up", "out"]

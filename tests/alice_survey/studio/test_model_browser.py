@@ -22,7 +22,7 @@ from alice_survey.base.artefacts import write_json
 from reconstruct.copc_nodes import read_nodes
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import sketch_mesh
-from tests.alice_survey.report.tiny import SLOPE, tiny_workspace
+from tests.alice_survey.report.tiny import SLOPE, plane_of, tiny_workspace
 from tests.alice_survey.studio.client import FOLDED, serving
 from tests.reconstruct.tiny_cloud import deep_cloud, rippled
 
@@ -221,11 +221,7 @@ CLOUD_POINTS = 15_000
 MIDDLE = np.array([0.4, 0.6, -10.0])
 """Of mesh and cloud."""
 EAST, NORTH, UP = np.eye(3)
-WALL = {
-    "name": "wall", "about": "facing 180 deg, tilt 0 deg", "origin_enu": [0.0, 1.0, -10.5],
-    "right_enu": EAST.tolist(), "up_enu": UP.tolist(), "out_enu": (-NORTH).tolist(),
-    "frame": "ned", "unit": "m", "datum": None, "vertical_datum": "the plane 'wall'",
-}  # fmt: skip
+WALL = plane_of("wall", origin_enu=(0.0, 1.0, -10.5))
 
 
 def with_tiles(folder: Path) -> Path:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.studio.client import FOLDED, serving
-from tests.alice_survey.studio.picture_page import WAIT_MS, PicturePage
+from tests.alice_survey.studio.client import serving
+from tests.alice_survey.studio.journey_page import WIDE, begun_page
+from tests.alice_survey.studio.picture_page import PicturePage
 from tests.alice_survey.studio.test_pictures import Truth
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -32,15 +32,11 @@ def ratios_of_picked_pairs(workspace: Path, pairs: int, seed: int) -> np.ndarray
         for place in truth.places(rng, 2 * pairs)
         if np.abs(place[:2] - [0.6, 0.45]).max() < 0.55 and truth.nearest(place) is not None
     ]  # within the model, whatever the pick's noise
-    with serving(workspace) as server, chromium() as browser:
-        page = browser.new_page(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
-        page.set_default_timeout(WAIT_MS)
-        heard = Heard()
-        heard.listen(page)
-        page.add_init_script(FOLDED)
+    camera = next(iter(truth.rig.cameras.values()))
+    with serving(workspace) as server, begun_page(WIDE) as (page, heard):
         page.goto(server.address + "#pictures")
         page.wait_for_selector("body[data-ready]")
-        pictures = PicturePage(page=page, size_px=(564, 451))
+        pictures = PicturePage(page=page, size_px=(camera.width_px, camera.height_px))
         spots: dict[str, np.ndarray] = {}
         for place in places[: 6 + pairs // 5]:
             found = truth.nearest(place)
@@ -67,7 +63,6 @@ def ratios_of_picked_pairs(workspace: Path, pairs: int, seed: int) -> np.ndarray
             value, sigma = pictures.length(one, two)
             ratios.append((value - np.linalg.norm(spots[one] - spots[two])) / sigma)
         assert heard.complaints == []
-        page.close()
     return np.array(ratios)
 
 

@@ -10,7 +10,7 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.studio.server import Server
 from reconstruct.copc_nodes import read_node, read_nodes
-from tests.alice_survey.report.tiny import CELL_M, tiny_workspace
+from tests.alice_survey.report.tiny import CELL_M, plane_of, tiny_workspace
 from tests.alice_survey.studio.client import ask, serving
 from tests.reconstruct.tiny_cloud import STEP_M, deep_cloud, rippled
 
@@ -154,11 +154,7 @@ def test_links_are_not_followed_and_nothing_is_nothing(tmp_path: Path) -> None:
 def test_a_wall_has_its_plane(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     deep_cloud(workspace / CLOUD, rippled(1.0, 1.0)[:, [0, 2, 1]])
-    write_json(workspace / "dense" / "plane.json", {
-        "name": "wall", "about": "facing 180 deg, tilt 0 deg", "origin_enu": [0.0, 0.0, 0.0],
-        "right_enu": [1.0, 0.0, 0.0], "up_enu": [0.0, 0.0, 1.0], "out_enu": [0.0, -1.0, 0.0],
-        "frame": "ned", "unit": "m", "datum": None, "vertical_datum": "the plane 'wall'",
-    })  # fmt: skip
+    write_json(workspace / "dense" / "plane.json", plane_of("wall"))
     with serving(workspace) as server:
         about = ask(server, "/api/model/points").json
         assert about["plane"]["out"] == [0.0, -1.0, 0.0]
