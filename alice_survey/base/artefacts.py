@@ -31,8 +31,6 @@ T = TypeVar("T")
 STAGE_FILE = "stage.json"
 _SPENT_FILE = ".spent"
 """In an unfinished stage: the resources used so far."""
-_WRITER = os.urandom(6).hex()
-"""Tells the files of this process from those of others, on whatever machine."""
 _TEMPORARY = re.compile(r"\..+\.tmp[0-9a-f]+(\..*)?")
 """Names that `atomic_path` gives, and those that libraries derive from them."""
 
@@ -339,13 +337,16 @@ def _drop_cut_files(folder: Path) -> None:
 def atomic_path(path: Path) -> Iterator[Path]:
     """A path to write to, next to `path`, that replaces it when all went well.
 
+    Threads, processes and machines that write the same file each get a path of their own: the last
+    one that finishes is kept, whole.
+
     Raises:
         WorkspaceError: there is a folder of that name.
     """
     if path.is_dir():
         raise WorkspaceError(f"{path} is a folder: give the name of a file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.tmp{_WRITER}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.tmp{os.urandom(6).hex()}{path.suffix}")
     try:
         yield temporary
         temporary.replace(path)

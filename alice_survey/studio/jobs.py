@@ -383,7 +383,11 @@ class Jobs:
             time.sleep(_LOOK_EVERY_S)
         record = job.finished()
         with contextlib.suppress(OSError, WorkspaceError):  # a full disk, a folder that was removed
-            record.write(job.folder / RECORD)
+            known = None if job.is_own else JobRecord.made(job.folder / RECORD)
+            if known is not None and known.ended_utc is not None:
+                record = known  # by the studio that has started it, which knows its exit code
+            else:
+                record.write(job.folder / RECORD)
         with self._lock:
             self._job = None
         job.ended.set()

@@ -283,6 +283,18 @@ def test_atomic_path_leaves_nothing_behind_on_failure(tmp_path: Path) -> None:
     assert target.read_text() == "old"
 
 
+def test_writers_of_the_same_file_do_not_mix(tmp_path: Path) -> None:
+    """Threads of one process, too: each writes a whole file, and the last one is kept."""
+    target = tmp_path / "a.txt"
+    with atomic_path(target) as first:
+        first.write_text("a long text")
+        with atomic_path(target) as second:
+            second.write_text("short")
+        assert target.read_text() == "short"
+    assert target.read_text() == "a long text"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
 def test_csv_writes_unknown_values_as_empty_cells(tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", ["x", "y"], [[1.5, float("nan")], [None, "t"]])
     assert (tmp_path / "a.csv").read_text() == "x,y\n1.5,\n,t\n"

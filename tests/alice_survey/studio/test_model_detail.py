@@ -44,7 +44,7 @@ const detail = startDetail({camera, canvas, draw() { asked = true; }}, square("r
     return {model, bytes: 2 ** 20};
   },
   drop: (model) => drops.push(model.name),
-  told: (now) => { heard = now; most = Math.max(most, now.bytes / 2 ** 20); },
+  progress: (now) => { heard = now; most = Math.max(most, now.bytes / 2 ** 20); },
   failed: (fault) => failures.push(fault.message),
 });
 
