@@ -5,6 +5,7 @@ import errno
 import os
 import platform
 import shlex
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -36,7 +37,8 @@ def session(
     run = Run(Console(quiet=quiet), _opened(log_file, events))
     command = shlex.join(["alice-survey", *arguments])
     packages = {"python": platform.python_version(), **versions()}
-    with interrupts.handled(lambda error: _finish(run, error)):
+    first = _Once()
+    with interrupts.handled(lambda error: _finish(run, error, first)):
         try:
             with reported_to(run):
                 run.report(
@@ -49,14 +51,15 @@ def session(
                     code = 0
                 except BaseException as error:
                     reason = interrupts.behind(error) or error
-                    code = _report_end(run, reason)
+                    code = _report_end(run, reason, first)
                     if reason is not error:
                         raise reason from None
                     raise
                 finally:
-                    run.report("run_finished", exit_code=code)
+                    if first("run_finished"):
+                        run.report("run_finished", exit_code=code)
         except KeyboardInterrupt as error:
-            _say_how_to_go_on(run, error)
+            _say_how_to_go_on(run, error, first)
             raise SystemExit(interrupts.exit_code(error)) from None
 
 
@@ -73,10 +76,29 @@ def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventF
     return files if events is None else [*files, EventFile(events)]
 
 
-def _report_end(run: Run, error: BaseException) -> int:
+class _Once:
+    """Whether something is done for the first time.
+
+    The end of an interrupted run is reported by its main thread, or by another one where that
+    takes too long; it may be only slow.
+    """
+
+    def __init__(self) -> None:
+        self._done: set[str] = set()
+        self._lock = threading.Lock()
+
+    def __call__(self, what: str) -> bool:
+        with self._lock:
+            is_first = what not in self._done
+            self._done.add(what)
+        return is_first
+
+
+def _report_end(run: Run, error: BaseException, first: _Once) -> int:
     """Report why a run ends early; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
-        run.report("error", interrupts.words(error))
+        if first("error"):
+            run.report("error", interrupts.words(error))
         return interrupts.exit_code(error)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
@@ -96,14 +118,16 @@ def _report_end(run: Run, error: BaseException) -> int:
     return 1
 
 
-def _say_how_to_go_on(run: Run, error: KeyboardInterrupt) -> None:
+def _say_how_to_go_on(run: Run, error: KeyboardInterrupt, first: _Once) -> None:
     goes_on = "; the same command goes on from here" if run.stages_begun else ""
-    say(f"{interrupts.words(error)}{goes_on}")
+    if first("said"):
+        say(f"{interrupts.words(error)}{goes_on}")
 
 
-def _finish(run: Run, error: KeyboardInterrupt) -> None:
+def _finish(run: Run, error: KeyboardInterrupt, first: _Once) -> None:
     """End a run whose main thread does not respond."""
-    run.report("error", interrupts.words(error))
-    run.report("run_finished", exit_code=interrupts.exit_code(error))
+    code = _report_end(run, error, first)
+    if first("run_finished"):
+        run.report("run_finished", exit_code=code)
     run.close()
-    _say_how_to_go_on(run, error)
+    _say_how_to_go_on(run, error, first)

@@ -26,6 +26,7 @@ from alice_survey.report.colours import (
     scale_of,
 )
 from alice_survey.report.held import Held
+from reconstruct.measure.surface import is_of_surface
 
 _MOST_PAINTED_PX = 24_000_000
 """Pixels of the mosaic in a page: about 5 MB."""
@@ -41,7 +42,7 @@ def picture_layers(held: Held) -> Iterator[PictureLayer]:
     first = mosaic is None
     for numbers in number_rasters(held.unit):
         file = held.file(numbers.file)
-        if file is not None:
+        if file is not None and is_of_surface(held.workspace, numbers.file):
             yield _number_layer(file, numbers, shown=first)
             first = False
 

@@ -155,7 +155,7 @@ class _Job:
 
     def stop(self) -> None:
         """Ask it to end, ever more firmly; returns when it has."""
-        for number, patience_s in zip((signal.SIGINT, signal.SIGTERM), _HARDER_S, strict=True):
+        for number, patience_s in zip((_gentle(), signal.SIGTERM), _HARDER_S, strict=True):
             self.send(number)
             if self.ended.wait(patience_s):
                 return
@@ -244,7 +244,7 @@ class Jobs:
         job = self._job
         if job is not None and job.is_own:
             job.stopping = True
-            job.send(signal.SIGINT)
+            job.send(_gentle())
             job.ended.wait(_ENDING_S)
 
     def running(self) -> dict[str, Any] | None:
@@ -394,6 +394,12 @@ class Jobs:
         self._publish(
             "run", {"job": None, "last": record.to_json(), "elsewhere": None, "ended": True}
         )
+
+
+def _gentle() -> signal.Signals:
+    """Ctrl-C; SIGTERM where this program ignores it, and so do those that it starts."""
+    is_deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    return signal.SIGTERM if is_deaf else signal.SIGINT
 
 
 def _environment() -> dict[str, str]:

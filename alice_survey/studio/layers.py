@@ -43,6 +43,7 @@ from alice_survey.report.colours import (
 from alice_survey.report.held import Held
 from alice_survey.studio.chart import CHART, CHART_TITLE, chart_crs, chart_numbers
 from alice_survey.studio.paths import Workspace, token_of, worked_on
+from reconstruct.measure.surface import is_of_surface
 
 _KEPT_TILES = 1000
 _KEPT_PYRAMIDS = 12
@@ -215,7 +216,9 @@ class Layers:
         for name in (*self._files, CHART):
             try:
                 shown = not self._overlays and (not found or name == CHART)
-                found.append(self._picture_layer(name, shown=shown))
+                layer = self._picture_layer(name, shown=shown)
+                if is_of_surface(self._workspace.folder, self._files.get(name, "")):
+                    found.append(layer)
             except FileNotFoundError:
                 continue
         return found

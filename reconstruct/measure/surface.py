@@ -21,9 +21,10 @@ from reconstruct.raster import DemGrid, grid_of, opened_raster, read_cells, smal
 from reconstruct.views.model import WorldFrame, read_frame
 
 MOSAIC = "mosaic/mosaic.tif"
+DEM, ERROR = "dense/dem.tif", "evaluation/error.tif"
 RASTERS = (
-    "dense/dem.tif", "dense/sigma.tif", "dense/slope.tif", "dense/stations.tif", "dense/count.tif",
-    "dense/surfaces.tif", "dense/lower.tif", "evaluation/error.tif", "mosaic/coverage.tif", MOSAIC,
+    DEM, "dense/sigma.tif", "dense/slope.tif", "dense/stations.tif", "dense/count.tif",
+    "dense/surfaces.tif", "dense/lower.tif", ERROR, "mosaic/coverage.tif", MOSAIC,
 )  # fmt: skip
 """Rasters that a place has values in."""
 _PICKING = "not counted: how well a place was picked on the map"
@@ -207,12 +208,23 @@ def _runs(cells: NDArray[np.int64]) -> Iterator[slice]:
         start = end
 
 
+def is_of_surface(workspace: Path, file: str) -> bool:
+    """Whether a raster is of the surface that is there now.
+
+    Errors that were evaluated before the surface was made anew, perhaps over another plane, have
+    other cells.
+    """
+    dem = workspace / DEM
+    return file != ERROR or not dem.is_file() or grid_of(workspace / file) == grid_of(dem)
+
+
 def values_at(
     workspace: Path, place: Sequence[float], files: Sequence[str] = RASTERS
 ) -> Mapping[str, tuple[float, ...]]:
     """Values of rasters of a workspace at a place, by their files; of a mosaic red, green, blue.
 
-    A raster that is not there, does not reach the place or knows nothing there is left out.
+    A raster that is not there, is of an earlier surface, does not reach the place or knows nothing
+    there is left out.
 
     Args:
         workspace: reconstructed.
@@ -222,7 +234,7 @@ def values_at(
     found = {}
     for file in files:
         path = workspace / file
-        if not path.is_file():
+        if not path.is_file() or not is_of_surface(workspace, file):
             continue
         with small_cache(), opened_raster(path) as raster:
             row, column = raster.index(place[0], place[1])

@@ -237,12 +237,15 @@ def stay(folder):
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ("number", "times"),
+    [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 1), (signal.SIGHUP, 1)],
+)
 @pytest.mark.parametrize(("kind", "workers"), [("parallel", 2), ("deep", 1)])
 def test_a_signal_ends_all_processes_and_says_how_to_go_on(
-    kind: str, workers: int, number: signal.Signals, tmp_path: Path
+    kind: str, workers: int, number: signal.Signals, times: int, tmp_path: Path
 ) -> None:
-    """Of Ctrl-C, a scheduler, and a terminal that closes."""
+    """Of Ctrl-C, a scheduler, and a terminal that closes; twice at once, as `timeout` sends it."""
     (tmp_path / "sleeping.py").write_text(SLEEPING)
     (tmp_path / "script.py").write_text(SCRIPT)
     folder, file = tmp_path / "workspace", tmp_path / "events"
@@ -255,6 +258,9 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     )  # fmt: skip
     _wait_until(lambda: len(list(folder.glob("begun*"))) == workers)
     os.killpg(run.pid, number)  # a terminal sends it to all processes
+    if times == 2:
+        time.sleep(0.02)  # two that come while one is pending are one
+        os.kill(run.pid, number)
     out, shown = run.communicate(timeout=20)
     by = "" if number == signal.SIGINT else f" by {number.name}"
     assert (run.returncode, out) == (128 + number, "")

@@ -4,12 +4,15 @@ import contextlib
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import cast
 
 _GRACE_S = 5.0
 """Time between such a signal and the end of a run that is inside a library."""
+_SAME_S = 0.5
+"""Signals so close to the first are the same one: `timeout` sends it to a process and its group."""
 _IS_POSIX = hasattr(signal, "sigwait")
 """Elsewhere Ctrl-C alone ends a run early, whenever Python gets to it."""
 SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM} | ({signal.SIGHUP} if _IS_POSIX else set()))
@@ -58,8 +61,9 @@ def handled(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
     that run already, such as numpy's, keep their own mask: enter this block before them.
 
     Python raises only between its own instructions, and an adjustment of a large model may take
-    minutes. Some seconds later, or at a second signal, the process therefore ends whatever it is
-    deep in. What is broken off then is as after a kill, which loses nothing.
+    minutes. Some seconds later, or at a second request, the process therefore ends whatever it is
+    deep in. What is broken off then is as after a kill, which loses nothing. After this block an
+    interrupted process is to end, and further signals no longer reach it.
 
     Args:
         finish: reports the end where the main thread does not.
@@ -89,11 +93,13 @@ def handled(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
                 return
             requests.append(Interrupted(number))
             signal.pthread_kill(main, _FORWARD)
+        began_s = time.monotonic()
         late = threading.Timer(_GRACE_S, end)
         late.daemon = True
         late.start()
         signal.sigwait(numbers)  # a second one, or the end
-        late.cancel()
+        while not ended.is_set() and time.monotonic() < began_s + _SAME_S:
+            signal.sigwait(numbers)
         if not ended.is_set():
             end()
 
@@ -108,7 +114,8 @@ def handled(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
             ended.set()
             signal.pthread_kill(cast(int, waiter.ident), next(iter(numbers)))
         waiter.join()
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        if not requests:  # else the process ends, and its exit code is to stay
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         signal.signal(_FORWARD, handler)
 
 

@@ -6,7 +6,7 @@ import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.j
 import {profileChart} from "./profile_chart.js";
 import {clock, counted, number, paceText, share} from "./words.js";
 
-const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"]];  /* as the coverage's own */
+const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"], ["#3c3c3c3c", "not yet"]];  /* as the coverage's own */
 const PROFILE_S = 300;
 const KEPT = 6000;
 

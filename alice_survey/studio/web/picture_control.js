@@ -15,10 +15,11 @@ function fitOf(row, preview) {
   if (!now && !fitted) return el("span", {class: why ? "warn" : null}, why || "");
   const words = (one) => (row.kind === "point"
     ? [one.north_m, one.east_m, one.down_m].map(mm).join(", ") : mm(one.error_m));
-  const bad = (fitted || now).misfit_sigmas > BAD_SIGMAS;
+  const judged = fitted || (row.kind === "bar" ? now : null);  /* a model lies as far off as its navigation */
+  const bad = judged && judged.misfit_sigmas > BAD_SIGMAS;
   return el("span", {class: bad ? "error" : null}, [
     now ? "now " + words(now) : "", now && fitted ? "; " : "", fitted && row.kind === "point" ? "fitted " + words(fitted) : "",
-    bad ? " BAD: " + number((fitted || now).misfit_sigmas, "sigmas", 2) : "",
+    bad ? " BAD: " + number(judged.misfit_sigmas, "sigmas", 2) : "",
   ].join(""));
 }
 

@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,10 @@ from alice_survey.kit.document import PictureLayer
 from alice_survey.report.colours import read_shrunk
 from alice_survey.report.held import Held
 from alice_survey.report.rasters import mosaic_layer, picture_layers
-from tests.alice_survey.report.tiny import tiny_workspace
+from alice_survey.studio.layers import Layers
+from alice_survey.studio.paths import Workspace
+from reconstruct.measure.surface import values_at
+from tests.alice_survey.report.tiny import COLUMNS, ROWS, tiny_workspace
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +78,26 @@ def test_a_raster_that_fits_keeps_its_own_grid(width: int, tmp_path: Path) -> No
     ) as raster:  # fmt: skip
         raster.write(np.ones((1, 2, width), np.uint8))
     assert read_shrunk(tmp_path / "a.tif", [1], 1e6)[2] == grid
+
+
+@pytest.mark.parametrize("columns", [COLUMNS, COLUMNS + 3])
+def test_errors_of_an_earlier_surface_are_no_layer(columns: int, tmp_path: Path) -> None:
+    """Nor a value under the cursor: they may have been evaluated over another plane."""
+    workspace = tiny_workspace(tmp_path)
+    shutil.copytree(workspace / "dense", workspace / "evaluation")
+    with rasterio.open(workspace / "dense" / "dem.tif") as dem:
+        profile = dem.profile | {"width": columns}
+    errors = np.full((1, ROWS, columns), 0.001, np.float32)
+    with rasterio.open(workspace / "evaluation" / "error.tif", "w", **profile) as raster:
+        raster.write(errors)
+    is_current = columns == COLUMNS
+    for layers in (
+        picture_layers(Held.of(workspace)),
+        Layers(Workspace(workspace)).picture_layers(),
+    ):
+        assert ("error" in {layer.name for layer in layers}) == is_current
+    found = values_at(workspace, (0.4, 1.0))
+    assert ("evaluation/error.tif" in found) == is_current and "dense/dem.tif" in found
 
 
 def test_numbers_are_coloured_between_limits_of_the_legend(workspace: Path) -> None:

@@ -4,16 +4,49 @@ import contextlib
 import json
 import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from http.client import HTTPResponse
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from alice_survey.studio.server import Server
 
+T = TypeVar("T")
+
 FOLDED = "sessionStorage.setItem('alice-survey layers', 'closed')"
 """Script of a page that keeps the list of layers from what is clicked on the map."""
+
+
+def until(look: Callable[[], T | None], within_s: float = 60.0) -> T:
+    """The first thing seen that counts as true."""
+    end_s = time.monotonic() + within_s
+    while not (found := look()):
+        assert time.monotonic() < end_s, f"it did not happen: {found}"
+        time.sleep(0.05)
+    return found
+
+
+def still(look: Callable[[], T], during_s: float = 0.4) -> T:
+    """The first thing seen that stays the same for a while."""
+    found, since_s = look(), time.monotonic()
+
+    def same() -> bool:
+        nonlocal found, since_s
+        now = look()
+        if now != found:
+            found, since_s = now, time.monotonic()
+        return time.monotonic() > since_s + during_s
+
+    until(same)
+    return found
+
+
+def looks_at(page: Any) -> list[str]:
+    """East and north of the middle of a page's map, and its zoom."""
+    canvas = page.locator("#map-canvas")
+    return [canvas.get_attribute(f"data-{name}") for name in ("east", "north", "zoom")]
 
 
 @dataclass(frozen=True, kw_only=True)

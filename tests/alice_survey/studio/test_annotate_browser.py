@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -13,7 +14,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.report.tiny import tiny_workspace
-from tests.alice_survey.studio.client import FOLDED, ask, serving
+from tests.alice_survey.studio.client import FOLDED, ask, looks_at, serving, still, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
@@ -33,8 +34,8 @@ def opened(browser: Any, server: Any, tab: str, width: int = 1280) -> tuple[Any,
     page.add_init_script(FOLDED)
     page.goto(server.address)
     page.wait_for_selector("body[data-ready]", timeout=20_000)
-    page.wait_for_timeout(1500)  # the plan that comes in moves the map
     page.get_by_role("tab", name=tab, exact=True).click()
+    still(lambda: looks_at(page))
     return page, heard
 
 
@@ -51,11 +52,26 @@ def click(page: Any, x: float, y: float) -> None:
     page.mouse.click(box["x"] + box["width"] * x, box["y"] + box["height"] * y)
 
 
-def stored(folder: Path) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads((folder / "annotations.json").read_text())[
-        "annotations"
-    ]
-    return found
+Stored = list[dict[str, Any]]
+
+
+def stored(folder: Path, holds: Callable[[Stored], object] = bool) -> Stored:
+    """The annotations in the file, once what is expected of them holds: pages show them before."""
+    file = folder / "annotations.json"
+
+    def found() -> Stored | None:
+        annotations: Stored = json.loads(file.read_text())["annotations"] if file.is_file() else []
+        return annotations if holds(annotations) else None
+
+    return until(found)
+
+
+def other_than(one: dict[str, Any]) -> Callable[[Stored], bool]:
+    return lambda found: found[0]["shape"] != one["shape"]
+
+
+def same_as(one: dict[str, Any]) -> Callable[[Stored], bool]:
+    return lambda found: found[0]["shape"] == one["shape"]
 
 
 def accessible(page: Any) -> None:
@@ -79,15 +95,13 @@ def test_a_polygon_is_drawn_edited_taken_back_and_exported(folder: Path) -> None
         vertex = page.get_by_role("button", name="Corner 1 of 4")
         vertex.focus()
         page.keyboard.press("Shift+ArrowLeft")
-        page.wait_for_timeout(500)
-        (moved,) = stored(folder)
+        (moved,) = stored(folder, other_than(one))
         pixel = 2.0 ** -float(page.locator(MAP).get_attribute("data-zoom"))
         shift = one["shape"]["points"][0][0] - moved["shape"]["points"][0][0]
         assert pixel / 2.5 < shift < 1.01 * max(pixel, 0.001)
         assert moved["shape"]["points"][1:] == one["shape"]["points"][1:]
         page.get_by_role("button", name="Undo", exact=True).click()
-        page.wait_for_timeout(500)
-        assert stored(folder)[0]["shape"] == one["shape"]
+        stored(folder, same_as(one))
 
         page.get_by_text("Files of other tools").click()
         with page.expect_download() as downloading:
@@ -129,11 +143,13 @@ def test_points_are_set_by_the_keyboard_alone_at_400_px(folder: Path) -> None:
         page.get_by_text("1 annotation", exact=True).wait_for()
         for _ in range(3):
             page.keyboard.press("ArrowRight")
-        page.wait_for_timeout(400)
+        still(lambda: looks_at(page))
         page.keyboard.press("Enter")
         page.get_by_text("2 annotations").wait_for()
         page.keyboard.press("Escape")
-        first, second = (one["shape"]["points"][0] for one in stored(folder))
+        first, second = (
+            one["shape"]["points"][0] for one in stored(folder, lambda found: len(found) > 1)
+        )
         assert second[0] - first[0] > 0.05
         assert second[1] == pytest.approx(first[1], abs=0.1)
         assert page.evaluate("document.documentElement.scrollWidth") <= 400
@@ -151,8 +167,8 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
     with serving(folder) as server, chromium() as browser:
         page, heard = opened(browser, server, "Annotate", width)
         add_label(page, "Porites")
-        page.wait_for_timeout(500)
-        before = (folder / "annotations.json").read_bytes()
+        file = folder / "annotations.json"
+        before = until(lambda: file.is_file() and file.read_bytes())
         page.get_by_text("Draw in pictures", exact=True).click()
         with page.expect_request("**/api/pictures/seeing?*") as asking:
             page.get_by_role("button", name="Show the pictures of the map's middle").click()
@@ -160,8 +176,7 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         north, east = (float(asked[axis][0]) for axis in "ne")
         view = page.locator(".picture-view[data-ready]").first
         view.wait_for(timeout=60_000)
-        page.wait_for_timeout(500)
-        box = view.bounding_box()
+        box = still(view.bounding_box)
         middle = np.array([box["width"], box["height"]]) / 2
         for right, down in clicked:
             view.click(position={"x": middle[0] + right, "y": middle[1] + down})
@@ -194,24 +209,23 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         assert figures["surface"] == pytest.approx(figures["rugosity"] * mark["area"], rel=0.02)
         assert 0 < figures["surface_sigma"] < 0.2 * area
         page.screenshot(path=str(tmp_path / f"kept-{width}.png"))
-        drawn = (folder / "annotations.json").read_bytes()
+        drawn = file.read_bytes()
 
         page.get_by_role("button", name="Edit in its picture").click()
         corner = page.get_by_role("button", name="Corner 2 of 3")
         corner.wait_for(timeout=60_000)
         corner.focus()
         page.keyboard.press("ArrowRight")
-        page.wait_for_timeout(700)
-        (moved,) = stored(folder)
+        (moved,) = stored(folder, other_than(one))
         shift = np.array(moved["shape"]["points"]) - points
         assert 0.1 < shift[1, 0] <= 8.0 and np.abs(shift).sum() == pytest.approx(shift[1, 0])
+        page.wait_for_timeout(1200)  # edits of one corner in quick succession are undone as one
         spot = corner.bounding_box()
         page.mouse.move(spot["x"] + 13, spot["y"] + 13)
         page.mouse.down()
         page.mouse.move(spot["x"] + 33, spot["y"] + 33, steps=4)
         page.mouse.up()
-        page.wait_for_timeout(700)
-        (dragged,) = stored(folder)
+        (dragged,) = stored(folder, other_than(moved))
         shift = np.array(dragged["shape"]["points"]) - np.array(moved["shape"]["points"])
         np.testing.assert_allclose(shift[[0, 2]], 0.0)
         assert shift[1, 0] == pytest.approx(shift[1, 1], abs=0.1) and 1.0 < shift[1, 0] < 10.0
@@ -219,21 +233,19 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         page.screenshot(path=str(tmp_path / f"edited-{width}.png"))
         for _ in range(2):
             page.keyboard.press("Control+z")
-            page.wait_for_timeout(700)
-        assert (folder / "annotations.json").read_bytes() == drawn
+        until(lambda: file.read_bytes() == drawn)
         corner.focus()
         page.keyboard.press("Escape")  # to the picture
         page.keyboard.press("Escape")  # to the map
         assert page.evaluate("document.activeElement.id") == "map-canvas"
         page.get_by_role("button", name="Undo", exact=True).click()
         page.get_by_text("Nothing is annotated yet.").wait_for()
-        page.wait_for_timeout(500)
-        assert (folder / "annotations.json").read_bytes() == before
+        until(lambda: file.read_bytes() == before)
 
         page.locator("#panel-annotate").get_by_label("Shape", exact=True).select_option("point")
         page.get_by_role("button", name="Show the pictures of the map's middle").click()
         view.wait_for(timeout=60_000)
-        page.wait_for_timeout(500)
+        still(view.bounding_box)
         with rasterio.open(folder / "dense" / "dem.tif", "r+") as raster:
             raster.write(np.full(raster.shape, np.nan, np.float32), 1)
         view.focus()

@@ -16,7 +16,7 @@ import shapely
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.studio.endpoints.follow import _COLOURS
 from alice_survey.studio.server import Server
-from tests.alice_survey.studio.client import ask, call, serving
+from tests.alice_survey.studio.client import ask, call, serving, until
 from tests.missions.follow.dives import route_rows, text_of
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
@@ -45,13 +45,12 @@ def state(server: Server) -> dict[str, Any]:
 
 def wait_for(server: Server, true: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """The first state of which something is true."""
-    until = time.monotonic() + 60.0
-    while time.monotonic() < until:
+
+    def seen() -> dict[str, Any] | None:
         found = state(server)
-        if found.get("fix") and true(found):
-            return found
-        time.sleep(0.1)
-    raise AssertionError(f"never came: {found}")
+        return found if found.get("fix") and true(found) else None
+
+    return until(seen)
 
 
 @pytest.fixture
@@ -154,10 +153,7 @@ def test_a_log_that_cannot_be_used_is_said_in_a_line(tmp_path: Path) -> None:
     folder = workspace_of(tmp_path / "reef")
     (folder / "nav.csv").write_text("a,b\n1,2\n")
     with serving(folder, log=str(folder / "nav.csv")) as server:
-        until = time.monotonic() + 30.0
-        while time.monotonic() < until and not state(server)["fault"]:
-            time.sleep(0.1)
-        assert "time_s" in state(server)["fault"]
+        assert "time_s" in until(lambda: state(server)["fault"])
     with serving(tmp_path / "empty", log="nav.csv") as server:
         found = state(server)
         assert not found["following"]

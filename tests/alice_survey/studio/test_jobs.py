@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from filelock import FileLock
 from alice_survey.base.errors import AliceError
 from alice_survey.studio.heard import KEPT_LINES, EventsTail, Heard
 from alice_survey.studio.jobs import BusyError, JobRecord, Jobs
+from tests.alice_survey.studio.client import until
 
 PROGRAM = """
 import json, os, signal, subprocess, sys, time
@@ -83,13 +84,6 @@ def folder_of(workspace: Path, number: int = 1) -> Path:
     return workspace / ".studio" / "jobs" / f"{number:04d}"
 
 
-def until(happened: Callable[[], object], within_s: float = 20.0) -> None:
-    end_s = time.monotonic() + within_s
-    while not happened():
-        assert time.monotonic() < end_s, "it did not happen"
-        time.sleep(0.02)
-
-
 def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
     told = Published()
     with jobs_in(tmp_path, told) as jobs:
@@ -146,6 +140,26 @@ def test_a_deaf_job_is_ended_in_the_end(tmp_path: Path, monkeypatch: pytest.Monk
         until(lambda: jobs.running() is None)
         (ended,) = jobs.history()
     assert ended["state"] == "stopped" and ended["exit_code"] == -signal.SIGKILL
+
+
+def test_a_studio_in_the_background_of_a_script_stops_jobs_as_soon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shell lets such programs, and so their jobs, ignore Ctrl-C."""
+    monkeypatch.setattr("alice_survey.studio.jobs._HARDER_S", (600.0, 600.0))
+    usual = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sleeping = [sys.executable, "-c", "import time; time.sleep(600)"]
+    try:
+        jobs = Jobs(tmp_path, Published(), sleeping)
+        jobs.start("plan")
+        jobs.stop()
+        until(lambda: jobs.running() is None)
+        jobs.start("plan")
+        jobs.close()
+        until(lambda: jobs.running() is None)
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    assert [one["state"] for one in jobs.history()] == ["stopped", "stopped"]
 
 
 def test_a_killed_job_says_so(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.studio.server import Server
 from reconstruct.placing.control_file import read_control, read_picks
 from tests.alice_survey.kit.browser import Heard
-from tests.alice_survey.studio.client import ask, serving
+from tests.alice_survey.studio.client import ask, looks_at, serving, still
 from tests.alice_survey.studio.journey_page import (
     LONG_MS,
     NARROW,
@@ -73,7 +73,7 @@ def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path:
         plan = PlanPage(page=page, heard=heard)
         plan.settled()
         page.get_by_role("button", name=re.compile("^Delete")).first.click()
-        page.wait_for_timeout(500)
+        page.get_by_text("Draw the area to survey on the map").wait_for()
         plan.draw("Survey area", ((2.0, 2.0), (2.0, 5.0), (4.5, 5.0), (4.5, 2.0)))
         is_accessible(page, tmp_path / "drawn.png")
         survey_flown(page)
@@ -321,9 +321,9 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
 
 def measured_coral(page: Any, number: int) -> None:
     """Measure a triangle in the middle of the map, and look at its figures."""
-    page.wait_for_timeout(1500)
     box = page.locator("#map-canvas")
     box.scroll_into_view_if_needed()
+    still(lambda: looks_at(page))
     east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
     corners = [(east - 0.2, north - 0.15), (east + 0.2, north - 0.15), (east, north + 0.2)]
     button(page, "Area").click()

@@ -23,7 +23,7 @@ from reconstruct.copc_nodes import read_nodes
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import sketch_mesh
 from tests.alice_survey.report.tiny import SLOPE, plane_of, tiny_workspace
-from tests.alice_survey.studio.client import FOLDED, serving
+from tests.alice_survey.studio.client import FOLDED, looks_at, serving, still, until
 from tests.reconstruct.tiny_cloud import deep_cloud, rippled
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -77,14 +77,17 @@ def at(page: Any, east: float, north: float) -> dict[str, float]:
     }
 
 
-def middle(page: Any) -> list[str]:
-    return [page.locator(MAP).get_attribute(f"data-{name}") for name in ("east", "north")]
-
-
 def click(page: Any, *places: tuple[float, float]) -> None:
     for place in places:
         page.locator(MAP).click(position=at(page, *place))
         page.wait_for_timeout(60)
+
+
+def move_map(page: Any, key: str) -> None:
+    before = looks_at(page)
+    page.keyboard.press(key)
+    until(lambda: looks_at(page) != before)
+    still(lambda: looks_at(page))
 
 
 def kept(page: Any) -> list[dict[str, Any]]:
@@ -165,13 +168,7 @@ def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
         page.keyboard.press("p")
         for key in ("ArrowRight", "ArrowUp", "ArrowLeft"):
             page.keyboard.press("Enter")
-            before = middle(page)
-            page.keyboard.press(key)
-            for _ in range(100):
-                page.wait_for_timeout(50)
-                if middle(page) != before:
-                    break
-            page.wait_for_timeout(300)
+            move_map(page, key)
         page.keyboard.press("Enter")
         page.keyboard.press("Backspace")
         page.keyboard.press("f")
@@ -333,10 +330,8 @@ def test_tiles_are_drawn_as_the_view_needs_them_and_picked(width: int, tmp_path:
 
 def drawn_points(page: Any) -> int:
     """How many points are drawn when no more are on the way."""
-    page.wait_for_timeout(100)
     page.wait_for_selector("#mesh-canvas[data-coming='0']", timeout=10_000)
-    page.wait_for_timeout(100)
-    text = page.get_by_text(re.compile("points drawn, 0 on the way")).inner_text()
+    text = still(page.get_by_text(re.compile("points drawn, 0 on the way")).inner_text)
     return int(text.split(" of ")[0].replace(",", ""))
 
 

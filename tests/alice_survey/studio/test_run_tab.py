@@ -19,8 +19,8 @@ from alice_survey.studio.folders import Folders
 from alice_survey.studio.jobs import Jobs
 from alice_survey.studio.server import Server
 from alice_survey.studio.survey_state import ways_on
-from tests.alice_survey.studio.client import Reply, ask, call, serving
-from tests.alice_survey.studio.test_jobs import PROGRAM, until
+from tests.alice_survey.studio.client import Reply, ask, call, serving, until
+from tests.alice_survey.studio.test_jobs import PROGRAM
 from tests.reconstruct.pictures.dated import navigation, take
 from tests.small_survey import settings_in
 

@@ -74,7 +74,8 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         for _ in range(3):
             page.keyboard.press("+")
             page.wait_for_timeout(250)
-        assert int(page.locator(MAP).get_attribute("data-level")) == 3 > first
+        page.wait_for_selector(f"{MAP}[data-level='3']")
+        assert first < 3
         assert all(width > 0 for _, width in all_loaded(page, 3))
 
         page.get_by_label("Height", exact=True).check()
