@@ -211,7 +211,7 @@ def _runs(cells: NDArray[np.int64]) -> Iterator[slice]:
 def is_of_surface(workspace: Path, file: str) -> bool:
     """Whether a raster is of the surface that is there now.
 
-    Errors that were evaluated before the surface was made anew, perhaps over another plane, have
+    Errors that were evaluated before the surface was made again, perhaps over another plane, have
     other cells.
     """
     dem = workspace / DEM

@@ -11,6 +11,7 @@ import {isArea, targetOf} from "./annotate_shapes.js";
 import {annotationTable, coverTable, surfaceCells, warnings} from "./annotate_tables.js";
 import {drawingTool} from "./drawing.js";
 import {missing} from "./missing.js";
+import {startOwnSaves} from "./own_saves.js";
 import {pictureDrawing, pictureEditing} from "./picture_drawing.js";
 
 const NOTHING = {labels: [], annotations: new Map()};
@@ -35,6 +36,7 @@ export function tab(studio) {
   let pixel = 0;
   let [loaded, entered] = [false, false];
   const hidden = new Set();
+  const saves = startOwnSaves();
   const drawn = annotationsOn(studio, choose);
   const drawing = drawingTool(studio, "annotate");
   const handles = vertexHandles(studio.map.leaflet, "annotate", {
@@ -120,7 +122,7 @@ export function tab(studio) {
       const next = now();
       if (next === stored) return;
       try {
-        ({token} = await send("/api/annotations/change", {token, ...changeBetween(stored, next)}));
+        ({token} = await saves.save(send("/api/annotations/change", {token, ...changeBetween(stored, next)})));
       } catch (fault) {
         await load();
         throw fault;
@@ -137,7 +139,8 @@ export function tab(studio) {
     return store();
   }
 
-  on("annotations", (data) => {
+  on("annotations", async (data) => {
+    if (await saves.isOwn(data.token)) return;
     inTurn(async () => {
       if (!loaded || data.token === token) return;
       await load();

@@ -2,6 +2,7 @@
 
 import {attempt, button, download, el, field, get, on, say, send, table} from "./core.js";
 import {missing} from "./missing.js";
+import {startOwnSaves} from "./own_saves.js";
 import {ORANGE} from "./palette.js";
 import {counted, csv, number, withSigma} from "./words.js";
 import {controlForm, controlRows, mm} from "./picture_control.js";
@@ -16,11 +17,7 @@ export function tab(studio) {
   let chosen = [];
   let wall = null;
   let checking = 0;
-  const saved = new Set();  /* tokens of the files as this page has written them */
-  const own = ({token}) => {
-    saved.add(token);
-    return token;
-  };
+  const saves = startOwnSaves();
 
   const name = el("input", {type: "text", value: "", maxlength: "100", autocomplete: "off"});
   const sigma = el("input", {type: "number", min: "0.01", max: "20", step: "any", value: "0.3"});
@@ -187,14 +184,13 @@ export function tab(studio) {
   async function savePoint() {
     const point = name.value.trim();
     if (!point) throw new Error("give the point a name");
-    const done = await send("/api/picks/save", {token: held.token, points: [point], picks: used().map(asPick)});
-    held.token = own(done);
+    held.token = (await saves.save(send("/api/picks/save", {token: held.token, points: [point], picks: used().map(asPick)}))).token;
     await load();
     say("Saved " + point + " to picks.csv.");
   }
 
   async function removePoint(point) {
-    held.token = own(await send("/api/picks/save", {token: held.token, points: [point], picks: []}));
+    held.token = (await saves.save(send("/api/picks/save", {token: held.token, points: [point], picks: []}))).token;
     chosen = chosen.filter((one) => one !== point);
     await load();
     say("Took " + point + " out of picks.csv.");
@@ -297,8 +293,7 @@ export function tab(studio) {
   /* ---- Control ---- */
 
   async function saveControl(rows, names) {
-    const done = await send("/api/control/save", {token: control.token, rows, names});
-    control.token = own(done);
+    control.token = (await saves.save(send("/api/control/save", {token: control.token, rows, names}))).token;
     await load();
     say("Saved to control.csv. Run the reconstruction for the model to use it.");
   }
@@ -323,12 +318,11 @@ export function tab(studio) {
     drawControl();
   }
 
-  /* A while later, when a page knows what it has saved itself. */
-  on("picks", ({file, token}) => setTimeout(() => {
-    if (saved.delete(token) || panel.hidden || !file || token === held.token || token === control.token) return;
+  on("picks", async ({file, token}) => {
+    if (await saves.isOwn(token) || panel.hidden || !file || token === held.token || token === control.token) return;
     say(file + " was changed by another page: loaded again.", "warn");
     attempt(load);
-  }, 500));
+  });
 
   return {
     name: "pictures", title: "Pictures", panel,

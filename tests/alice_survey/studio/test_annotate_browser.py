@@ -168,7 +168,8 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         page, heard = opened(browser, server, "Annotate", width)
         add_label(page, "Porites")
         file = folder / "annotations.json"
-        before = until(lambda: file.is_file() and file.read_bytes())
+        until(lambda: file.is_file() and "Porites" in file.read_text())
+        before = file.read_bytes()
         page.get_by_text("Draw in pictures", exact=True).click()
         with page.expect_request("**/api/pictures/seeing?*") as asking:
             page.get_by_role("button", name="Show the pictures of the map's middle").click()

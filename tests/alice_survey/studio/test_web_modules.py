@@ -127,6 +127,30 @@ def test_what_a_file_has_replaces_what_is_of_its_kind(tmp_path: Path) -> None:
     assert kept == {**SHAPES, "allowed": [SQUARE]}
 
 
+def test_reports_of_own_saves_are_known_whatever_comes_first(tmp_path: Path) -> None:
+    """The report before its answer; both answers before the first report; content saved twice."""
+    early, late, again, other, failed = run(
+        tmp_path, "own_saves",
+        """(async () => {
+          const wait = (ms, value) => new Promise((done) => setTimeout(() => done(value), ms));
+          const saves = m.startOwnSaves();
+          const slow = saves.save(wait(30, {token: "a"}));
+          const early = await saves.isOwn("a");
+          await slow;
+          await saves.save(wait(0, {token: "b"}));
+          await saves.save(wait(0, {token: "a"}));
+          await saves.save(wait(0, {token: "b"}));
+          const late = [await saves.isOwn("b"), await saves.isOwn("a")];
+          const again = await saves.isOwn("b");
+          const other = [await saves.isOwn("b"), await saves.isOwn("c")];
+          const refused = saves.save(Promise.reject(new Error("no"))).catch((fault) => fault.message);
+          return [early, late, again, other, [await saves.isOwn("d"), await refused]];
+        })()""",
+    )  # fmt: skip
+    assert (early, late, again) == (True, [True, True], True)
+    assert other == [False, False] and failed == [False, "no"]
+
+
 edits = st.lists(
     st.tuples(st.sampled_from(["move", "insert", "remove", "drop", "shift", "add", "hole"]),
               st.integers(0, 40), st.integers(0, 40), st.floats(-5, 5)), max_size=30,
