@@ -143,7 +143,7 @@ def test_reports_of_own_saves_are_known_whatever_comes_first(tmp_path: Path) -> 
           const late = [await saves.isOwn("b"), await saves.isOwn("a")];
           const again = await saves.isOwn("b");
           const other = [await saves.isOwn("b"), await saves.isOwn("c")];
-          const refused = saves.save(Promise.reject(new Error("no"))).catch((fault) => fault.message);
+          const refused = saves.save(Promise.reject(new Error("no"))).catch((no) => no.message);
           return [early, late, again, other, [await saves.isOwn("d"), await refused]];
         })()""",
     )  # fmt: skip
