@@ -33,7 +33,7 @@ def opened(browser: Any, server: Any, tab: str, width: int = 1280) -> tuple[Any,
     heard.listen(page)
     page.add_init_script(FOLDED)
     page.goto(server.address)
-    page.wait_for_selector("body[data-ready]", timeout=20_000)
+    page.wait_for_selector("body[data-ready]", timeout=60_000)
     page.get_by_role("tab", name=tab, exact=True).click()
     still(lambda: looks_at(page))
     return page, heard
@@ -278,7 +278,7 @@ def test_a_survey_is_compared_with_a_copy_of_itself(folder: Path, width: int) ->
         page.get_by_label("Next to this one").select_option(label="copy")
         page.get_by_role("button", name="Open", exact=True).click()
         pane = page.locator(".leaflet-compare-pane")
-        pane.locator("img").first.wait_for(state="attached", timeout=20_000)
+        pane.locator("img").first.wait_for(state="attached", timeout=60_000)
         swipe = page.get_by_label("Where the two meet, %")
         swipe.focus()
         clips = [pane.evaluate("e => e.style.clip")]
@@ -292,7 +292,7 @@ def test_a_survey_is_compared_with_a_copy_of_itself(folder: Path, width: int) ->
 
         page.get_by_role("radio", name="Side by side").check()
         other = page.get_by_role("application", name="moves with the other")
-        other.locator("img").first.wait_for(state="attached", timeout=20_000)
+        other.locator("img").first.wait_for(state="attached", timeout=60_000)
         assert page.locator(MAP).bounding_box()["width"] == pytest.approx(wide / 2, abs=3)
         accessible(page)
         page.get_by_role("radio", name="This survey alone").check()

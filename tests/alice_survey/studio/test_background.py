@@ -115,11 +115,11 @@ def test_tiles_are_shown_and_taken_away(tmp_path: Path, tiles: tuple[str, list[s
         heard = Heard()
         heard.listen(page)
         page.goto(server.address)
-        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
         under = ".leaflet-under-pane img"
         page.wait_for_function(
             f"[...document.querySelectorAll('{under}')].some((tile) => tile.naturalWidth === 256)",
-            timeout=20_000,
+            timeout=60_000,
         )
         box = page.locator("#map-canvas").bounding_box()
         covered = page.evaluate(

@@ -56,7 +56,7 @@ def opened(
         heard.listen(page)
         page.add_init_script(FOLDED)
         page.goto(server.address + "#model")
-        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
         page.wait_for_selector("#panel-model:visible")
         yield page, heard
         assert [line for line in heard.complaints if not any(c in line for c in complaints)] == []
@@ -103,15 +103,15 @@ def named(measure: dict[str, Any]) -> dict[str, Any]:
 
 
 def measured(page: Any, count: int) -> list[dict[str, Any]]:
-    page.wait_for_selector(f"tr[data-measure] >> nth={count - 1}", timeout=20_000)
+    page.wait_for_selector(f"tr[data-measure] >> nth={count - 1}", timeout=60_000)
     return kept(page)
 
 
 def test_lengths_areas_and_exports(tmp_path: Path) -> None:
     with opened(with_mesh(tmp_path / "reef")) as (page, _):
         page.locator(MAP).hover(position=at(page, 0.4, 0.6))
-        page.locator(".under", has_text="Sigma").wait_for(timeout=10_000)
-        page.locator("#map-readout", has_text="height −9.").wait_for(timeout=10_000)
+        page.locator(".under", has_text="Sigma").wait_for(timeout=60_000)
+        page.locator("#map-readout", has_text="height −9.").wait_for(timeout=60_000)
 
         page.get_by_role("button", name="Length", exact=True).click()
         click(page, (0.2, 0.5), (0.6, 0.5))
@@ -189,7 +189,7 @@ def test_two_picks_on_the_mesh_are_a_length(tmp_path: Path) -> None:
 
     with opened(with_mesh(tmp_path / "reef")) as (page, _):
         page.get_by_text("In 3D", exact=True).click()
-        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
         canvas = page.locator("#mesh-canvas")
         box = canvas.bounding_box()
         canvas.click(position={"x": box["width"] * 0.45, "y": box["height"] * 0.5})
@@ -254,7 +254,7 @@ def test_tiles_are_drawn_as_the_view_needs_them_and_picked(width: int, tmp_path:
 
     with opened(with_tiles(tmp_path / "reef"), width) as (page, heard):
         page.get_by_text("In 3D", exact=True).click()
-        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
         canvas = page.locator("#mesh-canvas")
 
         def loaded() -> set[str]:
@@ -265,11 +265,11 @@ def test_tiles_are_drawn_as_the_view_needs_them_and_picked(width: int, tmp_path:
         for _ in range(16):
             page.keyboard.press("-")
         page.get_by_label("Drawn as").select_option("tiles")
-        page.wait_for_selector("#mesh-canvas[data-parts='1'][data-coming='0']", timeout=10_000)
+        page.wait_for_selector("#mesh-canvas[data-parts='1'][data-coming='0']", timeout=60_000)
         assert loaded() == {"tileset.json", "top.glb"}
         canvas.focus()
         page.keyboard.press("0")
-        page.wait_for_selector("#mesh-canvas[data-parts='2'][data-coming='0']", timeout=10_000)
+        page.wait_for_selector("#mesh-canvas[data-parts='2'][data-coming='0']", timeout=60_000)
         assert loaded() == {"tileset.json", "top.glb", "west.json", "west.glb", "east.glb"}
         shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB"), float)
         assert 0.1 < (np.abs(shot - [243, 246, 248]).max(axis=2) > 30).mean() < 0.95
@@ -330,7 +330,7 @@ def test_tiles_are_drawn_as_the_view_needs_them_and_picked(width: int, tmp_path:
 
 def drawn_points(page: Any) -> int:
     """How many points are drawn when no more are on the way."""
-    page.wait_for_selector("#mesh-canvas[data-coming='0']", timeout=10_000)
+    page.wait_for_selector("#mesh-canvas[data-coming='0']", timeout=60_000)
     text = still(page.get_by_text(re.compile("points drawn, 0 on the way")).inner_text)
     return int(text.split(" of ")[0].replace(",", ""))
 
@@ -349,10 +349,10 @@ def test_damaged_parts_and_little_memory_on_a_wall(tmp_path: Path) -> None:
     write_json(workspace / "dense" / "plane.json", WALL)
     with opened(workspace, complaints=("500", "409")) as (page, _):
         page.get_by_text("In 3D", exact=True).click()
-        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
         canvas, status = page.locator("#mesh-canvas"), page.locator("#status.error")
         page.get_by_label("Drawn as").select_option("tiles")
-        page.wait_for_selector("#mesh-canvas[data-parts='1'][data-coming='0']", timeout=10_000)
+        page.wait_for_selector("#mesh-canvas[data-parts='1'][data-coming='0']", timeout=60_000)
         assert status.inner_text() == (
             "A part is not drawn: mesh/tiles/west.glb is cut off: delete it and run its stage again"
         )
@@ -401,7 +401,7 @@ def test_it_is_accessible(width: int, tmp_path: Path) -> None:
         page.keyboard.press("f")
         measured(page, 2)
         page.get_by_text("In 3D", exact=True).click()
-        page.wait_for_selector(".mesh[data-ready]", timeout=30_000)
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
         for text in ("What the sigmas count", "Files"):
             page.get_by_text(text, exact=True).click()
         found = Axe().run(page)

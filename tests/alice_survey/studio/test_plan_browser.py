@@ -47,7 +47,7 @@ class PlanPage:
             "(after) => Number(document.querySelector('#panel-plan')?.dataset.plans || -1) > after"
             " && !document.querySelector('main[data-planning]')",
             arg=after,
-            timeout=20_000,
+            timeout=60_000,
         )
         return self.plans
 

@@ -52,7 +52,7 @@ def all_loaded(page: Any, level: int) -> list[tuple[str, int]]:
             && new URL(tile.src).pathname.split("/")[3] === String(level));
         }""",
         arg=[PICTURES, level],
-        timeout=20_000,
+        timeout=60_000,
     )
     return tiles(page)
 
@@ -63,7 +63,7 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         heard = Heard()
         heard.listen(page)
         page.goto(server.address)
-        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
         assert "token" not in page.url
         first = int(page.locator(MAP).get_attribute("data-level"))
         shown = all_loaded(page, first)
@@ -81,7 +81,7 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         page.get_by_label("Height", exact=True).check()
         page.wait_for_function(
             "() => document.querySelector('img[src*=\"/tiles/height/\"]')?.naturalWidth > 0",
-            timeout=20_000,
+            timeout=60_000,
         )
         assert page.get_by_text("height, m").first.is_visible()
         for name in ("Mosaic", "Sigma of height", "Height") * 3:  # faster than tiles come
@@ -103,7 +103,7 @@ def test_every_tab_is_accessible(folder: Path, width: int, scheme: str) -> None:
         heard = Heard()
         heard.listen(page)
         page.goto(server.address)
-        page.wait_for_selector("body[data-ready]", timeout=20_000)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
         names = page.locator("#tabs [role=tab]").all_inner_texts()
         for name in names:
             page.get_by_role("tab", name=name, exact=True).click()
