@@ -29,11 +29,12 @@ def opened(browser: Any, server: Any, tab: str, width: int = 1280) -> tuple[Any,
     page = browser.new_page(
         viewport={"width": width, "height": 900}, reduced_motion="reduce", accept_downloads=True
     )
+    page.set_default_timeout(60_000)
     heard = Heard()
     heard.listen(page)
     page.add_init_script(FOLDED)
     page.goto(server.address)
-    page.wait_for_selector("body[data-ready]", timeout=60_000)
+    page.wait_for_selector("body[data-ready]")
     page.get_by_role("tab", name=tab, exact=True).click()
     still(lambda: looks_at(page))
     return page, heard
@@ -92,6 +93,7 @@ def test_a_polygon_is_drawn_edited_taken_back_and_exported(folder: Path) -> None
         (one,) = stored(folder)
         assert one["label"] == "Porifera > Axinella" and len(one["shape"]["points"]) == 4
 
+        page.get_by_role("row", name="Rugosity").first.wait_for()  # all is measured
         vertex = page.get_by_role("button", name="Corner 1 of 4")
         vertex.focus()
         page.keyboard.press("Shift+ArrowLeft")
@@ -176,7 +178,7 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         asked = parse_qs(urlsplit(asking.value.url).query)
         north, east = (float(asked[axis][0]) for axis in "ne")
         view = page.locator(".picture-view[data-ready]").first
-        view.wait_for(timeout=60_000)
+        view.wait_for()
         box = still(view.bounding_box)
         middle = np.array([box["width"], box["height"]]) / 2
         for right, down in clicked:
@@ -189,7 +191,7 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
         page.keyboard.press("f")
         page.locator("#status", has_text="Polygon drawn in").wait_for()
         page.get_by_role("button", name="Back to the map").first.click()
-        page.get_by_role("row", name="Rugosity").first.wait_for(timeout=60_000)
+        page.get_by_role("row", name="Rugosity").first.wait_for()
         (one,) = stored(folder)
         seen = ask(server, f"/api/pictures/seeing?n={north}&e={east}&count=1").json["pictures"][0]
         assert one["image"] == seen["name"]
@@ -214,7 +216,7 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
 
         page.get_by_role("button", name="Edit in its picture").click()
         corner = page.get_by_role("button", name="Corner 2 of 3")
-        corner.wait_for(timeout=60_000)
+        corner.wait_for()
         corner.focus()
         page.keyboard.press("ArrowRight")
         (moved,) = stored(folder, other_than(one))
@@ -245,7 +247,7 @@ def test_a_colony_is_drawn_in_a_picture(width: int, small_survey: Path, tmp_path
 
         page.locator("#panel-annotate").get_by_label("Shape", exact=True).select_option("point")
         page.get_by_role("button", name="Show the pictures of the map's middle").click()
-        view.wait_for(timeout=60_000)
+        view.wait_for()
         still(view.bounding_box)
         with rasterio.open(folder / "dense" / "dem.tif", "r+") as raster:
             raster.write(np.full(raster.shape, np.nan, np.float32), 1)
@@ -278,7 +280,7 @@ def test_a_survey_is_compared_with_a_copy_of_itself(folder: Path, width: int) ->
         page.get_by_label("Next to this one").select_option(label="copy")
         page.get_by_role("button", name="Open", exact=True).click()
         pane = page.locator(".leaflet-compare-pane")
-        pane.locator("img").first.wait_for(state="attached", timeout=60_000)
+        pane.locator("img").first.wait_for(state="attached")
         swipe = page.get_by_label("Where the two meet, %")
         swipe.focus()
         clips = [pane.evaluate("e => e.style.clip")]
@@ -292,7 +294,7 @@ def test_a_survey_is_compared_with_a_copy_of_itself(folder: Path, width: int) ->
 
         page.get_by_role("radio", name="Side by side").check()
         other = page.get_by_role("application", name="moves with the other")
-        other.locator("img").first.wait_for(state="attached", timeout=60_000)
+        other.locator("img").first.wait_for(state="attached")
         assert page.locator(MAP).bounding_box()["width"] == pytest.approx(wide / 2, abs=3)
         accessible(page)
         page.get_by_role("radio", name="This survey alone").check()
