@@ -155,7 +155,7 @@ class _Job:
 
     def stop(self) -> None:
         """Ask it to end, ever more firmly; returns when it has."""
-        for number, patience_s in zip((_gentle(), signal.SIGTERM), _HARDER_S, strict=True):
+        for number, patience_s in zip((_first_signal(), signal.SIGTERM), _HARDER_S, strict=True):
             self.send(number)
             if self.ended.wait(patience_s):
                 return
@@ -244,7 +244,7 @@ class Jobs:
         job = self._job
         if job is not None and job.is_own:
             job.stopping = True
-            job.send(_gentle())
+            job.send(_first_signal())
             job.ended.wait(_ENDING_S)
 
     def running(self) -> dict[str, Any] | None:
@@ -396,10 +396,10 @@ class Jobs:
         )
 
 
-def _gentle() -> signal.Signals:
+def _first_signal() -> signal.Signals:
     """Ctrl-C; SIGTERM where this program ignores it, and so do those that it starts."""
-    is_deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    return signal.SIGTERM if is_deaf else signal.SIGINT
+    is_ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    return signal.SIGTERM if is_ignored else signal.SIGINT
 
 
 def _environment() -> dict[str, str]:

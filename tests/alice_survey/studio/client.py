@@ -49,6 +49,14 @@ def looks_at(page: Any) -> list[str]:
     return [canvas.get_attribute(f"data-{name}") for name in ("east", "north", "zoom")]
 
 
+def move_map(page: Any, key: str) -> None:
+    """Press a key that moves the map, and wait for its end."""
+    before = looks_at(page)
+    page.keyboard.press(key)
+    until(lambda: looks_at(page) != before)
+    still(lambda: looks_at(page))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reply:
     status: int

@@ -14,7 +14,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.report.tiny import tiny_workspace
-from tests.alice_survey.studio.client import FOLDED, ask, looks_at, serving, still, until
+from tests.alice_survey.studio.client import FOLDED, ask, looks_at, move_map, serving, still, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
@@ -144,8 +144,7 @@ def test_points_are_set_by_the_keyboard_alone_at_400_px(folder: Path) -> None:
         page.keyboard.press("Enter")
         page.get_by_text("1 annotation", exact=True).wait_for()
         for _ in range(3):
-            page.keyboard.press("ArrowRight")
-        still(lambda: looks_at(page))
+            move_map(page, "ArrowRight")
         page.keyboard.press("Enter")
         page.get_by_text("2 annotations").wait_for()
         page.keyboard.press("Escape")

@@ -23,7 +23,7 @@ from reconstruct.copc_nodes import read_nodes
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import sketch_mesh
 from tests.alice_survey.report.tiny import SLOPE, plane_of, tiny_workspace
-from tests.alice_survey.studio.client import FOLDED, looks_at, serving, still, until
+from tests.alice_survey.studio.client import FOLDED, move_map, serving, still
 from tests.reconstruct.tiny_cloud import deep_cloud, rippled
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -81,13 +81,6 @@ def click(page: Any, *places: tuple[float, float]) -> None:
     for place in places:
         page.locator(MAP).click(position=at(page, *place))
         page.wait_for_timeout(60)
-
-
-def move_map(page: Any, key: str) -> None:
-    before = looks_at(page)
-    page.keyboard.press(key)
-    until(lambda: looks_at(page) != before)
-    still(lambda: looks_at(page))
 
 
 def kept(page: Any) -> list[dict[str, Any]]:
