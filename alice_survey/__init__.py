@@ -14,14 +14,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alice_survey.api.figures import plot_dem, plot_mosaic, plot_plan, plot_track
-    from alice_survey.api.rasters import Dem, Mosaic, read_dem, read_mosaic
-    from alice_survey.api.survey import Survey
-    from alice_survey.api.track import Track, read_track
-    from alice_survey.base.config import SurveyConfig, load_config
-    from alice_survey.base.errors import AliceError
-    from alice_survey.base.frames import Datum
-    from alice_survey.base.seawater import n_water
+    from alice_survey.app.api.figures import plot_dem, plot_mosaic, plot_plan, plot_track
+    from alice_survey.app.api.rasters import Dem, Mosaic, read_dem, read_mosaic
+    from alice_survey.app.api.survey import Survey
+    from alice_survey.app.api.track import Track, read_track
+    from alice_survey.core.config import SurveyConfig, load_config
+    from alice_survey.core.errors import AliceError
+    from alice_survey.core.frames import Datum
+    from alice_survey.core.seawater import n_water
     from camera_calib.camera import Camera
     from camera_calib.lenses.fisheye import FisheyeLens
     from camera_calib.lenses.opencv import OpenCVLens
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from reconstruct.views.model import SparseModel, View, read_model
 
 _HOMES = {
-    "alice_survey.api.figures": ("plot_dem", "plot_mosaic", "plot_plan", "plot_track"),
-    "alice_survey.api.rasters": ("Dem", "Mosaic", "read_dem", "read_mosaic"),
-    "alice_survey.api.survey": ("Survey",),
-    "alice_survey.api.track": ("Track", "read_track"),
-    "alice_survey.base.config": ("SurveyConfig", "load_config"),
-    "alice_survey.base.errors": ("AliceError",),
-    "alice_survey.base.frames": ("Datum",),
-    "alice_survey.base.seawater": ("n_water",),
+    "alice_survey.app.api.figures": ("plot_dem", "plot_mosaic", "plot_plan", "plot_track"),
+    "alice_survey.app.api.rasters": ("Dem", "Mosaic", "read_dem", "read_mosaic"),
+    "alice_survey.app.api.survey": ("Survey",),
+    "alice_survey.app.api.track": ("Track", "read_track"),
+    "alice_survey.core.config": ("SurveyConfig", "load_config"),
+    "alice_survey.core.errors": ("AliceError",),
+    "alice_survey.core.frames": ("Datum",),
+    "alice_survey.core.seawater": ("n_water",),
     "camera_calib.camera": ("Camera",),
     "camera_calib.lenses.fisheye": ("FisheyeLens",),
     "camera_calib.lenses.opencv": ("OpenCVLens",),

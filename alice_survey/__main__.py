@@ -1,5 +1,5 @@
 """`python -m alice_survey` is the command line."""
 
-from alice_survey.cli.main import main
+from alice_survey.app.cli.main import main
 
 main()

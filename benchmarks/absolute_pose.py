@@ -20,8 +20,8 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera, pose_jacobian
 
 LEAST_INLIERS = 6

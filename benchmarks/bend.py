@@ -26,7 +26,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import AliceError
+from alice_survey.core.errors import AliceError
 from benchmarks.bend_pipeline import Adjust, Adjusted, adjusted
 from benchmarks.bend_survey import (
     LOGS,

@@ -8,10 +8,10 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.records import RangeRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.records import RangeRecord
 from camera_calib.rig import Rig
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.mapping.database import Observations

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from alice_survey.kit.figure import figure_style, new_figure, save_figure
 from benchmarks.bend_survey import Fault, FlownTrack, fly, logged, records_of
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over

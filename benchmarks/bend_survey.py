@@ -17,19 +17,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 from scipy.stats.qmc import Halton
 
-from alice_survey.api.survey import Survey
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.executor import local_executor
-from alice_survey.base.frames import (
+from alice_survey.app.api.survey import Survey
+from alice_survey.app.pipeline import run
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.executor import local_executor
+from alice_survey.core.frames import (
     Array,
     Datum,
     attitude_from_rotation,
     interpolate_poses,
 )
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.trajectory import Trajectory, read_columns, read_track
-from alice_survey.seafloor.terrain import Terrain, survey_terrain
-from alice_survey.survey import run
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.trajectory import Trajectory, read_columns, read_track
+from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
 from camera_calib.freedom import moved
 from camera_calib.rig import Covariance, Rig, read_rig
 from missions.logs.navigation_csv import NavigationLog, read_navigation

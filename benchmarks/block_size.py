@@ -23,9 +23,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import minimise
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.block_solver import minimise
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.manifest import ImageRecord
 from benchmarks.bend_survey import NOISE_PX, calibrated_rig
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine

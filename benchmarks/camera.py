@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.executor import local_executor
+from alice_survey.core.executor import local_executor
 from benchmarks import camera_calibration, camera_pose, camera_speed, target_calibration
 from benchmarks.figures import Findings, add_options, hand_over
 from benchmarks.machine import heading, machine

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array
 from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import SERIAL, Executor
+from alice_survey.core.executor import SERIAL, Executor
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.figures import Figure, Goal
 from tests.cameras import flat_port_camera

@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 import pycolmap
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array
 from benchmarks.figures import Figure, Goal
 from camera_calib.camera import Camera
 from camera_calib.rig import design_rig

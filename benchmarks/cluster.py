@@ -23,9 +23,9 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.manifest import read_manifest
-from alice_survey.stages import names, spec
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.stages import names, spec
 from benchmarks.cluster_model import Network, RecordedStage, Recording, makespan, recorded
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
@@ -97,7 +97,7 @@ def measured_s(work: Path, survey: Path, workers: int) -> float:
 
 def task_cost_s(work: Path, tasks: int = 300) -> float:
     """What an empty task costs the command and the scheduler on this machine."""
-    from alice_survey.base.cluster.engine import cluster_executor
+    from alice_survey.core.cluster.engine import cluster_executor
 
     with workers_of(work, 1) as file, cluster_executor(work, None, file) as executor:
         list(executor.map(abs, range(20), label="first"))

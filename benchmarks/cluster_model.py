@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.cluster.engine import most_in_flight
-from alice_survey.base.frames import Array
+from alice_survey.core.cluster.engine import most_in_flight
+from alice_survey.core.frames import Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 _XYZ_FROM_RGB = np.array([
     [0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505],

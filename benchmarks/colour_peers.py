@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 _RANGES = 10
 """Clusters of range in which the darkest pixels are looked for."""

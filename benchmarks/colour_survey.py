@@ -16,22 +16,22 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.config import (
+from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.config import (
     CameraConfig,
     ImagingConfig,
     Jerlov,
     SeafloorConfig,
     WaterConfig,
 )
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.seafloor.as_built import true_rig
-from alice_survey.seafloor.light import CameraLight, camera_light
-from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
-from alice_survey.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
-from alice_survey.seafloor.terrain import Terrain, build_terrain
-from alice_survey.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.sim.seafloor.as_built import true_rig
+from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
+from alice_survey.sim.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
+from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
+from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import Rig
 from camera_calib.water import water_optics

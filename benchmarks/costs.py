@@ -31,13 +31,13 @@ from typing import Any
 import numpy as np
 from scipy.optimize import nnls
 
-from alice_survey import computing
-from alice_survey.base.artefacts import read_stage
-from alice_survey.base.executor import default_threads
-from alice_survey.base.run.resources import processor
-from alice_survey.computing import PREDICTED, SurveyCost, SurveySize, weighed, workspace_size
-from alice_survey.stages import is_imported, spec
-from alice_survey.survey import settings
+from alice_survey.app import computing
+from alice_survey.app.computing import PREDICTED, SurveyCost, SurveySize, weighed, workspace_size
+from alice_survey.app.pipeline import settings
+from alice_survey.core.artefacts import read_stage
+from alice_survey.core.executor import default_threads
+from alice_survey.core.run.resources import processor
+from alice_survey.core.stages import is_imported, spec
 from benchmarks.cluster_model import recorded
 
 DATA = Path(computing.__file__).with_suffix(".toml")

@@ -27,8 +27,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.frames import Array
 from benchmarks import facade_scene as scene
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over, plain
 from benchmarks.harbour_judge import face_points, spread

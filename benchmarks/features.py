@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.core.config import SurveyConfig
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 

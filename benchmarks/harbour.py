@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.executor import local_executor
+from alice_survey.core.executor import local_executor
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over, plain
 from benchmarks.harbour_judge import judge, true_harbour
 from benchmarks.harbour_survey import (

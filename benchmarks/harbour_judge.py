@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import local_executor
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.executor import local_executor
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import read_manifest
 from benchmarks.harbour_masks import score_masks
 from benchmarks.harbour_mosaic import score_plane
 from benchmarks.harbour_scene import PARTS

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
 from benchmarks.harbour_scene import FISH, WEEDS
 from benchmarks.harbour_sight import instants_that_see, trace
 from benchmarks.harbour_survey import STROBES, Station, body_poses, harbour_rig, time_of

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.seafloor.terrain import CERAMIC, DETRITUS, ROCK, SAND, Terrain, TerrainObject
+from alice_survey.core.frames import Array
+from alice_survey.sim.seafloor.terrain import CERAMIC, DETRITUS, ROCK, SAND, Terrain, TerrainObject
 from benchmarks.harbour_scene import (
     FISH,
     FLOOR_M,

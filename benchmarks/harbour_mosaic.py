@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.frames import Array
-from alice_survey.seafloor.terrain import CERAMIC, ROCK, SAND
-from alice_survey.seafloor.texture import survey_texture
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.frames import Array
+from alice_survey.sim.seafloor.terrain import CERAMIC, ROCK, SAND
+from alice_survey.sim.seafloor.texture import survey_texture
 from benchmarks.harbour_scene import PARTS
 from benchmarks.harbour_survey import SEED
 from benchmarks.harbour_truth import distances, normals

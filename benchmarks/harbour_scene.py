@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 FLOOR_M = 6.0
 WALL_EAST_M = (-3.2, 2.5)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from benchmarks.harbour_scene import FLOOR_M
 from benchmarks.harbour_truth import clearance, distances, normals
 from camera_calib.camera import Camera

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, ImagingConfig, WaterConfig
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum, rotation_from_attitude
-from alice_survey.seafloor.as_built import true_rig
-from alice_survey.seafloor.light import CameraLight, camera_light
-from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, render
-from alice_survey.seafloor.sensor import MIDDLE_GREY, Sensor, develop, expose
-from alice_survey.seafloor.texture import SAND_ALBEDO, survey_texture
+from alice_survey.core.config import CameraConfig, ImagingConfig, WaterConfig
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, Datum, rotation_from_attitude
+from alice_survey.sim.seafloor.as_built import true_rig
+from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, render
+from alice_survey.sim.seafloor.sensor import MIDDLE_GREY, Sensor, develop, expose
+from alice_survey.sim.seafloor.texture import SAND_ALBEDO, survey_texture
 from benchmarks.harbour_meshes import moving_at, still_harbour
 from benchmarks.harbour_scene import PILE
 from camera_calib.mount import mount_rotation

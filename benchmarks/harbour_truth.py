@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from benchmarks.harbour_scene import (
     FISH,
     FLOOR_M,

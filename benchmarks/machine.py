@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from alice_survey.base.run.resources import processor
+from alice_survey.core.run.resources import processor
 
 
 def machine(packages: Sequence[str]) -> dict[str, Any]:

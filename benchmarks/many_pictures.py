@@ -31,8 +31,8 @@ import rasterio
 from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.api.survey import Survey
-from alice_survey.base.artefacts import (
+from alice_survey.app.api.survey import Survey
+from alice_survey.core.artefacts import (
     Stage,
     read_csv,
     read_json,
@@ -41,9 +41,9 @@ from alice_survey.base.artefacts import (
     write_csv,
     write_json,
 )
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
-from alice_survey.stages import spec
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.core.stages import spec
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import python

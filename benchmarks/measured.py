@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 
-from alice_survey.base.run.resources import family, memory_mib
+from alice_survey.core.run.resources import family, memory_mib
 
 _EVERY_S, _SURELY_EVERY_S = 0.2, 2.0
 """Between looks at the memory of a command; it takes the kernel 6 ms a process to share it out, so

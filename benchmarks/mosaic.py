@@ -22,8 +22,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
@@ -43,9 +43,9 @@ _POINTS = 20
 """Of the sparse model, seen by each picture."""
 _MOST_MIB = 1536.0
 _RUN = (
-    "import sys; from pathlib import Path; from alice_survey.base.config import ReconstructConfig, "
-    "SurveyConfig; from alice_survey.stages import spec; "
-    "from alice_survey.base.executor import local_executor; "
+    "import sys; from pathlib import Path; from alice_survey.core.config import ReconstructConfig, "
+    "SurveyConfig; from alice_survey.core.stages import spec; "
+    "from alice_survey.core.executor import local_executor; "
     "spec('mosaic').make(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
     f"mosaic_pixel_m={PIXEL_M})), local_executor(int(sys.argv[2])))"
 )

@@ -11,7 +11,7 @@ import shapely.affinity
 from shapely.geometry import MultiPoint, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 from missions.values.area import Area, multipolygon
 
 _COAST_SEED = 5

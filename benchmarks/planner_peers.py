@@ -17,7 +17,7 @@ import opencoverage
 import shapely
 from shapely.geometry import LineString, Polygon
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.lines.lay import lay_lines
 from missions.route.turns import legs_through, line_table, route_of
 from missions.route.ways import Ways

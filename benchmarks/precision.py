@@ -23,9 +23,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.frames import Array
-from alice_survey.base.trajectory import Trajectory
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.frames import Array
+from alice_survey.core.trajectory import Trajectory
 from benchmarks import bend_survey
 from benchmarks.bend import score
 from benchmarks.bend_pipeline import adjusted

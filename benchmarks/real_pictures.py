@@ -20,7 +20,7 @@ import numpy as np
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from reconstruct.placing.alignment import align_similarity

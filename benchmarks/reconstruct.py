@@ -46,8 +46,8 @@ _STAGES = {"sparse": ("mapping", "placing"), "dense": ("dense",), "mosaic": ("mo
 _RUN = """
 import sys
 from pathlib import Path
-from alice_survey.cli.session import session
-from alice_survey.survey import run
+from alice_survey.app.cli.session import session
+from alice_survey.app.pipeline import run
 
 with session(sys.argv[1:], quiet=True, log_file=None, events=Path(sys.argv[2])):
     run(sys.argv[3:], Path(sys.argv[1]), None)

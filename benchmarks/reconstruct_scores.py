@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from alice_survey.base.frames import Array
-from alice_survey.seafloor.terrain import Terrain, read_terrain
+from alice_survey.core.frames import Array
+from alice_survey.sim.seafloor.terrain import Terrain, read_terrain
 from reconstruct.evaluate.figures import rms
 from reconstruct.evaluate.truth import read_true_poses, surface_distance
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity

@@ -8,7 +8,7 @@ import subprocess
 from importlib import resources
 from pathlib import Path
 
-from alice_survey.base.artefacts import read_stage, write_csv
+from alice_survey.core.artefacts import read_stage, write_csv
 from benchmarks.measured import python
 
 _SIMULATED = ("plan", "fly", "image", "calibrate")

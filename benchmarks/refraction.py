@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from reconstruct.mapping.bundle import all_pictures, held_options

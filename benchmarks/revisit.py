@@ -19,11 +19,11 @@ import numpy as np
 import shapely
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import local_executor
-from alice_survey.base.manifest import read_manifest, write_manifest
-from alice_survey.base.records import RegistrationRecord
-from alice_survey.seafloor.terrain import read_terrain
-from alice_survey.survey import run, settings
+from alice_survey.app.pipeline import run, settings
+from alice_survey.core.executor import local_executor
+from alice_survey.core.manifest import read_manifest, write_manifest
+from alice_survey.core.records import RegistrationRecord
+from alice_survey.sim.seafloor.terrain import read_terrain
 from missions.values.area import multipolygon
 from missions.values.plan_file import read_plan
 from reconstruct.evaluate.cameras import score_cameras

@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord, write_manifest
-from alice_survey.base.records import (
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord, write_manifest
+from alice_survey.core.records import (
     CamerasRecord,
     MappingRecord,
     PicturesRecord,

@@ -19,13 +19,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.block_solver import minimise
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.executor import Executor, local_executor
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import RegistrationRecord
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.block_solver import minimise
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import RegistrationRecord
 from benchmarks.bend_survey import NOISE_PX, calibrated_rig
 from benchmarks.block_size import ALTITUDE_M, DATUM, Block, block, near_start, records_of
 from benchmarks.scale_model import pinhole_warps, write_mapped

@@ -26,13 +26,13 @@ from rasterio.shutil import copy
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import collected_by
-from alice_survey.base.executor import SERIAL
-from alice_survey.report.colours import encoded
-from alice_survey.studio.layers import Layers
-from alice_survey.studio.paths import Workspace
-from alice_survey.survey import template_text
+from alice_survey.app.pipeline import template_text
+from alice_survey.app.report.colours import encoded
+from alice_survey.app.studio.layers import Layers
+from alice_survey.app.studio.paths import Workspace
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import collected_by
+from alice_survey.core.executor import SERIAL
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from missions.plan.draft import Draft, drafted

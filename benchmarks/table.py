@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import atomic_path, write_json
+from alice_survey.core.artefacts import atomic_path, write_json
 from benchmarks.runs import Run
 
 DONE, MISSED, FAILED, LEFT_OUT = "done", "goal missed", "failed", "left out"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import SERIAL, Executor
+from alice_survey.core.executor import SERIAL, Executor
 from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.solve import blank_camera, calibrate
 from camera_calib.calibration import Calibration, TargetView

@@ -18,17 +18,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.allocation import (
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.allocation import (
     AXIS_WEIGHTS,
     AllocationScratch,
     allocate_exact,
     allocate_rpi,
     allocation_scratch,
 )
-from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.propulsion import thrust_limits
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.propulsion import thrust_limits
 from benchmarks.figures import Figure, Goal
 from tests.oracles_propulsion import redistributed
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.vehicle import propulsion
-from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.dynamics import (
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import propulsion
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.dynamics import (
     STATE,
     Plant,
     Scratch,
@@ -27,15 +27,15 @@ from alice_survey.vehicle.dynamics import (
     rk4_step,
     scratch_for,
 )
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.sea import (
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.sea import (
     Current,
     constant_current,
     current_at,
     sheared_current,
     varying_current,
 )
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from benchmarks.figures import Figure, Goal
 from tests import oracles_dynamics as oracle
 from tests.oracles_propulsion import wrench

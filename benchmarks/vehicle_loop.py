@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.config import SurveyConfig, changed
-from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.pilot.memory import DONE, PHASE, REASON
-from alice_survey.vehicle.pilot.safety import NONE
-from alice_survey.vehicle.simulator import Setup, simulate
+from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.sim.vehicle.floor import FloorGrid, level_floor
+from alice_survey.sim.vehicle.pilot.memory import DONE, PHASE, REASON
+from alice_survey.sim.vehicle.pilot.safety import NONE
+from alice_survey.sim.vehicle.simulator import Setup, simulate
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, mission_setup

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import SurveyConfig, changed
-from alice_survey.base.errors import VehicleError, collected_by
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.floor import level_floor
+from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.errors import VehicleError, collected_by
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.floor import level_floor
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan

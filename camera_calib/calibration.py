@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.freedom import HELD, Freedom
 from camera_calib.rig import Covariance, Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import ConfigDict
 
-from alice_survey.base.artefacts import checked
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import checked
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib import optics
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import MOST_PX, LensValues

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Flags, Indices, inverse_of
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import Flags, Indices, inverse_of
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import pose_jacobian
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array, pose_from_json, pose_to_json
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array, pose_from_json, pose_to_json
 from camera_calib.rig import Rig, read_rig, write_rig
 
 _DOWN = np.array([0.0, 0.0, 1.0])

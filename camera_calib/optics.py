@@ -7,9 +7,9 @@ Rows without a solution are NaN.
 
 import numpy as np
 
-from alice_survey.base.compiled import BLOCK as _BLOCK
-from alice_survey.base.compiled import compiled, compiled_ieee
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import BLOCK as _BLOCK
+from alice_survey.core.compiled import compiled, compiled_ieee
+from alice_survey.core.frames import Array
 from camera_calib.lenses.fisheye import FisheyeLens, fisheye_pixels, fisheye_rays, fisheye_slopes
 from camera_calib.lenses.opencv import OpenCVLens, opencv_pixels, opencv_rays, opencv_slopes
 from camera_calib.lenses.values import LensValues

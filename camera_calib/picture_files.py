@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ImageError, memory_shortage
+from alice_survey.core.errors import ImageError, memory_shortage
 
 MOST_PIXELS = 104_000_000
 """Most pixels of a picture: 0.8 GB of 4 channels and 16 bits. A small file can state any size."""

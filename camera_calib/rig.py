@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import checked, read_json, write_json
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
+from alice_survey.core.artefacts import checked, read_json, write_json
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.camera import Camera, camera_from_json
 from camera_calib.optics import LENSES, PORTS
 

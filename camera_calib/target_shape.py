@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import legendre
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from alice_survey.kit.words import with_sigma
 from camera_calib.freedom import NO_PRIOR, Prior
 from camera_calib.targets.target import Target

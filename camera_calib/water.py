@@ -6,7 +6,7 @@ K_d mu_0 = sqrt(a^2 + 0.256 a b), with mu_0 = 0.9, and by an assumption for each
 of scattering at 550 nm, b / (a + b), rising from clear ocean to turbid coast as measurements of
 these types do; b falls as 1 / wavelength, as it does for particles.
 
-The index of refraction is that of `alice_survey.base.seawater` (Quan and Fry 1995).
+The index of refraction is that of `alice_survey.core.seawater` (Quan and Fry 1995).
 """
 
 import math
@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import Jerlov
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.frames import Array
-from alice_survey.base.seawater import n_water, pressure_dbar
-from alice_survey.base.text_table import text_table
+from alice_survey.core.config import Jerlov
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.frames import Array
+from alice_survey.core.seawater import n_water, pressure_dbar
+from alice_survey.core.text_table import text_table
 
 CHANNELS = ("red", "green", "blue")
 WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])

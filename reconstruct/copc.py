@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.executor import SERIAL, Executor
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.executor import SERIAL, Executor
 
 if TYPE_CHECKING:
     import laspy

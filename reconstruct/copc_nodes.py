@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ReconstructionError, WorkspaceError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Array
 
 if TYPE_CHECKING:
     import laspy

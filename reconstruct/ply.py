@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",

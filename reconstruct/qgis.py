@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import rasterio
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.core.artefacts import atomic_path
 from reconstruct.raster import opened_raster
 
 _RAMPS = {

@@ -25,11 +25,11 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.run import progress
 from reconstruct.views.model import WorldFrame
 
 BLOCK = 256

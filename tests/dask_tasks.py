@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from alice_survey.base.errors import AliceError, warn
+from alice_survey.core.errors import AliceError, warn
 
 
 def is_first(mark: Path) -> bool:

@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any, Self
 
-from alice_survey.base.executor import Executor
+from alice_survey.core.executor import Executor
 
 
 class PicklingThreads:

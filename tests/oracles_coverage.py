@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import Certificate
 from missions.coverage.stations import Stations

@@ -13,9 +13,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, best_warp
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens

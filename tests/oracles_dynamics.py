@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from alice_survey.vehicle.fins import Fin
-from alice_survey.vehicle.propulsion import Thruster
-from alice_survey.vehicle.sea import Current
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.fins import Fin
+from alice_survey.sim.vehicle.propulsion import Thruster
+from alice_survey.sim.vehicle.sea import Current
+from alice_survey.sim.vehicle.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 FORCES, MOTIONS = "XYZKMN", "uvwpqr"

@@ -6,7 +6,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 Cost = Callable[[int, int], tuple[float, float]]
 

@@ -6,15 +6,15 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.vehicle import estimate_vector as vector
-from alice_survey.vehicle.dynamics import coriolis_matrix
-from alice_survey.vehicle.pilot import gains as g
-from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.gains import Gains
-from alice_survey.vehicle.pilot.path import Path
-from alice_survey.vehicle.pilot.settings import Guidance
-from tests.alice_survey.vehicle.motions import damping_matrix
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.dynamics import coriolis_matrix
+from alice_survey.sim.vehicle.pilot import gains as g
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot.gains import Gains
+from alice_survey.sim.vehicle.pilot.path import Path
+from alice_survey.sim.vehicle.pilot.settings import Guidance
+from tests.alice_survey.sim.vehicle.motions import damping_matrix
 
 
 def walked(path: Path, leg: int, along_m: float, steps: int = 20000) -> tuple[Array, float]:

@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.dynamics import STATE, derivative, scratch_for
-from alice_survey.vehicle.sea import constant_current
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.dynamics import STATE, derivative, scratch_for
+from alice_survey.sim.vehicle.sea import constant_current
+from alice_survey.sim.vehicle.vehicle import Vehicle
 
 
 def integrated(vehicle: Vehicle, start: Array, rps: Array, at_s: Array, load: Array) -> Array:

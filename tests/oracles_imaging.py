@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import Polygon
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from tests.oracles_camera import project_by_bisection

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 from missions.lines.hops import comparable
 from missions.lines.lay import laid, lay_lines
 from missions.lines.rows import Site

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from tests.cameras import flat_port_camera

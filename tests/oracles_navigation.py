@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.vehicle.navigation.sensors import DVL, GPS, IMU, PRESSURE, USBL, Sensors
+from alice_survey.sim.vehicle.navigation.sensors import DVL, GPS, IMU, PRESSURE, USBL, Sensors
 
 Array = NDArray[np.float64]
 GRAVITY = np.array([0.0, 0.0, 9.80665])

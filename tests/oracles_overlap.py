@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array, rotation_from_attitude
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations

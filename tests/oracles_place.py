@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 
 def covariance_matrix(time: Array, sigma: Array, tau: float, white: float) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from alice_survey.vehicle.propulsion import Thruster
+from alice_survey.sim.vehicle.propulsion import Thruster
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import Equations
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import Equations
+from alice_survey.core.frames import Array
 from reconstruct.adjustment.normal_equations import LinearObservations
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.views.model_files import as_transform

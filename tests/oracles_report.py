@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, MultiPolygon
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.route.fence import point_inside
 from missions.route.ways import Ways
 from missions.values.costs import Costs, leg_costs, power_at

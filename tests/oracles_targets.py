@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from alice_survey.base.compiled import compiled_ieee
+from alice_survey.core.compiled import compiled_ieee
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target
 

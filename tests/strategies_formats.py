@@ -9,8 +9,8 @@ import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.optics import LENSES

@@ -122,12 +122,13 @@ def layers() -> list[list[str]]:
 
 
 def without_a_layer() -> list[str]:
-    """Modules that no layer names; the packages' own `__init__` hold nothing but a docstring."""
+    """Modules that no layer names; those that hold nothing but a docstring need none."""
     named = [name for row in layers() for name in row]
     return [
         name
-        for name in modules()
+        for name, module in modules().items()
         if name not in PACKAGES
+        and len(module.tree.body) > 1
         and not any(name == layer or name.startswith(f"{layer}.") for layer in named)
     ]
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.cluster.engine import most_in_flight
-from alice_survey.base.executor import SERIAL
-from alice_survey.base.run import progress
-from alice_survey.base.run.events import EventFile
+from alice_survey.core.cluster.engine import most_in_flight
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.run import progress
+from alice_survey.core.run.events import EventFile
 from benchmarks.cluster_model import (
     Network,
     RecordedStage,

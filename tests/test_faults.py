@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.survey import init_survey
+from alice_survey.app.pipeline import init_survey
 
 pytestmark = pytest.mark.slow
 
@@ -89,7 +89,8 @@ def test_a_workspace_that_cannot_be_written_is_named(disk: Path) -> None:
 def _holder(workspace: Path) -> subprocess.Popen[str]:
     """Another process that works in the workspace until it is killed."""
     code = (
-        "import sys, time; from pathlib import Path; from alice_survey.survey import only_one\n"
+        "import sys, time; from pathlib import Path\n"
+        "from alice_survey.app.pipeline import only_one\n"
         "with only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     process = subprocess.Popen(

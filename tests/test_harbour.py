@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.seafloor.renderer import Scene, range_map
-from alice_survey.seafloor.texture import Texture
+from alice_survey.core.frames import Array
+from alice_survey.sim.seafloor.renderer import Scene, range_map
+from alice_survey.sim.seafloor.texture import Texture
 from benchmarks.harbour import figures, table
 from benchmarks.harbour_judge import (
     Truth,

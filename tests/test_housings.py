@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from alice_survey.base.artefacts import read_json
+from alice_survey.core.artefacts import read_json
 from benchmarks.reconstruct_surveys import demo_like
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions

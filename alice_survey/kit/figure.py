@@ -41,9 +41,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import ConfigError, WorkspaceError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import ConfigError, WorkspaceError
+from alice_survey.core.frames import Array
 from alice_survey.kit.document import EAST_NORTH, Figure
 from alice_survey.kit.map import round_length
 

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
-from alice_survey.base.frames import Array
-from alice_survey.base.seawater import n_water
-from alice_survey.base.text_table import text_table
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.errors import CalibrationError, ConfigError, ImageError
+from alice_survey.core.frames import Array
+from alice_survey.core.seawater import n_water
+from alice_survey.core.text_table import text_table
 from camera_calib.camera import Camera
 from camera_calib.water import CHANNELS, WAVELENGTH_NM
 

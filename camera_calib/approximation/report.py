@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import SurveyConfig, load_config
-from alice_survey.base.errors import CalibrationError, ConfigError
-from alice_survey.base.text_table import text_table
+from alice_survey.core.config import SurveyConfig, load_config
+from alice_survey.core.errors import CalibrationError, ConfigError
+from alice_survey.core.text_table import text_table
 from alice_survey.kit.figure import (
     INKS,
     LogNorm,

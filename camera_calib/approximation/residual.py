@@ -13,8 +13,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import CalibrationError, ConfigError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError, ConfigError
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
 

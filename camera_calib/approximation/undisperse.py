@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from alice_survey.base.errors import CalibrationError, ImageError
-from alice_survey.base.executor import SERIAL, Executor
+from alice_survey.core.errors import CalibrationError, ImageError
+from alice_survey.core.executor import SERIAL, Executor
 from camera_calib.approximation.dispersion import (
     Maps,
     channel_cameras,

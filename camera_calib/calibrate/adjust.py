@@ -3,7 +3,7 @@
 Poses of the target are eliminated view by view, so that each step solves for the rig's parameters
 alone; slopes are analytic. The loss is Huber's on the length of a residual, its scale taken from
 the residuals' median: 99.8 % efficient for normal noise, and no outlier pulls more than a point at
-three sigmas (`alice_survey.base.block_solver` takes the steps).
+three sigmas (`alice_survey.core.block_solver` takes the steps).
 """
 
 import math
@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import BlockStep, Equations, Flags, Minimum, minimise
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import RAYLEIGH_MEDIAN
+from alice_survey.core.block_solver import BlockStep, Equations, Flags, Minimum, minimise
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import RAYLEIGH_MEDIAN
 from camera_calib.calibrate.normal_equations import CalibrationProblem, State
 from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom, at_bound

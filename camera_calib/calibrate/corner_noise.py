@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.spatial.distance import cdist
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.adjust import Adjustment
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibration import CornerNoise, ErrorBudget

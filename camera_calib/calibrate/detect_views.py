@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.executor import Executor
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibration import Rejection, TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.errors import warn
-from alice_survey.base.records import CalibrationRecord
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.errors import warn
+from alice_survey.core.records import CalibrationRecord
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibrate.start import locate

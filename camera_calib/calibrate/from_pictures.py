@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.errors import CalibrationError, WorkspaceError
-from alice_survey.base.executor import Executor, local_executor
-from alice_survey.base.records import CalibrationRecord
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.errors import CalibrationError, WorkspaceError
+from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.records import CalibrationRecord
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.by_options import (
     calibrated,

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from alice_survey.base.errors import AliceError, CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import AliceError, CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.solve import blank_camera, first_cameras
 from camera_calib.calibration import Calibration, HousingJudgement, HousingTrial, TargetView
 from camera_calib.freedom import LensNames, lens_of

@@ -16,8 +16,8 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.start import poses_alone, poses_apart
 from camera_calib.calibration import TargetView
 from camera_calib.camera import Camera

@@ -3,7 +3,7 @@
 The unknowns are a few parameters of the rig, those of the target's shape, and six of every view's
 target pose. A view's pose meets only its own pixels, so that the equations have a small dense part
 of rig and shape, a 6 x 6 block for every view, and what couples the two
-(`alice_survey.base.block_solver`).
+(`alice_survey.core.block_solver`).
 """
 
 from collections.abc import Iterator
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import BlockStep, Equations, Flags, Indices
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import pose_jacobian
 from camera_calib.freedom import POSE, Freedom, chosen_slopes, moved, wanted_slopes
 from camera_calib.rig import Covariance, Rig

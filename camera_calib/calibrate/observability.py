@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.block_solver import inverse_of
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import inverse_of
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibration import Calibration, stack_views
 from camera_calib.camera import Camera

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.solve import Intrinsics
 from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from datetime import UTC
 from pathlib import Path
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.picture_files import time_taken
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")

@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.executor import Executor
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import BoardRecord
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.executor import Executor
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import BoardRecord
 from camera_calib.calibrate.detect_views import Size, detect_views
 from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet

@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.block_solver import Flags
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.block_solver import Flags
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from camera_calib.calibrate.adjust import Adjustment, adjust
 from camera_calib.calibrate.corner_noise import spread_of
 from camera_calib.calibrate.normal_equations import CalibrationProblem

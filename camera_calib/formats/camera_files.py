@@ -17,9 +17,9 @@ from typing import Any
 
 import pycolmap
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_bytes, read_text
 from camera_calib.formats.opencv_model import behind_port, camera_in_air, distorts, is_fisheye

@@ -22,8 +22,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.formats.camera_files import (
     MODELS,
     CameraRecord,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import camera_name

@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 
 _LARGEST_BYTES = 1 << 20
 _LARGEST_SKIPPED_BYTES = 1 << 26

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.formats.fields import Fields, read_json_fields
 from camera_calib.formats.opencv_model import read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble

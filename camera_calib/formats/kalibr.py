@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml, write_yaml
 from camera_calib.formats.opencv_model import (

@@ -18,8 +18,8 @@ from xml.etree import ElementTree as ET
 
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_text
 from camera_calib.formats.opencv_model import camera_in_air, is_fisheye

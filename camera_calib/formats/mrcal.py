@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml
 from camera_calib.formats.opencv_model import camera_matrix, counted_from_centre, distortion

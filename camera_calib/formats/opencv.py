@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_storage
 from camera_calib.formats.opencv_model import (

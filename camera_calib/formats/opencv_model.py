@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields
 from camera_calib.lenses.fisheye import COEFFICIENTS as FISHEYE_COEFFICIENTS

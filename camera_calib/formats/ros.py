@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError, warn
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import Fields, read_yaml, write_yaml
 from camera_calib.formats.opencv_model import (

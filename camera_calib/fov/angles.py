@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.seawater import n_water as n_water_of_colour
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.seawater import n_water as n_water_of_colour
 from camera_calib.approximation.pinhole_warp import best_warp, residual_px
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m, axial_pixel_m

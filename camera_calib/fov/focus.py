@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 

@@ -10,8 +10,8 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import CameraConfig
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import CameraConfig
 from camera_calib.fov.angles import AngleRow, angle_table
 from camera_calib.fov.table import MATCH_SIGMA_PX, TRUSTED_FOV_DEG, FovChoices, FovRow, fov_table
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from shapely import Polygon
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import (
     FocusedLens,

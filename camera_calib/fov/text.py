@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.text_table import text_table
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.text_table import text_table
 from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, PaperValidation
 from camera_calib.fov.table import FISHEYE_FOV_DEG, TRUSTED_FOV_DEG, BlurRow, FovRow

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.calibration import Calibration, stack_views
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.calibration import Calibration, stack_views
 from camera_calib.judge.fit_quality import (

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from camera_calib.calibration import Calibration
 from camera_calib.freedom import POSE, value
 from camera_calib.judge.fit_quality import (

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from alice_survey.kit.figure import (
     INK,
     INKS,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from alice_survey.kit.figure import (
     BAND,
     INK,

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import atomic_path, json_values
-from alice_survey.base.records import CalibrationReportRecord
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import atomic_path, json_values
+from alice_survey.core.records import CalibrationReportRecord
+from alice_survey.core.run import progress
 from alice_survey.kit.document import Figure, Report, Section, Table, Verdict, worst_first
 from alice_survey.kit.page import render_html
 from alice_survey.kit.words import with_sigma

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.text_table import text_table
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.text_table import text_table
 from alice_survey.kit.words import with_sigma
 from camera_calib.judge.judgement import over_frame, rig_parameters
 from camera_calib.judge.uncertainty import (

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import norm
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.calibration import Calibration
 from camera_calib.target_shape import usual_shape
 

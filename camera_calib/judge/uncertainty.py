@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig

@@ -19,9 +19,9 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from alice_survey.base.errors import CalibrationError, warn
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.errors import CalibrationError, warn
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, value

@@ -14,8 +14,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.frames import Array
 from camera_calib.lenses.values import FOCAL_AND_CENTRE, LensValues
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4")

@@ -16,9 +16,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from alice_survey.base.compiled import BLOCK as _BLOCK
-from alice_survey.base.compiled import compiled, compiled_ieee
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import BLOCK as _BLOCK
+from alice_survey.core.compiled import compiled, compiled_ieee
+from alice_survey.core.frames import Array
 from camera_calib.lenses.values import FOCAL_AND_CENTRE, LensValues
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")

@@ -8,8 +8,8 @@ from typing import ClassVar, Self
 
 from pydantic import ConfigDict
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 
 FOCAL_AND_CENTRE = ("fx_px", "fy_px", "cx_px", "cy_px")
 MOST_PX = 1e7

@@ -13,11 +13,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from alice_survey.base.compiled import BLOCK as _BLOCK
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.config import CameraConfig
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import BLOCK as _BLOCK
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.config import CameraConfig
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.ports.values import GLASS_AND_WATER, N_WATER_SPREAD, PortValues, Vector
 
 _NEWTON_STEPS = 60

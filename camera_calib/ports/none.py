@@ -5,9 +5,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.config import CameraConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.config import CameraConfig
+from alice_survey.core.frames import Array
 from camera_calib.ports.values import PortValues, Vector
 
 

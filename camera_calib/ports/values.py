@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import ConfigDict
 
-from alice_survey.base.config import CameraConfig
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 
 Vector = tuple[float, float, float]
 GLASS_AND_WATER: Mapping[str, tuple[float, float]] = {

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from camera_calib.targets.pattern import CROSSING, Surroundings
 
 Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]

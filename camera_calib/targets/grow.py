@@ -16,7 +16,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.targets.corners import fit_corners
 
 Place = tuple[int, int]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.targets.target import (
     TAG_BORDER_BITS,
     TAG_FAMILY,

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from reportlab.lib.units import mm
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import AliceError, CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import AliceError, CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target, read_target, write_target
 

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from alice_survey.base.artefacts import checked, read_json, write_json
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import checked, read_json, write_json
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 
 Kind = Literal["chessboard", "charuco", "apriltag"]
 Indices = NDArray[np.intp]

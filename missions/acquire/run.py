@@ -16,21 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import atomic_path, write_csv, write_json
-from alice_survey.base.config import CameraConfig, ImagingConfig, SeafloorConfig, WaterConfig
-from alice_survey.base.errors import ImageError, NavigationError
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array, interpolate_poses, pose_to_json
-from alice_survey.base.manifest import ImageRecord, write_manifest
-from alice_survey.base.records import BoardRecord, PicturesRecord
-from alice_survey.base.trajectory import Trajectory, read_columns, read_track
-from alice_survey.seafloor.as_built import true_rig
-from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
-from alice_survey.seafloor.light import CameraLight, camera_light
-from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
-from alice_survey.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
-from alice_survey.seafloor.terrain import read_terrain, survey_terrain
-from alice_survey.seafloor.texture import SAND_ALBEDO, survey_texture
+from alice_survey.core.artefacts import atomic_path, write_csv, write_json
+from alice_survey.core.config import CameraConfig, ImagingConfig, SeafloorConfig, WaterConfig
+from alice_survey.core.errors import ImageError, NavigationError
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array, interpolate_poses, pose_to_json
+from alice_survey.core.manifest import ImageRecord, write_manifest
+from alice_survey.core.records import BoardRecord, PicturesRecord
+from alice_survey.core.trajectory import Trajectory, read_columns, read_track
+from alice_survey.sim.seafloor.as_built import true_rig
+from alice_survey.sim.seafloor.board import PoolBoard, board_records, pool_poses, render_board
+from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
+from alice_survey.sim.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
+from alice_survey.sim.seafloor.terrain import read_terrain, survey_terrain
+from alice_survey.sim.seafloor.texture import SAND_ALBEDO, survey_texture
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.water import water_optics

@@ -14,9 +14,9 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import PlanError, warn, why
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import PlanError, warn, why
+from alice_survey.core.frames import Array, Datum
 
 Sense = Literal["auto", "heights", "depths"]
 """What a raster's values are: heights positive up, or depths positive down."""

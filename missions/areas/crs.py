@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.frames import Array, Datum
 from missions.areas.raw import RawShapes
 
 LOCAL = "local"

@@ -14,9 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from alice_survey.base.config import AreaConfig, Config
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.config import AreaConfig, Config
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array, Datum
 from missions.areas.crs import FARTHEST_M, LocalFrame, middle
 from missions.areas.files import Role, read_area_file
 from missions.areas.raw import RawShapes

@@ -15,9 +15,9 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import sides_of
-from alice_survey.base.contents import one_line, shown
-from alice_survey.base.errors import PlanError, warn
+from alice_survey.core.config import sides_of
+from alice_survey.core.contents import one_line, shown
+from alice_survey.core.errors import PlanError, warn
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.qgc_plan import read_qgc_plan
 from missions.areas.raw import RawShapes, from_geometries

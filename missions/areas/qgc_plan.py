@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from missions.areas.crs import check_finite, check_latitudes
 from missions.areas.raw import RawLine, RawShapes, no_points
 from missions.areas.safe import read_json

@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 
 _CLOSED = 0.02
 """Gap of a closed line, over its length: drawn by hand, ends seldom meet."""

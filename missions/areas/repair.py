@@ -7,8 +7,8 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.frames import Array
 from missions.areas.crs import LocalFrame
 from missions.areas.raw import RawShapes
 from missions.values.area import multipolygon

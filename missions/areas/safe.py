@@ -12,8 +12,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from xml.parsers import expat
 
-from alice_survey.base.config import SHAPEFILE_SIDES
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import SHAPEFILE_SIDES
+from alice_survey.core.errors import PlanError
 
 LARGEST_BYTES = 100_000_000
 """Size limit of a file, and of all that is unpacked from an archive."""

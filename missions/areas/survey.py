@@ -9,9 +9,9 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Point
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.files import read_area_file, read_wkt
 from missions.areas.raw import RawLine, RawShapes, from_rings, no_points

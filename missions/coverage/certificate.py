@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.coverage.raster import (
     Grid,

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import NavigationError, warn
-from alice_survey.base.frames import Array, rotation_from_attitude
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.trajectory import read_track
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import NavigationError, warn
+from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.stations import MOST_ALTITUDES, Stations
 from missions.logs.navigation_csv import (

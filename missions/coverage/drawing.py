@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.run import progress
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.run import progress
 from alice_survey.kit.figure import (
     Axes,
     BoundaryNorm,

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.frames import Array, Datum
 from missions.coverage.certificate import Certificate
 
 NO_DATA = 65535

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.coverage.certificate import (
     Certificate,

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, mapping
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 from missions.coverage.certificate import Certificate
 from missions.values.area import multipolygon
 

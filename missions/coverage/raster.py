@@ -14,8 +14,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.values.area import Area
 

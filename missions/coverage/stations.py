@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array, attitude_from_rotation, interpolate_poses
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array, attitude_from_rotation, interpolate_poses
 from camera_calib.rig import Rig
 from missions.values.footprint import common_swath
 from missions.values.line import Line

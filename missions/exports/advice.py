@@ -3,10 +3,10 @@
 import math
 from dataclasses import dataclass
 
-from alice_survey.base.errors import warn
+from alice_survey.core.errors import warn
 from alice_survey.kit.words import share
-from alice_survey.vehicle.pilot.ardusub import LEAST_RADIUS_M, LEAST_SPEED_MPS
-from alice_survey.vehicle.pilot.cola2 import Cola2Settings
+from alice_survey.sim.vehicle.pilot.ardusub import LEAST_RADIUS_M, LEAST_SPEED_MPS
+from alice_survey.sim.vehicle.pilot.cola2 import Cola2Settings
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern

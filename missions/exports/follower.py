@@ -1,6 +1,6 @@
 """How an autopilot will follow a plan: its parameters, its tolerances, and how far it will be off.
 
-COLA2 steers by line of sight without an integral and without sway (alice_survey.vehicle.pilot.
+COLA2 steers by line of sight without an integral and without sway (alice_survey.sim.vehicle.pilot.
 cola2): a current across a section holds it off by `delta` times the sine of the drift angle, in
 closed form, and the shortest `delta` is bounded by how quickly the vehicle turns. ArduSub holds on
 to its track by sway with an integral: no steady current holds it off that the vehicle can stem.
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alice_survey.base.config import SeaConfig, VehicleConfig
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.pilot.cola2 import circling_m, steady_drift, turn_in_m, yaw_rad_s
-from alice_survey.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
-from alice_survey.vehicle.pilot.settings import los_loop, shortest_look_ahead_m
+from alice_survey.core.config import SeaConfig, VehicleConfig
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.pilot.cola2 import circling_m, steady_drift, turn_in_m, yaw_rad_s
+from alice_survey.sim.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
+from alice_survey.sim.vehicle.pilot.settings import los_loop, shortest_look_ahead_m
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.route.energy import craft_of
 from missions.values.line import Line

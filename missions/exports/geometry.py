@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_ne, level_pose
 from missions.values.legs import Leg, Route, places_on

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 
 

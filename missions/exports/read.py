@@ -3,8 +3,8 @@
 import math
 from pathlib import Path
 
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import PlanError, why
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import PlanError, why
 from missions.exports.registry import format_named, format_names
 from missions.values.mission import Mission, MissionStep
 

@@ -4,7 +4,7 @@ import pkgutil
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exports import formats
 
 if TYPE_CHECKING:

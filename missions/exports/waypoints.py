@@ -9,8 +9,8 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, Point
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from missions.exports.geometry import chords
 from missions.exports.mount import CameraMount
 from missions.values.costs import SETTLE_S

@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import atomic_path, read_stage
-from alice_survey.base.config import SurveyConfig, parse_config
-from alice_survey.base.errors import PlanError
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import atomic_path, read_stage
+from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.errors import PlanError
+from alice_survey.core.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.exports.advice import advice
 from missions.exports.format import Export

@@ -11,8 +11,8 @@ from functools import partial
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, PlanConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import CameraConfig, PlanConfig
+from alice_survey.core.errors import PlanError
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import (
     FocusedLens,

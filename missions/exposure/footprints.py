@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from shapely.affinity import translate
 
-from alice_survey.base.config import PlanConfig
+from alice_survey.core.config import PlanConfig
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import axial_pixel_m
 from camera_calib.rig import Rig

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 Spectrum = Literal["led", "even"]
 

@@ -12,8 +12,8 @@ cos^4`.
 
 Assumed: no daylight; each channel takes 100 nm of the LEDs' spectrum (`missions.exposure.lamp`),
 with the water of its middle, and has the whole quantum efficiency; sand as in the simulator. The
-simulator (`alice_survey.seafloor`) computes by ray, with a soft edge of the cone, an even spectrum
-and all scattered light lost but for the veil: its pictures have the light of `c` both ways, and
+simulator (`alice_survey.sim.seafloor`) computes by ray, with a soft edge of the cone, an even
+spectrum and all scattered light lost but for the veil: its pictures have the light of `c` both ways, and
 lack the blur of what is scattered on the way from the floor. Tests compare the two on these terms.
 """
 
@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, ImagingConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig, ImagingConfig
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from camera_calib.water import WAVELENGTH_NM, WaterOptics, phase_per_sr
 from missions.exposure.forward_light import LIT_SHARE, SEEN_SHARE, share_within
@@ -31,7 +31,7 @@ from missions.exposure.lamp import LAMP, Spectrum, watts_per_lumen
 from missions.exposure.settings_table import Setting, settings_of
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
-"""Red, green and blue of bare sand, as `alice_survey.seafloor.texture.SAND_ALBEDO`."""
+"""Red, green and blue of bare sand, as `alice_survey.sim.seafloor.texture.SAND_ALBEDO`."""
 PORT_TRANSMITTANCE = 0.955
 """Fresnel at square incidence: 0.4 % from water to glass, 4.3 % from glass to air."""
 LENS_TRANSMITTANCE = 0.9

@@ -6,15 +6,15 @@ Every number stands as a row (`Setting`) with its equation, its source and the l
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import (
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import (
     CameraConfig,
     ImagingConfig,
     PlanConfig,
     SurveyConfig,
     WaterConfig,
 )
-from alice_survey.base.errors import PlanError, warn
+from alice_survey.core.errors import PlanError, warn
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from missions.exposure.focus import Focus, focus_rows, plan_focus, too_open

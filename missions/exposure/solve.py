@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from alice_survey.base.config import PlanConfig
-from alice_survey.base.errors import AliceError, PlanError
-from alice_survey.base.text_table import text_table
+from alice_survey.core.config import PlanConfig
+from alice_survey.core.errors import AliceError, PlanError
+from alice_survey.core.text_table import text_table
 from missions.exposure.focus import largest_f_number, needed_f_number
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import too_dark

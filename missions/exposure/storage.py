@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from alice_survey.base.config import CameraConfig
+from alice_survey.core.config import CameraConfig
 from camera_calib.camera import Camera
 from missions.exposure.settings_table import Setting, settings_of
 

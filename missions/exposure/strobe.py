@@ -10,8 +10,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from alice_survey.base.config import ImagingConfig, PlanConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import ImagingConfig, PlanConfig
+from alice_survey.core.errors import PlanError
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import Way, conflict, less_overlap
 

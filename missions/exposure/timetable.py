@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.errors import PlanError
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.errors import PlanError
 
 _US = 1_000_000
 HEADER = (

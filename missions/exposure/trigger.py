@@ -16,9 +16,9 @@ from itertools import product
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, PlanConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig, PlanConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.exposure.settings_table import Setting, settings_of

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from alice_survey.base.config import PlanConfig
-from alice_survey.base.errors import AliceError, PlanError
+from alice_survey.core.config import PlanConfig
+from alice_survey.core.errors import AliceError, PlanError
 
 LEAST_ALTITUDE_M, HIGHEST_ALTITUDE_M = 0.3, 10.0
 """Altitudes of the glass over any ground that `plan.altitude_m` allows."""

@@ -8,12 +8,12 @@ from typing import Any
 
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import need_stage, write_json
-from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.executor import SERIAL, Executor, local_executor
+from alice_survey.core.artefacts import need_stage, write_json
+from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.kit.words import share
-from alice_survey.seafloor.terrain import survey_terrain
+from alice_survey.sim.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, mounted, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record

@@ -17,18 +17,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import VehicleError
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.dynamics import STATE
-from alice_survey.vehicle.files import vehicle_to_fly
-from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.pilot.gains import gains_for
-from alice_survey.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
-from alice_survey.vehicle.pilot.settings import pilot_guidance
-from alice_survey.vehicle.propulsion import add_thrust
-from alice_survey.vehicle.simulator import Flown, Setup, simulate
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.dynamics import STATE
+from alice_survey.sim.vehicle.files import vehicle_to_fly
+from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
+from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
+from alice_survey.sim.vehicle.propulsion import add_thrust
+from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_records import true_velocity
 from missions.fly.simulation import (
     FlightSettings,

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.config import SeaConfig, SurveyConfig, changed, parse_current
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.executor import Executor, local_executor
-from alice_survey.base.frames import Array
-from alice_survey.base.text_table import text_table
+from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.config import SeaConfig, SurveyConfig, changed, parse_current
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.frames import Array
+from alice_survey.core.text_table import text_table
 from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
 from camera_calib.rig import design_rig
 from missions.fly.compare import (

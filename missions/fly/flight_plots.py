@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from alice_survey.kit.figure import (
     Axes,
     LineCollection,
@@ -18,8 +18,8 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from alice_survey.vehicle.navigation import tick as navigation
-from alice_survey.vehicle.pilot.memory import (
+from alice_survey.sim.vehicle.navigation import tick as navigation
+from alice_survey.sim.vehicle.pilot.memory import (
     ABORT,
     APPROACH,
     ASCEND,
@@ -28,7 +28,7 @@ from alice_survey.vehicle.pilot.memory import (
     PHASE,
     WANTED_SURGE,
 )
-from alice_survey.vehicle.simulator import Flown
+from alice_survey.sim.vehicle.simulator import Flown
 from missions.coverage.drawing import draw_polygons
 from missions.fly.flight_records import rpm_of, true_velocity
 from missions.fly.flight_route import whole_route

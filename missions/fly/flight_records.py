@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import VehicleConfig
-from alice_survey.base.frames import Array, rotation_from_attitude
-from alice_survey.vehicle import estimate_vector as vector
-from alice_survey.vehicle.log import VehicleLog, vehicle_log
-from alice_survey.vehicle.navigation import tick as navigation
-from alice_survey.vehicle.pilot.memory import FOLLOW, PHASE
-from alice_survey.vehicle.simulator import Flown
+from alice_survey.core.config import VehicleConfig
+from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.log import VehicleLog, vehicle_log
+from alice_survey.sim.vehicle.navigation import tick as navigation
+from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
+from alice_survey.sim.vehicle.simulator import Flown
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight

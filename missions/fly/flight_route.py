@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, Point
 
-from alice_survey.base.errors import PlanError
-from alice_survey.vehicle.pilot.path import Path, path_from_legs
+from alice_survey.core.errors import PlanError
+from alice_survey.sim.vehicle.pilot.path import Path, path_from_legs
 from missions.values.legs import Leg, Route
 from missions.values.plan_file import Plan
 

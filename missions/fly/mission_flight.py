@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, VehicleConfig
-from alice_survey.base.errors import PlanError, VehicleError
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.pilot import mission as pilot
-from alice_survey.vehicle.pilot import steps as column
-from alice_survey.vehicle.pilot.ardusub import LEAST_SPEED_MPS, ArduSubSettings
-from alice_survey.vehicle.pilot.gains import gains_for
-from alice_survey.vehicle.pilot.memory import ALONG, LEG
-from alice_survey.vehicle.simulator import simulate
+from alice_survey.core.config import CameraConfig, VehicleConfig
+from alice_survey.core.errors import PlanError, VehicleError
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.floor import FloorGrid
+from alice_survey.sim.vehicle.pilot import mission as pilot
+from alice_survey.sim.vehicle.pilot import steps as column
+from alice_survey.sim.vehicle.pilot.ardusub import LEAST_SPEED_MPS, ArduSubSettings
+from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.pilot.memory import ALONG, LEG
+from alice_survey.sim.vehicle.simulator import simulate
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_lines

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.core.errors import PlanError
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.floor import FloorGrid
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight, stations_of_plan

@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.artefacts import Stage, run_stage, write_json
-from alice_survey.base.config import CameraConfig, PlanConfig, WaterConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.artefacts import Stage, run_stage, write_json
+from alice_survey.core.config import CameraConfig, PlanConfig, WaterConfig
+from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import VehicleError, warn
-from alice_survey.base.executor import Executor, progress
-from alice_survey.base.records import FlightRecord
-from alice_survey.base.trajectory import write_track
-from alice_survey.seafloor.terrain import survey_terrain
-from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.log import write_vehicle_log
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import VehicleError, warn
+from alice_survey.core.executor import Executor, progress
+from alice_survey.core.records import FlightRecord
+from alice_survey.core.trajectory import write_track
+from alice_survey.sim.seafloor.terrain import survey_terrain
+from alice_survey.sim.vehicle.floor import FloorGrid
+from alice_survey.sim.vehicle.log import write_vehicle_log
 from camera_calib.rig import design_rig
 from missions.fly.flight_plots import draw_flight, draw_vehicle
 from missions.fly.flight_records import bag_record, believed_log, flight_summary, true_log

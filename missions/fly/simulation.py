@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import (
+from alice_survey.core.config import (
     CameraConfig,
     Config,
     NavigationConfig,
@@ -16,37 +16,37 @@ from alice_survey.base.config import (
     SurveyConfig,
     VehicleConfig,
 )
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array, rotation_from_attitude
-from alice_survey.base.trajectory import Trajectory
-from alice_survey.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.vehicle.limits import spot_rate_rad_s
-from alice_survey.vehicle.navigation.sensors import (
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.core.trajectory import Trajectory
+from alice_survey.sim.vehicle.floor import FloorGrid, floor_depth
+from alice_survey.sim.vehicle.limits import spot_rate_rad_s
+from alice_survey.sim.vehicle.navigation.sensors import (
     CompassSpec,
     DvlSpec,
     GpsSpec,
     SensorSuite,
     UsblSpec,
 )
-from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
-from alice_survey.vehicle.pilot.command import Without
-from alice_survey.vehicle.pilot.gains import Gains, gains_for
-from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
-from alice_survey.vehicle.pilot.mission import NO_LAW, NO_MISSION, PilotMission
-from alice_survey.vehicle.pilot.path import Path
-from alice_survey.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
-from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
-from alice_survey.vehicle.sea import (
+from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
+from alice_survey.sim.vehicle.pilot.command import Without
+from alice_survey.sim.vehicle.pilot.gains import Gains, gains_for
+from alice_survey.sim.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
+from alice_survey.sim.vehicle.pilot.mission import NO_LAW, NO_MISSION, PilotMission
+from alice_survey.sim.vehicle.pilot.path import Path
+from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
+from alice_survey.sim.vehicle.pilot.settings import Guidance, pilot_guidance
+from alice_survey.sim.vehicle.sea import (
     Current,
     Disturbance,
     read_current,
     sheared_current,
     varying_current,
 )
-from alice_survey.vehicle.simulator import Failure, Flown, Setup, simulate
-from alice_survey.vehicle.stability import pitch_divergence_speed_mps
-from alice_survey.vehicle.swell import with_swell
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.simulator import Failure, Flown, Setup, simulate
+from alice_survey.sim.vehicle.stability import pitch_divergence_speed_mps
+from alice_survey.sim.vehicle.swell import with_swell
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import path_of, room_behind_m, roomier_side, turns_on_the_spot
 from missions.route.energy import sound_craft_of
 from missions.values.flight import Flight, trigger_times

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.config import PlanConfig, SurveyConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.config import PlanConfig, SurveyConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import glass_places, planned_lines

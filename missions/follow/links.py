@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError, VehicleError
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
+from alice_survey.core.errors import NavigationError, VehicleError
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from camera_calib.rig import Rig
 from missions.follow.rows import Piece, Reordered, row_of_text
 from missions.live.loop import Odometry

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.coverage.dive_record import (
     ALIKE_RAD,

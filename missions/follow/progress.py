@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.coverage.dive_record import ALIKE_RAD
 from missions.coverage.stations import Stations, stations_of_lines
 from missions.values.costs import Costs, leg_costs

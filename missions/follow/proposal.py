@@ -17,8 +17,8 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.config import PlanConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import PlanConfig
+from alice_survey.core.errors import PlanError
 from missions.coverage.certificate import Certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import Stations, stations_of_lines

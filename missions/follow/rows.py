@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import finite_number
 from missions.logs.navigation_csv import READINGS, RowParser, find_zone
 

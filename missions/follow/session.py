@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import NavigationError, PlanError
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import NavigationError, PlanError
 from alice_survey.kit.words import share
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError
+from alice_survey.core.errors import NavigationError
 from missions.follow.rows import ROW, TIME, Piece
 from missions.logs.navigation_csv import READINGS, RowParser, find_zone
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from missions.lines.rows import Site, rooms, stretches, to_uv, united
 from missions.route.fence import edges_of
 from missions.values.area import Area

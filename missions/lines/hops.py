@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from missions.route.joins import LONGEST_SWAY_M
 from missions.values.costs import Costs, power_at
 

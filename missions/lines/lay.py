@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import note_compiling
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.compiled import note_compiling
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from missions.lines import cells, cross, hops, rows, tour
 from missions.lines.fill import fill_table
 from missions.lines.rows import Site

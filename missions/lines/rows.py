@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from missions.route.fence import edges_of
 from missions.values.area import Area
 

@@ -22,11 +22,11 @@ from itertools import islice
 import numpy as np
 import shapely
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.errors import PlanError
-from alice_survey.base.executor import progress
-from alice_survey.base.frames import Array
-from alice_survey.base.run.progress import step
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import PlanError
+from alice_survey.core.executor import progress
+from alice_survey.core.frames import Array
+from alice_survey.core.run.progress import step
 from missions.lines import cells, hops, rows
 from missions.lines.lay import check_size, laid, note_planner, survey_pieces
 from missions.lines.rows import Site

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from missions.lines.cells import CORNERS
 
 EXACT = 8

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from alice_survey.base.errors import VehicleError
+from alice_survey.core.errors import VehicleError
 
 
 def mavlink_to(address: str, **settings: int) -> Any:

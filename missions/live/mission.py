@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.errors import VehicleError
-from alice_survey.base.frames import rotation_from_attitude
-from alice_survey.vehicle import estimate_vector as vector
-from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.command import Pilot
-from alice_survey.vehicle.pilot.memory import FOLLOW
-from alice_survey.vehicle.simulated_vehicle import TICK_S
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import rotation_from_attitude
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot.command import Pilot
+from alice_survey.sim.vehicle.pilot.memory import FOLLOW
+from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import one_dive
 from missions.fly.simulation import FlightSettings, longest_mission_s, piloting_of
 from missions.live.loop import Command, LinkLimits, LinkState, PilotLoop

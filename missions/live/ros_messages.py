@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import VehicleError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import Array
 from missions.live.loop import Odometry
 from missions.logs.ros_builder import NS_PER_S, MessageBuilder
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world

@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle.simulated_vehicle import TICK_S
+from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
 from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState
 from missions.live.mission import LiveMission
 from missions.live.ros_messages import (

@@ -6,10 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import note
-from alice_survey.base.trajectory import write_track
-from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import note
+from alice_survey.core.trajectory import write_track
+from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
 from missions.fly.run import flight_noise, true_floor
 from missions.fly.simulation import flight_settings, longest_mission_s, mission_setup
 from missions.live.loop import LinkLimits

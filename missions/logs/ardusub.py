@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError, warn
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import NavigationError, warn
+from alice_survey.core.frames import Array, Datum
 from missions.logs.dataflash import LogTable, Mask, read_dataflash
 from missions.logs.dive import DATED_AFTER_S, LoggedDive
 from missions.logs.message_sources import Keep, Source, Tables, dive_from, take, with_time

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.executor import progress
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.executor import progress
+from alice_survey.core.frames import Array, Datum
 from missions.logs.ros_builder import (
     FIX,
     JOINTS,

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import NavigationError
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import NavigationError
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

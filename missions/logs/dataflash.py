@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array
 
 Mask = NDArray[np.bool_]
 

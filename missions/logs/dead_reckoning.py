@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dive import LoggedDive, Signal
 from missions.logs.navigation_csv import longest_gap_s
 

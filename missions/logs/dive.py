@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.logs.navigation_csv import interpolated
 
 ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError, warn
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.errors import NavigationError, warn
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
 from missions.logs.dive import ROLES, LoggedDive, Signal
 from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
@@ -394,7 +394,7 @@ def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: Impor
     """The vehicle log (docs/vehicle-logs.md) at the rows' times, (N,) as logged, from the first."""
     from scipy.spatial.transform import Rotation
 
-    from alice_survey.vehicle.log import vehicle_log, write_vehicle_log
+    from alice_survey.sim.vehicle.log import vehicle_log, write_vehicle_log
 
     # Depths of the log, not of the chart: a vehicle's log knows of no tide.
     time_s, columns = navigation_table(dive, at_s, options, 0.0)

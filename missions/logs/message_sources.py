@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array
 from missions.logs.dataflash import LogTable, Mask
 from missions.logs.dive import ROLES, LoggedDive, Signal, cleaned, usable_positions
 

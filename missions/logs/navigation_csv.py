@@ -9,10 +9,10 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import NavigationError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import NavigationError, warn
+from alice_survey.core.frames import Array
 from missions.values.navigation import COLUMNS
 
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, rotation_from_attitude
 from missions.logs.dive import LoggedDive, Signal, cleaned
 from missions.logs.ros_bag import DENSITY_KG_M3, GRAVITY_MPS2
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from missions.logs.dataflash import LogTable, Mask
 from missions.logs.dive import LoggedDive, Signal, cleaned
 from missions.logs.message_sources import Keep, Source, Tables, dive_from, take, with_time

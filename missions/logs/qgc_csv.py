@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import NavigationError
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import NavigationError
 from missions.logs.dive import LoggedDive, cleaned, usable_positions
 from missions.logs.navigation_csv import READINGS, find_zone, utc_date
 

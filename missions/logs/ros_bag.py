@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.executor import progress
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.executor import progress
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from missions.logs.bag_reader import opened_bag
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world

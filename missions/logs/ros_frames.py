@@ -7,7 +7,7 @@ Both changes of axes are exact in floating point: they swap and negate component
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 _HALF_ROOT = float(np.sqrt(0.5))
 

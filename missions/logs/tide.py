@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array
 from missions.logs.dive import DATED_AFTER_S, Signal
 from missions.logs.navigation_csv import utc_date
 

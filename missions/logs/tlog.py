@@ -20,7 +20,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError
+from alice_survey.core.errors import NavigationError
 from missions.logs.dataflash import LogTable
 
 RECORDED = "recorded_s"

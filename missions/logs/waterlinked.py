@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import NavigationError
+from alice_survey.core.errors import NavigationError
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, cleaned, finite_number
 
 VELOCITY, ATTITUDE = "velocity", "position_local"

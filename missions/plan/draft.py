@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.config import (
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.config import (
     AreaConfig,
     Config,
     SurveyConfig,
@@ -17,9 +17,9 @@ from alice_survey.base.config import (
     settings_files,
     settings_in,
 )
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.frames import Datum
-from alice_survey.base.settings_text import Values, with_settings_changed, with_values
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.frames import Datum
+from alice_survey.core.settings_text import Values, with_settings_changed, with_values
 from missions.areas.drawn import DrawnShapes, area_settings
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import SeaConfig, SurveyConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.config import SeaConfig, SurveyConfig
+from alice_survey.core.frames import Array
 from alice_survey.kit.figure import (
     INK,
     Axes,

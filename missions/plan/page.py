@@ -6,9 +6,9 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.config import SeaConfig
-from alice_survey.base.frames import Datum
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.config import SeaConfig
+from alice_survey.core.frames import Datum
 from alice_survey.kit.document import (
     Link,
     MapScript,

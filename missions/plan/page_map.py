@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon
 
-from alice_survey.base.config import SeaConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.config import SeaConfig
+from alice_survey.core.frames import Array
 from alice_survey.kit.document import PictureLayer, Scale, ShapeLayer, SurveyMap
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry

@@ -14,8 +14,8 @@ import shapely
 import shapely.ops
 from shapely.geometry import MultiPolygon, Point
 
-from alice_survey.base.config import PlanConfig
-from alice_survey.base.errors import PlanError, warn
+from alice_survey.core.config import PlanConfig
+from alice_survey.core.errors import PlanError, warn
 from missions.lines.lay import check_size, lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.route.dives import split_dives

@@ -15,10 +15,10 @@ import numpy as np
 import shapely.ops
 from shapely.geometry import Point
 
-from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
-from alice_survey.base.errors import PlanError, heard, warn
-from alice_survey.vehicle.hull import POINT, Hull
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
+from alice_survey.core.errors import PlanError, heard, warn
+from alice_survey.sim.vehicle.hull import POINT, Hull
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry

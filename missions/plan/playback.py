@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.areas.bathymetry import Bathymetry
 from missions.plan.run import station_times_s
 from missions.values.costs import Costs, leg_costs

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import AliceError, collected_by
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import AliceError, collected_by
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig, design_rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate

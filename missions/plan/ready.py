@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from alice_survey.base.config import PlanConfig, SurveyConfig, with_settings
-from alice_survey.base.errors import PlanError, collected_by, warn
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.config import PlanConfig, SurveyConfig, with_settings
+from alice_survey.core.errors import PlanError, collected_by, warn
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig, design_rig
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.ways_out import (

@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from alice_survey.base.config import VehicleConfig
-from alice_survey.base.text_table import text_table
+from alice_survey.core.config import VehicleConfig
+from alice_survey.core.text_table import text_table
 from alice_survey.kit.words import share
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate

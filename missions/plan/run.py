@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.config import SeaConfig, SurveyConfig
-from alice_survey.base.executor import Executor
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.config import SeaConfig, SurveyConfig
+from alice_survey.core.executor import Executor
+from alice_survey.core.run import progress
 from alice_survey.kit.document import Link, PictureLayer
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.steady import drag_power
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.steady import drag_power
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import ConflictError
 from missions.plan.ready import with_tried_ways

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from missions.route.turns import Turns, legs_alone, legs_through, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.costs import Costs, leg_row_costs

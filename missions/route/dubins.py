@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.frames import Array
 from missions.route.fence import Fence, arc_inside
 
 _SAME_M = 1e-6

@@ -3,8 +3,8 @@
 Along lines a vehicle that can sway holds its heading and meets the current's part across by sway;
 one that cannot turns into the current until nothing pushes it sideways (it crabs), as all do on the
 way between lines. The thrusts that balance drag, body lift, buoyancy and jets, and the electrical
-power that they take, are those of `alice_survey.vehicle.steady`; to them come the hotel load and,
-on lines, the lights.
+power that they take, are those of `alice_survey.sim.vehicle.steady`; to them come the hotel load
+and, on lines, the lights.
 
 Where the numbers of `[vehicle]` come from:
 
@@ -30,15 +30,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.config import SeaConfig, SurveyConfig, VehicleConfig
-from alice_survey.base.errors import PlanError, VehicleError
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.files import coefficients_from_file, vehicle_to_fly
-from alice_survey.vehicle.limits import STEP_MPS, spot_rate_rad_s
-from alice_survey.vehicle.pilot.diving import MOST_PITCH_RAD
-from alice_survey.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.vehicle.steady import steady_flight
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.config import SeaConfig, SurveyConfig, VehicleConfig
+from alice_survey.core.errors import PlanError, VehicleError
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_to_fly
+from alice_survey.sim.vehicle.limits import STEP_MPS, spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.diving import MOST_PITCH_RAD
+from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
+from alice_survey.sim.vehicle.steady import steady_flight
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.values.costs import SETTLE_S, Costs
 
 Manner = Literal["held", "crab"]
@@ -290,7 +290,7 @@ def expected_current(sea: SeaConfig, depth_m: float) -> Array:
     if sea.current_file is None:
         towards = math.radians(sea.current_towards_deg)
         return sea.current_mps * np.array([math.cos(towards), math.sin(towards)])
-    from alice_survey.vehicle.sea import read_current
+    from alice_survey.sim.vehicle.sea import read_current
 
     current = read_current(sea.current_file)
     means = [

@@ -14,8 +14,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.frames import Array
 
 TOUCH_M = 1e-6
 """What is outside by less counts as inside: far below what any vehicle holds, far above rounding

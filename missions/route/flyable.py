@@ -2,11 +2,11 @@
 
 import math
 
-from alice_survey.base.config import PlanConfig, SurveyConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.vehicle.under_way import held, least_radius_m
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.config import PlanConfig, SurveyConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
+from alice_survey.sim.vehicle.under_way import held, least_radius_m
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.route.energy import craft_of
 
 _ROOM = 1.25

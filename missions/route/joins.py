@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.frames import Array
 from missions.route.dubins import moved, shortest_turn
 from missions.route.fence import Fence, straight_inside
 from missions.values.costs import Costs, power_at

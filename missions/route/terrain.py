@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.hull import Hull
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.hull import Hull
 from missions.areas.bathymetry import Bathymetry
 from missions.values.line import Line
 

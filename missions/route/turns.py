@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.frames import Array
 from missions.route import joins
 from missions.route.fence import OPEN_WATER, TOUCH_M, Fence, straight_inside
 from missions.route.ways import Ways

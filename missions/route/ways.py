@@ -18,9 +18,9 @@ from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.polygon import orient
 
-from alice_survey.base.compiled import compiled_ieee
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled_ieee
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from missions.route.fence import TOUCH_M, Fence, fence_of, point_inside, straight_inside
 from missions.values.area import multipolygon
 

@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, mapping, shape
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array, Datum
 
 
 @dataclass(frozen=True, kw_only=True)

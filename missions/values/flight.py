@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from alice_survey.base.frames import Array, attitude_from_rotation
-from alice_survey.base.trajectory import Trajectory
-from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING
-from alice_survey.vehicle.pilot.standing import STOP_M
-from alice_survey.vehicle.simulator import Flown
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.core.frames import Array, attitude_from_rotation
+from alice_survey.core.trajectory import Trajectory
+from alice_survey.sim.vehicle.pilot.memory import CROSS, PATH_HEADING
+from alice_survey.sim.vehicle.pilot.standing import STOP_M
+from alice_survey.sim.vehicle.simulator import Flown
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
 

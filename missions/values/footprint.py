@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import Polygon
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
 from camera_calib.camera import Camera
 from camera_calib.fov.table import sides_of, sure_size_m
 from camera_calib.rig import Rig

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 LineKind = Literal["survey", "cross", "closing", "fill", "tie"]
 """survey: of the pattern. cross: across it. closing: back over the start, so that the block's end

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 
 Autopilot = Literal["cola2", "ardusub"]
 """Software of vehicles that follows missions."""

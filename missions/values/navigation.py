@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.frames import Array, Datum
 
 COLUMNS = (
     "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",

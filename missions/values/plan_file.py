@@ -11,10 +11,10 @@ from typing import Any
 from pydantic import TypeAdapter
 from shapely.errors import ShapelyError
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.contents import one_line, shown
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Datum
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.contents import one_line, shown
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Datum
 from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line

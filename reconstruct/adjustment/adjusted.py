@@ -8,12 +8,12 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import RangeRecord
-from alice_survey.base.run import progress
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import RangeRecord
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig

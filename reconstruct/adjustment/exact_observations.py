@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import KDTree
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from camera_calib.freedom import chosen_slopes, wanted_slopes
 from camera_calib.rig import Rig
 from reconstruct.adjustment.normal_equations import LinearObservations

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 
 BIAS_PX = 0.01

@@ -5,7 +5,7 @@ all share. With R, c the pose `world_from_rig` and X the point, the pixel depend
 R^T (X - c) only, so that with P its slopes by X those by a small rotation about the axes of the
 world (R' = exp(turn) R) and by a motion of c are P [X - c]x and -P. Points are eliminated one by
 one, which leaves a block-sparse system of the stations with a border of what is shared
-(`alice_survey.base.block_solver`).
+(`alice_survey.core.block_solver`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,9 +16,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from scipy.sparse import csr_matrix, identity
 
-from alice_survey.base.block_solver import BlockStep, Equations, Flags, Indices, product_of
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import BlockStep, Equations, Flags, Indices, product_of
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.mapping.arrays import first_of
 
 Result = TypeVar("Result")

@@ -14,8 +14,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array
 from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 _MEASURED = 0.05
 """Share of the prior variance that pictures take away, from which a direction is measured."""

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.adjustment.normal_equations import POSE, Gauge, PointEquations
 from reconstruct.mapping.arrays import Indices
 

@@ -16,11 +16,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import BlockStep, Flags, inverse_of, minimise
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.block_solver import BlockStep, Flags, inverse_of, minimise
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, at_bound, moved, pose_names, value

@@ -27,11 +27,11 @@ from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.block_solver import product_of
-from alice_survey.base.contents import read_arrays, taken_from
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.block_solver import product_of
+from alice_survey.core.contents import read_arrays, taken_from
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig

@@ -10,10 +10,10 @@ import rasterio
 import shapely
 from PIL import Image
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import CamerasRecord
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import CamerasRecord
 from reconstruct.annotations.values import Affine, Annotation, DrawnShape
 from reconstruct.raster import opened_raster
 

@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, OnPlane, Projector
 from reconstruct.annotations.values import Annotation, DrawnShape
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.annotations.values import DrawnShape, Kind, Place
 from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.measure.errors import shared_errors

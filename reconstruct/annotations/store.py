@@ -9,12 +9,12 @@ import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import Field, ValidationError
 
-from alice_survey.base.artefacts import JsonRecord, json_values
-from alice_survey.base.contents import first_fault
-from alice_survey.base.edited_files import check_token, content_of, content_token
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.records import PlaceRecord
+from alice_survey.core.artefacts import JsonRecord, json_values
+from alice_survey.core.contents import first_fault
+from alice_survey.core.edited_files import check_token, content_of, content_token
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.records import PlaceRecord
 from reconstruct.annotations.values import Annotation, AnnotationSet, Label
 from reconstruct.views.model import WorldFrame, datum_of
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.annotations.marks import MeasuredMark, own_covariance
 from reconstruct.measure.areas import SurfaceAreas, figures_of_all, surface_within
 from reconstruct.measure.surface import MeasuredSurface

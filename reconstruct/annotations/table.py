@@ -15,9 +15,9 @@ from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.errors import ConfigError, WorkspaceError
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.errors import ConfigError, WorkspaceError
+from alice_survey.core.run import progress
 from reconstruct.annotations.marks import MarkMeasures, MeasuredMark
 from reconstruct.annotations.projection import PIXEL_SIGMA_PX, Projector
 from reconstruct.annotations.store import read_annotations

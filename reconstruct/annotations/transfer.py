@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import AliceError, WorkspaceError, why
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import AliceError, WorkspaceError, why
 from reconstruct.annotations.backdrops import Backdrops, backdrops_of
 from reconstruct.annotations.formats.common import ToolFiles
 from reconstruct.annotations.formats.registry import format_named

@@ -17,8 +17,8 @@ from pydantic import (
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import Config
-from alice_survey.base.frames import Array
+from alice_survey.core.config import Config
+from alice_survey.core.frames import Array
 
 Kind = Literal["point", "polyline", "polygon", "rectangle", "circle"]
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]

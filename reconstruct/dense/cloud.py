@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.records import CloudRecord
+from alice_survey.core.executor import Executor
+from alice_survey.core.records import CloudRecord
 from reconstruct.copc import PointSpool, SpooledPart, write_copc
 from reconstruct.dense.surface_tiles import SurfaceTile
 from reconstruct.dense.view_store import ViewStore

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.dense.points import EDGE_ON
 from reconstruct.dense.surfaces import sorted_ranks
 from reconstruct.raster import DemGrid

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
 from reconstruct.dense.view_store import StoredDepth
 from reconstruct.views.model import View

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import Executor
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.executor import Executor
 from reconstruct.dense.cloud import write_clouds
 from reconstruct.dense.dem import (
     FILL_CELLS,

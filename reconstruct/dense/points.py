@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.pictures.undistorted import WHOLE, Part
 from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, slopes_of

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.views.model import SparseModel
 
 _COMPANY = 16

@@ -18,8 +18,8 @@ from numba import cuda
 from numba.cuda.cudadrv.driver import CudaAPIError
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import warn
-from alice_survey.base.run.resources import user_lock
+from alice_survey.core.errors import warn
+from alice_survey.core.run.resources import user_lock
 from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, Share, refine
 
 _BLOCK = (32, 8)

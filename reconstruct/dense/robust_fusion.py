@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.compiled import compiled
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.dense.surfaces import sorted_ranks
 
 Float32 = NDArray[np.float32]

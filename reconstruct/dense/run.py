@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.executor import Executor
-from alice_survey.base.plane_settings import parse_planes
-from alice_survey.base.records import SurfaceRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.executor import Executor
+from alice_survey.core.plane_settings import parse_planes
+from alice_survey.core.records import SurfaceRecord
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import (
     Scales,

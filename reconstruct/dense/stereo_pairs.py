@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.views.model import SparseModel, View, points_of_views
 
 LEAST_POINTS = 8

@@ -19,8 +19,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.dense.points import Points
 from reconstruct.dense.robust_fusion import robust_height
 from reconstruct.dense.surfaces import surfaces_of

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.dense.free_space import look_at_points
 from reconstruct.dense.points import EDGE_ON, Points, joined, part_in_box, points_in_box
 from reconstruct.dense.pose_part import ErrorsOfPoses

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
+from alice_survey.core.compiled import compiled
 
 Float32 = NDArray[np.float32]
 

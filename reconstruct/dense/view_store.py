@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.core.artefacts import atomic_path
 from reconstruct.pictures.undistorted import WHOLE, Part
 
 _DEPTH_STEP = 2e-5

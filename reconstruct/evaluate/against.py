@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
-from alice_survey.base.records import ChangeRecord
-from alice_survey.base.run import progress
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
+from alice_survey.core.records import ChangeRecord
+from alice_survey.core.run import progress
 from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
 from reconstruct.evaluate.height_registration import HeightFit, refine_heights, register_heights

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.evaluate.figures import rms
 from reconstruct.placing.alignment import align_rigid, align_similarity
 

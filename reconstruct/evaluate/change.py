@@ -15,8 +15,8 @@ from rasterio.features import shapes
 from rasterio.transform import Affine
 from scipy.ndimage import find_objects
 
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import rms, rounded
 from reconstruct.evaluate.height_registration import HeightFit

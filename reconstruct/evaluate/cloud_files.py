@@ -11,11 +11,11 @@ from typing import BinaryIO
 
 import numpy as np
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import ReconstructionError, WorkspaceError, why
-from alice_survey.base.executor import run_apart
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, why
+from alice_survey.core.executor import run_apart
+from alice_survey.core.frames import Array, Datum
 from reconstruct.ply import read_ply_points
 
 _MOST_POINTS = 2_000_000

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import ReconstructionError, WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.errors import ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.figures import rms, rounded, tukey_weights
 from reconstruct.placing.alignment import Similarity
 

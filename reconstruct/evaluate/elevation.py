@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array, Datum
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.planes import read_plane
 from reconstruct.raster import DemGrid, grid_of, read_cells

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import mean_grid, tukey_weights
 

@@ -8,11 +8,11 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import MeshRecord
-from alice_survey.base.run import progress
-from alice_survey.seafloor.terrain import Terrain
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import MeshRecord
+from alice_survey.core.run import progress
+from alice_survey.sim.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import shares_within, spread
 from reconstruct.evaluate.truth import surface_depth, surface_distance
 

@@ -12,10 +12,10 @@ from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
-from alice_survey.seafloor.terrain import Terrain
-from alice_survey.seafloor.texture import Texture
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
+from alice_survey.sim.seafloor.terrain import Terrain
+from alice_survey.sim.seafloor.texture import Texture
 from reconstruct.evaluate.truth import surface_depth, surface_material
 from reconstruct.raster import opened_raster
 

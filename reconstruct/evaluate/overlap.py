@@ -11,8 +11,8 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.trajectory import read_columns
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.trajectory import read_columns
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_polygon
 from missions.values.plan_file import Plan

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from alice_survey.kit.figure import (
     Axes,
     colour_bar,

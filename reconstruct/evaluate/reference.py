@@ -7,11 +7,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import ReferenceRecord, RegistrationRecord
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import ReferenceRecord, RegistrationRecord
+from alice_survey.core.run import progress
 from reconstruct.evaluate.cloud_files import read_own_cloud, read_reference
 from reconstruct.evaluate.cloud_registration import (
     CloudDistances,

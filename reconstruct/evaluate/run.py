@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey.base.artefacts import read_stage, write_csv
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import RegistrationRecord, ScoreRecord
-from alice_survey.seafloor.terrain import read_terrain
-from alice_survey.seafloor.texture import survey_texture
+from alice_survey.core.artefacts import read_stage, write_csv
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import RegistrationRecord, ScoreRecord
+from alice_survey.sim.seafloor.terrain import read_terrain
+from alice_survey.sim.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
 from missions.values.plan_file import read_plan
 from reconstruct.evaluate.cameras import CameraScore, score_cameras

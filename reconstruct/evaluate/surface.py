@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
-from alice_survey.base.run import progress
-from alice_survey.seafloor.terrain import Terrain
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
+from alice_survey.core.run import progress
+from alice_survey.sim.seafloor.terrain import Terrain
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import (
     compare_volumes,

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.contents import taken_from
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
-from alice_survey.base.trajectory import read_columns
-from alice_survey.seafloor.terrain import Floats, Terrain
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import taken_from
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
+from alice_survey.core.trajectory import read_columns
+from alice_survey.sim.seafloor.terrain import Floats, Terrain
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.frames import Array
 from reconstruct.ply import write_ply
 from reconstruct.views.model import SparseModel, View
 

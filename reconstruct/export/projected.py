@@ -20,12 +20,12 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
 
-from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_csv, write_json
-from alice_survey.base.errors import ConfigError, ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import MeshRecord, SurfaceRecord
-from alice_survey.base.run import progress
-from alice_survey.stages import need
+from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_csv, write_json
+from alice_survey.core.errors import ConfigError, ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import MeshRecord, SurfaceRecord
+from alice_survey.core.run import progress
+from alice_survey.core.stages import need
 from reconstruct.copc import PointSpool, write_copc
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.views.model import WorldFrame, read_frame

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_json
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.stages import need
+from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.stages import need
 from reconstruct.evaluate.mesh import read_mesh
 from reconstruct.export.nerfstudio import write_nerfstudio
 from reconstruct.pictures.undistorted import Pictures

@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array
 
 Item = TypeVar("Item")
 Loaded = TypeVar("Loaded")

@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from alice_survey.base.artefacts import read_json, write_json
-from alice_survey.base.compiled import compiled
-from alice_survey.base.contents import taken_from
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import read_json, write_json
+from alice_survey.core.compiled import compiled
+from alice_survey.core.contents import taken_from
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.light.parts import Histogram, Parts, percentiles, values_in
 
 GRID = (9, 11)

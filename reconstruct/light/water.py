@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.light.solve import (
     FALL_OFF_SIGMA,
     GRID,

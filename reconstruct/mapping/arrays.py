@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.views.model_files import stored_of
 
 Indices = NDArray[np.int64]

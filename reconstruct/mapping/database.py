@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.run import progress
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.matching.matches import PairMatches, as_seen
 from reconstruct.views.model_files import rigid3d

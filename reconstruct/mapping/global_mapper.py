@@ -23,9 +23,9 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.mapping.bundle import all_pictures, direct_solver
 from reconstruct.mapping.database import Observations, station_frames
 from reconstruct.mapping.spread_points import move_points, spread_part, take_poses

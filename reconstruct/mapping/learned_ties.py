@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features, save_features
 from reconstruct.matching.learned import RATIO, find_learned, match_learned

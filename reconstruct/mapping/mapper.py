@@ -17,11 +17,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.run import progress
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, new_folder, station_frames, write_database

@@ -16,9 +16,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observed
 from reconstruct.mapping.bundle import FULLY, ROUGHLY, all_pictures, held_options
 from reconstruct.mapping.database import Observations, new_folder, write_database

@@ -10,8 +10,8 @@ costs almost nothing where errors are normal.
 import numpy as np
 import pycolmap
 
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import CAUCHY_TUNING, RAYLEIGH_MEDIAN
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import CAUCHY_TUNING, RAYLEIGH_MEDIAN
 from reconstruct.mapping.arrays import Indices, observed
 
 _LEAST_SIGMA_PX = 1e-3

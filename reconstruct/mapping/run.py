@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ImageError, WorkspaceError, warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Datum
-from alice_survey.base.manifest import ImageRecord, read_manifest
-from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesRecord
-from alice_survey.stages import rig_file
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import ImageError, WorkspaceError, warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Datum
+from alice_survey.core.manifest import ImageRecord, read_manifest
+from alice_survey.core.records import CamerasRecord, MappingRecord, PicturesRecord
+from alice_survey.core.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, mounted, read_rig
 from reconstruct.mapping.database import Observations, VerifiedPair

@@ -15,9 +15,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import warn
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.run import progress
+from alice_survey.core.errors import warn
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.formats.camera_files import CameraRecord, camera_of
 from reconstruct.mapping.bundle import all_pictures, direct_solver

@@ -8,9 +8,9 @@ other points follow, one by one, with poses held.
 import numpy as np
 import pycolmap
 
-from alice_survey.base.block_solver import Flags
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import Flags
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.mapping.arrays import Indices, Observed, observed
 
 _CELLS = 8

@@ -21,9 +21,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import CAUCHY_TUNING
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import CAUCHY_TUNING
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.working_range import ray_passes

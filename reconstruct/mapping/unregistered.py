@@ -7,8 +7,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.mapping.database import VerifiedPair
 
 UNREGISTERED = "unregistered.csv"

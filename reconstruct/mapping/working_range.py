@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import WarpRecord
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import WarpRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig

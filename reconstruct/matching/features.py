@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.frames import Array
 
 _CONTRAST = 0.01
 """SIFT's contrast threshold: a quarter of the usual, since sediment has little."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 

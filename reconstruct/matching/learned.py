@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.matching.features import Features, spread
 from reconstruct.matching.matches import (
     PairMatches,

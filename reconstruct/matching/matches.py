@@ -14,8 +14,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.matching.features import Features, load_features
 

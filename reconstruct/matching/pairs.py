@@ -19,9 +19,9 @@ from scipy.spatial.transform import RigidTransform
 from shapely import STRtree
 from shapely.geometry import Polygon
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
 from reconstruct.matching.frusta import (

@@ -21,9 +21,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
 from reconstruct.matching.matches import Matches
 from reconstruct.views.interpolation import cubic_level, is_inside
 from reconstruct.views.range_shift import FAST

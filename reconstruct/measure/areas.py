@@ -9,8 +9,8 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.measure.cells import known_squares, own_variance, plan_slopes, surface_area
 from reconstruct.measure.errors import REACH_CELLS, FigureSlopes, PackedSlopes, summed
 from reconstruct.measure.figures import Measured, figure

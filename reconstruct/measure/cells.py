@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, uniform_filter
 from scipy.special import ndtr
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.measure.errors import REACH_CELLS, own_correlation
 
 _CORNERS = ((np.s_[:-1, :-1], -1, 1), (np.s_[:-1, 1:], 1, 1), (np.s_[1:, :-1], -1, -1),

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from alice_survey.base.frames import Array
-from alice_survey.base.records import RegistrationRecord, SurfaceRecord
+from alice_survey.core.frames import Array
+from alice_survey.core.records import RegistrationRecord, SurfaceRecord
 from reconstruct.adjustment.uncertainty import SharedMotions, read_uncertainty
 from reconstruct.planes import Plane
 from reconstruct.views.model import WorldFrame

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum
 
 _HEADER = ("name", "kind", "figure", "value", "sigma", "unit", "sigma_own", "sigma_shared",
            "notes", "places")  # fmt: skip

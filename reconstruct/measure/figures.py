@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.measure.errors import FigureSlopes, PackedSlopes
 from reconstruct.measure.surface import MeasuredSurface, Samples
 

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import shapely
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.measure.areas import NOTHING_KNOWN, AreaSums, GridPart, PolygonOnGrid
 from reconstruct.measure.cells import (
     lifted,

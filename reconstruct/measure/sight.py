@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from rasterio.windows import Window
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.contents import taken_from
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import taken_from
+from alice_survey.core.frames import Array
 from reconstruct.planes import Plane
 from reconstruct.raster import opened_raster, small_cache
 

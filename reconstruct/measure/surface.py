@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 from scipy.spatial import KDTree
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from alice_survey.kit.document import OWN_AXES
 from reconstruct.measure.errors import REACH_CELLS, SharedErrors, own_correlation, shared_errors
 from reconstruct.measure.sight import sight_lines

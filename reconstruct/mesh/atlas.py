@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.topology import Triangles, component_areas, edges_of, split_fans
 from reconstruct.mesh.visibility import ray_scene

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.mesh.texture import Textured, remapped
 from reconstruct.mesh.topology import face_normals, vertex_normals
 from reconstruct.mesh.visibility import ray_scene

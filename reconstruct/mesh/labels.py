@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.mesh.topology import Triangles, edges_of, face_normals, twin_sides
 from reconstruct.mesh.visibility import Candidates
 

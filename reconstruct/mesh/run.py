@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.records import CloudRecord, MeshRecord
-from alice_survey.base.run import progress
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.records import CloudRecord, MeshRecord
+from alice_survey.core.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts

@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
 from reconstruct.mesh.cells import (
     GROWTH,
     Cell,

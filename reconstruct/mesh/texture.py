@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.errors import warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_pages, make_wedges
 from reconstruct.mesh.labels import Charts

@@ -28,9 +28,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Wedges, make_pages, make_wedges
 from reconstruct.mesh.cells import Cell, CellLevel, CellMesh, Key, join

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 Triangles = NDArray[np.int32]
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
 from reconstruct.mesh.topology import Triangles, face_areas, face_normals
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View

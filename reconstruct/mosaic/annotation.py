@@ -17,10 +17,10 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.artefacts import atomic_path, need_stage, write_csv
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.executor import progress
-from alice_survey.base.records import MosaicRecord
+from alice_survey.core.artefacts import atomic_path, need_stage, write_csv
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.executor import progress
+from alice_survey.core.records import MosaicRecord
 
 LARGEST_SIDE_PX = 32_767
 _STRIP = 512

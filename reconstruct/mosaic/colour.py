@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import json_values
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.light.solve import (
     BRIGHT_PERCENT,
     GRID,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
+from alice_survey.core.compiled import compiled
 from reconstruct.light.water import LEAST_LEFT
 from reconstruct.mosaic.picture_measures import encoded
 

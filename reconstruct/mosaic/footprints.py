@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.warp import transform as to_crs
 
-from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from reconstruct.raster import DemGrid, crs_of
 from reconstruct.views.model import View, WorldFrame
 

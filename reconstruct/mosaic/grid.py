@@ -9,8 +9,8 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.raster import DemGrid, tiles_of
 from reconstruct.views.model import SparseModel, View, enu_from_cam, points_of_views
 

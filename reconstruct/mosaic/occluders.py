@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.records import CloudRecord
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.compiled import compiled
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.records import CloudRecord
 from reconstruct.mosaic.grid import Float32
 from reconstruct.planes import Plane
 from reconstruct.ply import read_header

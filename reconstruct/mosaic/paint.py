@@ -11,8 +11,8 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.run.resources import release_memory
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.blend import Blend, ViewPart
 from reconstruct.mosaic.colour import ColourModel

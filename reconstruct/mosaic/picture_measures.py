@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from reconstruct.light.solve import GRID, at_places
 from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints

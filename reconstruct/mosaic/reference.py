@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.stages import COLOUR_FILE
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.stages import COLOUR_FILE
 from reconstruct.mosaic.picture_measures import BRIGHTEST, DARKEST, linear_table
 from reconstruct.pictures.undistorted import Pictures
 

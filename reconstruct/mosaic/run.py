@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from rasterio.windows import Window
 
-from alice_survey.base.config import ReconstructConfig, WaterConfig
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.records import MosaicRecord, PicturesRecord
+from alice_survey.core.config import ReconstructConfig, WaterConfig
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour

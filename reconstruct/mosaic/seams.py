@@ -11,7 +11,7 @@ views in the same sweep and for two views comes close to the minimal cut.
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
+from alice_survey.core.compiled import compiled
 
 Float32 = NDArray[np.float32]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.core.artefacts import atomic_path
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.water import CHANNELS

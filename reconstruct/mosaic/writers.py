@@ -14,7 +14,7 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.run import progress
+from alice_survey.core.run import progress
 from reconstruct.mosaic.grid import CELL_PX, coarse
 from reconstruct.mosaic.paint import Labels, Painted
 from reconstruct.raster import (

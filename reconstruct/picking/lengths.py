@@ -20,11 +20,11 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.contents import read_arrays
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRecord
-from alice_survey.stages import SCALE_FILE
+from alice_survey.core.contents import read_arrays
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.core.stages import SCALE_FILE
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
     Pixels,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.picking.surface import SurfacePlace
 from reconstruct.placing.picked_points import RegisteredPicture
 

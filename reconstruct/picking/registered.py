@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.contents import taken_from
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import CamerasRecord
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.contents import taken_from
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import CamerasRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import Indices
 from reconstruct.placing.picked_points import RegisteredPicture

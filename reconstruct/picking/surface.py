@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from alice_survey.base.artefacts import read_stage
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import read_stage
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.evaluate.elevation import LEVEL, Elevation, StoredElevation
 from reconstruct.placing.picked_points import RegisteredPicture
 from reconstruct.planes import read_plane

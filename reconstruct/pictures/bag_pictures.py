@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import ImageError, warn
-from alice_survey.base.executor import progress
-from alice_survey.base.frames import Array
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import ImageError, warn
+from alice_survey.core.executor import progress
+from alice_survey.core.frames import Array
 from missions.logs.bag_reader import opened_bag
 from reconstruct.pictures.files import safe_name
 from reconstruct.pictures.moments import moments_of

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.contents import one_line, shown
-from alice_survey.base.errors import ImageError
+from alice_survey.core.contents import one_line, shown
+from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import (
     PILLOW_FAULTS,
     exif_time,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.pictures.quality import sharpness
 
 Grey = NDArray[np.uint8]

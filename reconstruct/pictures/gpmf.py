@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.pictures.mp4 import TelemetryTrack, payloads
 
 _LEAST_FIX = 3

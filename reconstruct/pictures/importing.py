@@ -9,15 +9,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from alice_survey.base.artefacts import Stage, run_stage
-from alice_survey.base.errors import (
+from alice_survey.core.artefacts import Stage, run_stage
+from alice_survey.core.errors import (
     ImageError,
     WorkspaceError,
     warn,
 )
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.manifest import read_manifest, write_manifest
-from alice_survey.base.records import PicturesRecord
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.manifest import read_manifest, write_manifest
+from alice_survey.core.records import PicturesRecord
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import read_rig, write_rig
 from missions.logs.navigation_csv import find_zone, read_navigation

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alice_survey.base.errors import ImageError, warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.errors import ImageError, warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from missions.logs.dive import DATED_AFTER_S
 from reconstruct.pictures.files import (

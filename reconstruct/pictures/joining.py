@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import Stage, need_stage, read_stage, run_stage, write_json
-from alice_survey.base.errors import CalibrationError, ImageError, PlanError, WorkspaceError
-from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
-from alice_survey.base.records import PicturesRecord
-from alice_survey.stages import rig_file
+from alice_survey.core.artefacts import Stage, need_stage, read_stage, run_stage, write_json
+from alice_survey.core.errors import CalibrationError, ImageError, PlanError, WorkspaceError
+from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.core.records import PicturesRecord
+from alice_survey.core.stages import rig_file
 from camera_calib.rig import read_rig, write_rig
 from missions.values.legs import Route
 from missions.values.plan_file import Plan, read_plan

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from alice_survey.base.errors import ImageError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ImageError, warn
+from alice_survey.core.frames import Array
 
 _WITHIN_SHARE = 0.25
 """Pictures this share of the shortest usual interval apart are of one moment: a dropped picture

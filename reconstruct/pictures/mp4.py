@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ImageError
+from alice_survey.core.errors import ImageError
 
 _EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
 _YEARS = range(2000, 2200)

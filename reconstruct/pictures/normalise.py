@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ImageError
+from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import read_pixels
 
 Grey = NDArray[np.uint8]

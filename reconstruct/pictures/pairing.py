@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import CalibrationError, ImageError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import CalibrationError, ImageError, warn
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.picture_files import time_taken
 from missions.logs.dive import finite_number

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.errors import ImageError, heard
+from alice_survey.core.errors import ImageError, heard
 from camera_calib.rig import Rig, read_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
 from reconstruct.pictures.files import (

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ImageError, why
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.errors import ImageError, why
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask

@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.base.artefacts import read_stage, write_csv
-from alice_survey.base.errors import ImageError
-from alice_survey.base.executor import Executor
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.artefacts import read_stage, write_csv
+from alice_survey.core.errors import ImageError
+from alice_survey.core.executor import Executor
+from alice_survey.core.manifest import read_manifest
 from alice_survey.kit.figure import INKS, Axes, figure_style, new_figure, plain_name, save_figure
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.quality import (

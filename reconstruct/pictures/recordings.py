@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alice_survey.base.errors import ImageError, warn
+from alice_survey.core.errors import ImageError, warn
 from reconstruct.pictures.files import VIDEO, natural_key, to_utc
 from reconstruct.pictures.gpmf import Fixes, read_fixes
 from reconstruct.pictures.mp4 import Mp4Facts, read_mp4

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from alice_survey.base.artefacts import JsonRecord
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.artefacts import JsonRecord
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.pictures.files import ADVICE, PictureFolder, kind_of, named
 from reconstruct.pictures.incoming import COPIES, MIRRORED, UNDECODABLE, Incoming
 from reconstruct.pictures.recordings import Recording

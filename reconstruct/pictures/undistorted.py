@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.contents import taken_from
-from alice_survey.base.errors import ImageError, WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import CamerasRecord
+from alice_survey.core.contents import taken_from
+from alice_survey.core.errors import ImageError, WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import CamerasRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.picture_files import read_pixels
 from reconstruct.pictures.normalise import Grey, normalise

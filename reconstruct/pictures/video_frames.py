@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ImageError, note, warn
-from alice_survey.base.executor import progress
+from alice_survey.core.errors import ImageError, note, warn
+from alice_survey.core.executor import progress
 from reconstruct.pictures.files import PictureFacts, safe_name
 from reconstruct.pictures.frame_choice import Frame, FrameCounts, OverlapChooser
 from reconstruct.pictures.incoming import Incoming

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import ImageError, NavigationError, warn
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.errors import ImageError, NavigationError, warn
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
 from missions.logs.navigation_csv import READINGS, NavigationLog, warn_of_gaps
 from reconstruct.pictures.files import named, to_utc
 from reconstruct.pictures.incoming import Incoming

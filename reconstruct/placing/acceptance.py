@@ -16,11 +16,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.robust import CAUCHY_TUNING, MAD_TO_SIGMA
-from alice_survey.base.run import progress
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.robust import CAUCHY_TUNING, MAD_TO_SIGMA
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, first_pictures, observed

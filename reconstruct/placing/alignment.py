@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.robust import MAD_TO_SIGMA
 
 _BEAM = np.tan(np.deg2rad(15.0))
 """Radius of what a sonar's beam covers over the altitude: echo sounders' beams are 30 degrees wide,

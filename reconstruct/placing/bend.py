@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.placing.alignment import Similarity
 
 _THIN = 0.1

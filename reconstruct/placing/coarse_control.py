@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import brentq
 
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, aligned
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array, Datum
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
 from reconstruct.placing.control_file import Control, KnownLength

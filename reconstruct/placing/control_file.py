@@ -27,10 +27,10 @@ from typing import Literal
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array, Datum
-from alice_survey.stages import CONTROL_FILES
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.stages import CONTROL_FILES
 
 CONTROL_FILE, PICKS_FILE, MARKERS_FILE = CONTROL_FILES
 PICK_SIGMA_PX = 0.5

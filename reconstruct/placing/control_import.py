@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from alice_survey.base.artefacts import need_stage, write_csv
-from alice_survey.base.contents import one_line, shown
-from alice_survey.base.errors import WorkspaceError, warn, why
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.artefacts import need_stage, write_csv
+from alice_survey.core.contents import one_line, shown
+from alice_survey.core.errors import WorkspaceError, warn, why
+from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.files import safe_name
 from reconstruct.placing.control_file import CONTROL_FILE, PICKS_FILE
 from reconstruct.placing.foreign_control import ForeignBar, ForeignControl, ForeignPoint

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.edited_files import check_token, content_of, content_token, replaced
-from alice_survey.base.errors import WorkspaceError, why
+from alice_survey.core.edited_files import check_token, content_of, content_token, replaced
+from alice_survey.core.errors import WorkspaceError, why
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 
 PICKS_HEADER = ("image", "point", "x", "y", "sigma_px", "matched_to")

@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 
 LEAST_WHITE = 1e-4
 """Share of white error that two readings at the same time need to have any innovation."""

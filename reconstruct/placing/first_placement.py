@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import warn
+from alice_survey.core.errors import warn
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import Epochs
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from alice_survey.base.contents import shown
+from alice_survey.core.contents import shown
 from reconstruct.placing.control_file import PICK_SIGMA_PX, Use
 
 Place = tuple[float, float, float]

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.placing.correlated_errors import LEAST_WHITE, standard_residuals
 from reconstruct.placing.navigation_equations import GROUPS, NavigationEquations
 from reconstruct.placing.placement_problem import Correlation, Extra, PlacementProblem, channels_of

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.first_placement import first_placement, observable
 from reconstruct.placing.navigation_equations import (

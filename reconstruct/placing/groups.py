@@ -13,10 +13,10 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import collected_by, warn
-from alice_survey.base.frames import Datum
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import JointRecord
+from alice_survey.core.errors import collected_by, warn
+from alice_survey.core.frames import Datum
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import JointRecord
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.normal_equations import POSE
 from reconstruct.adjustment.soft_modes import SoftModes

@@ -9,12 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.base.artefacts import need_stage, read_stage, write_csv
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import ControlRecord
+from alice_survey.core.artefacts import need_stage, read_stage, write_csv
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import ControlRecord
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.placing.control import describe
 from reconstruct.placing.control_file import (

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from xml.etree import ElementTree as ET
 
-from alice_survey.base.contents import shown
+from alice_survey.core.contents import shown
 from reconstruct.placing.control_file import PICK_SIGMA_PX
 from reconstruct.placing.foreign_control import (
     Coordinates,

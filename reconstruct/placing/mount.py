@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import Level, collected_by, note, warn
-from alice_survey.base.frames import rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.errors import Level, collected_by, note, warn
+from alice_survey.core.frames import rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.navigation_equations import Installation
 from reconstruct.placing.placement_fit import FoundMount, PlacementFit
 

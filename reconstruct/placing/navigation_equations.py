@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import cross_matrices

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError, warn
+from alice_survey.core.frames import Array
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
 from reconstruct.placing.generalised_fit import Estimate, estimate, without_gross_errors

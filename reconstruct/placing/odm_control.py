@@ -8,7 +8,7 @@ there are no names of one place, are one point.
 import math
 import re
 
-from alice_survey.base.contents import shown
+from alice_survey.core.contents import shown
 from reconstruct.placing.foreign_control import (
     Coordinates,
     ForeignControl,

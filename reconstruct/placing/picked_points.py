@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import warn
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.triangulate import nearest_to_rays
 from reconstruct.placing.control_file import PICK_SIGMA_PX, Pick

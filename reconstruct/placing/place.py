@@ -11,13 +11,13 @@ import pycolmap
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import MappingRecord, PicturesRecord, ScaleRecord
-from alice_survey.base.run import progress
-from alice_survey.stages import SCALE_FILE
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
+from alice_survey.core.run import progress
+from alice_survey.core.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.soft_modes import SoftModes

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array, pose_to_json
+from alice_survey.core.frames import Array, pose_to_json
 from camera_calib.mount import nearest_mount
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.bend import Bend

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.placing.correlated_errors import correlated_share, whiten
 from reconstruct.placing.navigation_equations import GROUP_OF, PARAMETERS, NavigationEquations
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import warn
-from alice_survey.base.executor import Executor
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import (
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import warn
+from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import (
     AcceptanceRecord,
     CamerasRecord,
     ControlRecord,

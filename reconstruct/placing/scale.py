@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRecord
-from alice_survey.stages import SCALE_FILE
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.core.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.placing.control_file import Pick
 from reconstruct.placing.picked_points import RegisteredPicture, find_spots

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import atomic_path, read_csv, write_csv, write_json
-from alice_survey.base.contents import one_line
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import atomic_path, read_csv, write_csv, write_json
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observed

@@ -6,10 +6,10 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.run import progress
 from alice_survey.kit.document import EAST_NORTH, OWN_AXES
 from alice_survey.kit.figure import (
     EllipseCollection,

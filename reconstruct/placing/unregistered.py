@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_csv, write_csv
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.artefacts import read_csv, write_csv
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.mapping.unregistered import UNREGISTERED
 from reconstruct.placing.track import TrackRow

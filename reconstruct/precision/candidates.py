@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import PlanConfig, SurveyConfig
-from alice_survey.base.errors import PlanError, collected_by
-from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.core.config import PlanConfig, SurveyConfig
+from alice_survey.core.errors import PlanError, collected_by
+from alice_survey.core.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.plan.planner import area_bathymetry, plan_survey

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.block_solver import inverse_of
-from alice_survey.base.config import (
+from alice_survey.core.block_solver import inverse_of
+from alice_survey.core.config import (
     CameraConfig,
     ImagingConfig,
     NavigationConfig,
     ReconstructConfig,
     WaterConfig,
 )
-from alice_survey.seafloor.board import PoolBoard, pool_poses
-from alice_survey.vehicle.navigation.sensors import CompassSpec, PressureSpec
+from alice_survey.sim.seafloor.board import PoolBoard, pool_poses
+from alice_survey.sim.vehicle.navigation.sensors import CompassSpec, PressureSpec
 from camera_calib.freedom import USUAL_LENS, knowing_water, of_lenses, of_ports, pose_names
 from camera_calib.rig import Covariance, Rig, design_rig
 from missions.fly.check import rig_of

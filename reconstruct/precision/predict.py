@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.block_solver import inverse_of, product_of
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import inverse_of, product_of
+from alice_survey.core.frames import Array
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
 from reconstruct.adjustment.normal_equations import (
     LinearObservations,

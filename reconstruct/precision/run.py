@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import atomic_path, need_stage, read_json, write_json
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import ConfigError, warn
-from alice_survey.base.frames import Array
-from alice_survey.base.text_table import text_table
+from alice_survey.core.artefacts import atomic_path, need_stage, read_json, write_json
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import ConfigError, warn
+from alice_survey.core.frames import Array
+from alice_survey.core.text_table import text_table
 from alice_survey.kit.document import PictureLayer, Scale
 from alice_survey.kit.figure import (
     check_figure_path,

@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 from scipy.stats.qmc import Halton
 
-from alice_survey.base.block_solver import Flags, Indices
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import Flags, Indices
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_ne
 from reconstruct.adjustment.exact_observations import Pixels, RigState

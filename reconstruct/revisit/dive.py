@@ -9,9 +9,9 @@ import scipy.sparse as sp
 import shapely
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.block_solver import Flags
-from alice_survey.base.config import PlanConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import Flags
+from alice_survey.core.config import PlanConfig
+from alice_survey.core.frames import Array
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, joined, stations_of_lines, stations_of_plan
 from missions.fly.refly import refly_plan

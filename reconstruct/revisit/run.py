@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import PlanError, warn
-from alice_survey.base.executor import Executor
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.executor import Executor
 from alice_survey.kit.figure import figure_style, save_figure
 from alice_survey.kit.words import share
 from missions.coverage.drawing import (

@@ -16,12 +16,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, mapping
 
-from alice_survey.base.artefacts import need_stage
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord, read_manifest
-from alice_survey.base.records import RegistrationRecord
+from alice_survey.core.artefacts import need_stage
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord, read_manifest
+from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import assign_lines

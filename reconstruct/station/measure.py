@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from alice_survey.base.artefacts import need_stage, read_json
-from alice_survey.base.contents import taken_from
-from alice_survey.base.errors import ReconstructionError, WorkspaceError
-from alice_survey.base.frames import Array
+from alice_survey.core.artefacts import need_stage, read_json
+from alice_survey.core.contents import taken_from
+from alice_survey.core.errors import ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, warp_from_json
 from camera_calib.rig import Rig, read_rig
 from reconstruct.evaluate.elevation import StoredElevation

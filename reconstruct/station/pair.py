@@ -18,11 +18,11 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import CalibrationError, ImageError, ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.robust import MAD_TO_SIGMA
-from alice_survey.base.run import progress
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import CalibrationError, ImageError, ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
+from alice_survey.core.run import progress
 from alice_survey.kit.figure import colour_bar, figure_style, new_figure, save_figure
 from camera_calib.rig import Rig, read_rig, write_rig
 from reconstruct.dense.cloud import VERTEX, write_cloud

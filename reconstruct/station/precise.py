@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mesh.texture import remapped
 from reconstruct.views.model import View

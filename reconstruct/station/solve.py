@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
 from camera_calib.freedom import POSE

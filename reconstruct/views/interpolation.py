@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.compiled import compiled
+from alice_survey.core.compiled import compiled
 from reconstruct.views.range_shift import FAST
 
 _SIXTH, _HALF, _TWO_THIRDS = np.float32(1 / 6), np.float32(0.5), np.float32(2 / 3)

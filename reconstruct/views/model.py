@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.contents import taken_from
-from alice_survey.base.frames import Array, Datum
-from alice_survey.base.records import CamerasRecord, FrameRecord, PlaceRecord
+from alice_survey.core.contents import taken_from
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.records import CamerasRecord, FrameRecord, PlaceRecord
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, warp_from_json
 from reconstruct.views.range_shift import KernelLens, RangeShift, no_shift, range_shift
 

@@ -20,9 +20,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import Pinhole
 
 _PARAMS = {

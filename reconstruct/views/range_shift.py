@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
+from alice_survey.core.compiled import compiled
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.base.artefacts import (
+from alice_survey.core.artefacts import (
     Stage,
     atomic_path,
     need_stage,
@@ -18,7 +18,7 @@ from alice_survey.base.artefacts import (
     why_stale,
     write_csv,
 )
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 
 
 def stage(inputs: list[Path], value: int = 1, version: int = 1, resumes: bool = False) -> Stage:
@@ -186,8 +186,8 @@ def test_a_stage_records_what_it_took_outside_of_its_digest(tmp_path: Path) -> N
 def test_a_resumed_stage_counts_what_was_spent_before(
     tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("alice_survey.base.run.resources._EVERY_S", 0.01)
-    monkeypatch.setattr("alice_survey.base.run.resources._REPORTED_EVERY_S", 0.01)
+    monkeypatch.setattr("alice_survey.core.run.resources._EVERY_S", 0.01)
+    monkeypatch.setattr("alice_survey.core.run.resources._REPORTED_EVERY_S", 0.01)
     spent = tmp_path / "made.partial" / ".spent"
 
     def broken(folder: Path) -> None:
@@ -228,7 +228,7 @@ def test_a_record_of_what_was_spent_that_is_cut_does_no_harm(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from alice_survey.base import artefacts
+from alice_survey.core import artefacts
 target, call = Path(sys.argv[1]), int(sys.argv[2])
 calls = 0
 def step(original):

@@ -15,10 +15,10 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig, load_config
-from alice_survey.cli.main import app, main
-from alice_survey.stages import names
-from alice_survey.survey import init_survey
+from alice_survey.app.cli.main import app, main
+from alice_survey.app.pipeline import init_survey
+from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig, load_config
+from alice_survey.core.stages import names
 from camera_calib.rig import design_rig, write_rig
 from tests.missions.flown_plans import plan_of, walk
 
@@ -47,7 +47,7 @@ def fails(
 def test_help_loads_nothing_heavy() -> None:
     """`--help` answers at once because numeric packages are not even imported."""
     code = (
-        "import sys; from alice_survey.cli.main import app\n"
+        "import sys; from alice_survey.app.cli.main import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "heavy = {'numpy', 'scipy', 'cv2', 'pycolmap', 'open3d', 'pydantic', 'matplotlib'}\n"
@@ -295,7 +295,7 @@ def test_products_of_matrices_are_computed_on_one_core() -> None:
     """Else their rounding, and much time spent on waiting, would depend on the number of cores."""
     code = """
 import os
-from alice_survey.cli import main as cli
+from alice_survey.app.cli import main as cli
 
 def app():
     import numpy as np

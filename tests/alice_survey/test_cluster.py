@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.cluster import engine
-from alice_survey.base.cluster.connection import read_cluster_file
-from alice_survey.base.cluster.engine import ClusterExecutor, cluster_executor
-from alice_survey.base.cluster.shared_values import LARGE_BYTES, packed, packed_once, unpacked
-from alice_survey.base.cluster.worker import code_and_versions
-from alice_survey.base.errors import AliceError, ConfigError, WorkspaceError, heard
-from alice_survey.base.executor import SERIAL, Executor
-from alice_survey.base.run.resources import Meter
+from alice_survey.core.cluster import engine
+from alice_survey.core.cluster.connection import read_cluster_file
+from alice_survey.core.cluster.engine import ClusterExecutor, cluster_executor
+from alice_survey.core.cluster.shared_values import LARGE_BYTES, packed, packed_once, unpacked
+from alice_survey.core.cluster.worker import code_and_versions
+from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, heard
+from alice_survey.core.executor import SERIAL, Executor
+from alice_survey.core.run.resources import Meter
 from tests import dask_tasks
 from tests.dask_machines import Machines, kill, kill_work
 from tests.small_survey import settings_in
@@ -127,7 +127,7 @@ def test_a_cluster_gives_what_this_process_gives(executor: ClusterExecutor, tmp_
 
 def test_what_a_killed_run_left_goes_and_what_another_uses_stays(tmp_path: Path) -> None:
     hold = (
-        "import sys, time; from pathlib import Path; from alice_survey.base.cluster import engine; "
+        "import sys, time; from pathlib import Path; from alice_survey.core.cluster import engine; "
         "store = engine._store(Path(sys.argv[1])); print(store.__enter__(), flush=True)"
     )
     runs = [
@@ -263,7 +263,7 @@ def test_what_is_wrong_with_a_cluster_is_said_before_work(
         return str(raised.value)
 
     monkeypatch.setattr(engine, "_WAIT_S", 1.0)
-    monkeypatch.setattr("alice_survey.base.cluster.connection._CONNECT_S", 2)
+    monkeypatch.setattr("alice_survey.core.cluster.connection._CONNECT_S", 2)
     address = "tcp://127.0.0.1:9"
     assert "does not answer" in fault()
     with Machines(tmp_path / "machines", workers=0) as machines:

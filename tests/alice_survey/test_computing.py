@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey import computing
-from alice_survey.base.artefacts import StageRecord
-from alice_survey.base.config import CameraConfig, ImagingConfig, ReconstructConfig, SeafloorConfig
-from alice_survey.cli.main import app
-from alice_survey.computing import (
+from alice_survey.app import computing
+from alice_survey.app.cli.main import app
+from alice_survey.app.computing import (
     PREDICTED,
     StageCost,
     SurveyCost,
@@ -26,6 +24,8 @@ from alice_survey.computing import (
     size_of,
     stage_costs,
 )
+from alice_survey.core.artefacts import StageRecord
+from alice_survey.core.config import CameraConfig, ImagingConfig, ReconstructConfig, SeafloorConfig
 from benchmarks.costs import fitted, written
 from reconstruct.matching.features import detection_scales
 

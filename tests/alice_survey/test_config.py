@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from alice_survey.base.config import (
+from alice_survey.core.config import (
     AreaConfig,
     PlanConfig,
     SurveyConfig,
@@ -17,8 +17,8 @@ from alice_survey.base.config import (
     parse_current,
     parse_health,
 )
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import n_water, n_water_sigma
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.seawater import n_water, n_water_sigma
 
 
 def fault(settings: dict[str, Any]) -> str:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.contents import one_line, read_arrays, shown, taken_from
-from alice_survey.base.errors import PlanError, WorkspaceError
+from alice_survey.core.contents import one_line, read_arrays, shown, taken_from
+from alice_survey.core.errors import PlanError, WorkspaceError
 
 FILE = Path("frame.json")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.run.events import EventFile, LogFile, duration
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.run.events import EventFile, LogFile, duration
 
 TIME = "2023-11-14T22:13:20.250Z"
 

@@ -15,9 +15,9 @@ from typing import Any
 import psutil
 import pytest
 
-from alice_survey.base.errors import AliceError, heard, note, warn
-from alice_survey.base.executor import SERIAL, Executor, local_executor
-from alice_survey.base.run import progress
+from alice_survey.core.errors import AliceError, heard, note, warn
+from alice_survey.core.executor import SERIAL, Executor, local_executor
+from alice_survey.core.run import progress
 from tests.engines import PicklingThreads
 
 WORKERS = """
@@ -25,7 +25,7 @@ import os, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import sleeping
-from alice_survey.base.executor import local_executor
+from alice_survey.core.executor import local_executor
 if __name__ == "__main__":
     list(local_executor(2).map(sleeping.stay, [sys.argv[1]] * 8, label="sleep"))
 """

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import (
+from alice_survey.core.frames import (
     BODY_FROM_NADIR_CAM,
     Datum,
     attitude_from_rotation,

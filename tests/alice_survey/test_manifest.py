@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.base.errors import ImageError
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.errors import ImageError
+from alice_survey.core.manifest import read_manifest
 
 HEAD = "image,camera,station,mask,time_s\n"
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import Stage, run_stage
-from alice_survey.base.errors import heard, warn
-from alice_survey.base.executor import progress as counted
-from alice_survey.base.run import progress
-from alice_survey.base.run.display import Console
-from alice_survey.base.run.events import Event, LogFile, event_of
-from alice_survey.base.run.progress import Run
+from alice_survey.core.artefacts import Stage, run_stage
+from alice_survey.core.errors import heard, warn
+from alice_survey.core.executor import progress as counted
+from alice_survey.core.run import progress
+from alice_survey.core.run.display import Console
+from alice_survey.core.run.events import Event, LogFile, event_of
+from alice_survey.core.run.progress import Run
 
 
 class Clock:

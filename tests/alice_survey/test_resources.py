@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from alice_survey.base.run.resources import Meter, Spent, cpu_s, family, memory_mib, versions
+from alice_survey.core.run.resources import Meter, Spent, cpu_s, family, memory_mib, versions
 
 BUSY = """
 import sys, time

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import GREEN_NM, n_water, n_water_sigma, pressure_dbar
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.seawater import GREEN_NM, n_water, n_water_sigma, pressure_dbar
 from tests.oracles_water import (
     fresh_density_kg_m3,
     n_air,

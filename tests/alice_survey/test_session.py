@@ -18,11 +18,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from alice_survey.base.errors import PlanError, note, warn
-from alice_survey.base.executor import local_executor
-from alice_survey.base.run import interrupts, progress
-from alice_survey.cli import main as cli
-from alice_survey.cli.options import print_result, with_sessions
+from alice_survey.app.cli import main as cli
+from alice_survey.app.cli.options import print_result, with_sessions
+from alice_survey.core.errors import PlanError, note, warn
+from alice_survey.core.executor import local_executor
+from alice_survey.core.run import interrupts, progress
 
 
 def made(work: Callable[[], None]) -> typer.Typer:
@@ -202,10 +202,10 @@ SCRIPT = """
 import hashlib, sys, time
 from pathlib import Path
 import typer
-from alice_survey.base.run import interrupts
-from alice_survey.base.artefacts import Stage, run_stage
-from alice_survey.cli.options import with_sessions
-from alice_survey.base.executor import local_executor
+from alice_survey.core.run import interrupts
+from alice_survey.core.artefacts import Stage, run_stage
+from alice_survey.app.cli.options import with_sessions
+from alice_survey.core.executor import local_executor
 import sleeping
 
 app = typer.Typer()
@@ -321,8 +321,8 @@ for name in ("sigwait", "pthread_sigmask", "pthread_kill", "SIGHUP", "SIGUSR1"):
 del os.sched_getaffinity
 sys.modules["fcntl"] = None
 from pathlib import Path
-from alice_survey.base.executor import local_executor
-from alice_survey.cli.session import session
+from alice_survey.core.executor import local_executor
+from alice_survey.app.cli.session import session
 with session([], quiet=True, log_file=None, events=Path(sys.argv[1])):
     assert list(local_executor(1).map(abs, [-1, -2], label="abs")) == [1, 2]
 """
@@ -398,9 +398,9 @@ def _dies(item: int) -> int:
 BARS = """
 import time
 import typer
-from alice_survey.base.run import progress
-from alice_survey.cli.options import print_result, with_sessions
-from alice_survey.base.errors import warn
+from alice_survey.core.run import progress
+from alice_survey.app.cli.options import print_result, with_sessions
+from alice_survey.core.errors import warn
 
 app = typer.Typer()
 

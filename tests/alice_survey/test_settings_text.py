@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.settings_text import with_settings_changed, with_values
-from alice_survey.survey import template_text
+from alice_survey.app.pipeline import template_text
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.settings_text import with_settings_changed, with_values
 
 TEMPLATE = template_text()
 SECTIONS = list(tomllib.loads(TEMPLATE).keys() - {"name", "seed"})

@@ -12,19 +12,18 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey import stages
-from alice_survey.base import records
-from alice_survey.base.artefacts import JsonRecord, read_stage
-from alice_survey.base.config import SurveyConfig, load_config
-from alice_survey.base.errors import WorkspaceError, heard
-from alice_survey.base.executor import Executor
-from alice_survey.cli.main import app
-from alice_survey.report.figures import Figures
-from alice_survey.report.held import Held
-from alice_survey.report.sections import sections
-from alice_survey.report.verdicts import verdicts
-from alice_survey.stages import STAGES, StageSpec, spec
-from alice_survey.survey import FlightChanges, run, workspace_status
+from alice_survey.app.cli.main import app
+from alice_survey.app.pipeline import FlightChanges, run, workspace_status
+from alice_survey.app.report.figures import Figures
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.sections import sections
+from alice_survey.app.report.verdicts import verdicts
+from alice_survey.core import records, stages
+from alice_survey.core.artefacts import JsonRecord, read_stage
+from alice_survey.core.config import SurveyConfig, load_config
+from alice_survey.core.errors import WorkspaceError, heard
+from alice_survey.core.executor import Executor
+from alice_survey.core.stages import STAGES, StageSpec, spec
 
 OLD = Path(__file__).parent / "workspace_0_1_0.zip"
 """Made with version 0.1.0: records and small files as it wrote them, others cut short."""
@@ -132,7 +131,8 @@ def test_a_report_reads_what_version_0_1_0_wrote(old: Path) -> None:
 
 def test_status_loads_no_package_that_works(old: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from alice_survey.survey import workspace_status\n"
+        "import sys; from pathlib import Path\n"
+        "from alice_survey.app.pipeline import workspace_status\n"
         "assert workspace_status(Path(sys.argv[1]), None)[1]['stages']['mesh']\n"
         "heavy = {'scipy', 'numba', 'cv2', 'pycolmap', 'open3d', 'shapely', 'rasterio'}\n"
         "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"

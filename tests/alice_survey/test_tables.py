@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import AliceError, ConfigError
-from alice_survey.base.seawater import n_water
-from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
-from alice_survey.cli.main import app
+from alice_survey.app.cli.fov_tables import FovOptions, Output, fov_report, validation_report
+from alice_survey.app.cli.main import app
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import AliceError, ConfigError
+from alice_survey.core.seawater import n_water
 from camera_calib.fov.table import FovChoices
 from camera_calib.rig import design_rig, write_rig
 

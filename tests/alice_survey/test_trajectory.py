@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import rotation_from_attitude
-from alice_survey.base.trajectory import (
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import rotation_from_attitude
+from alice_survey.core.trajectory import (
     TRACK_COLUMNS,
     Trajectory,
     read_columns,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.calibration import TargetView
 from camera_calib.rig import Rig, design_rig
 from tests.cameras import changed

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import (
     Camera,
     camera_from_json,

@@ -63,7 +63,7 @@ TIGHT = """
 import resource, sys
 import cv2
 from pathlib import Path
-from alice_survey.base.errors import AliceError
+from alice_survey.core.errors import AliceError
 from camera_calib.picture_files import read_pixels
 read_pixels(Path(sys.argv[1]), cv2.IMREAD_COLOR)
 data = next(line for line in open("/proc/self/status") if line.startswith("VmData"))

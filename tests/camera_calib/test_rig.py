@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import AliceError, CalibrationError
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import AliceError, CalibrationError
 from camera_calib.rig import Covariance, Rig, design_rig, read_rig, write_rig
 from tests.cameras import changed
 

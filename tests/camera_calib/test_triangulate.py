@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.triangulate import nearest_to_rays, reproject, triangulate
 from tests.cameras import changed, flat_port_camera
 from tests.oracles_interface import (

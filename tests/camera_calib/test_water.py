@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.config import Jerlov
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import n_water
+from alice_survey.core.config import Jerlov
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.seawater import n_water
 from camera_calib.water import (
     CHANNELS,
     WAVELENGTH_NM,

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from PIL import Image
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.vehicle.files import vehicle_from_file
-from alice_survey.vehicle.log import write_vehicle_log
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.sim.vehicle.files import vehicle_from_file
+from alice_survey.sim.vehicle.log import write_vehicle_log
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig, design_rig, write_rig
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target
 from missions.logs.ros_frames import flipped_quaternion
-from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured
+from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.cameras import changed
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from tests.alice_survey.app.studio.client import serving
+from tests.alice_survey.app.studio.journey_page import begun_page, button
+from tests.alice_survey.app.studio.test_follow_browser import SimulatedDive
+from tests.alice_survey.app.studio.test_model_browser import click
 from tests.alice_survey.kit.browser import chromium
-from tests.alice_survey.studio.client import serving
-from tests.alice_survey.studio.journey_page import begun_page, button
-from tests.alice_survey.studio.test_follow_browser import SimulatedDive
-from tests.alice_survey.studio.test_model_browser import click
 from tests.docs.pages import DOCS
 from tests.missions.follow.dives import text_of
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import typer
 
-from alice_survey.cli.main import app
+from alice_survey.app.cli.main import app
 from tests.docs.given import GIVEN, Made
 from tests.docs.pages import (
     DOCS,

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.base.config import parse_config
-from alice_survey.vehicle.floor import level_floor
+from alice_survey.core.config import parse_config
+from alice_survey.sim.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
 from missions.fly.monte_carlo import fly_and_certify
 from missions.fly.simulation import flight_settings

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.frames import Datum
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.frames import Datum
 from tests.fuzz.target import Target
 
 _DEGREES = Polygon(

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.executor import SERIAL
 from camera_calib.rig import Rig, design_rig
 from tests.cameras import flat_port_camera
 from tests.fuzz.target import Target

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
 
-from alice_survey.base.errors import AliceError
+from alice_survey.core.errors import AliceError
 
 LONGEST_S = 10.0
 MOST_BYTES = 1 << 30

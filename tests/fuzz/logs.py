@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, WaterConfig
 from tests.fuzz.target import Target
 
 _HERE = Path(__file__).parent
@@ -209,7 +209,7 @@ def _vehicle_rows() -> list[str]:
 
 
 def read_vehicle_log(path: Path) -> object:
-    from alice_survey.vehicle.log import read_vehicle_log, segments
+    from alice_survey.sim.vehicle.log import read_vehicle_log, segments
 
     return segments(read_vehicle_log(path))
 
@@ -230,7 +230,7 @@ def _column_map(folder: Path) -> None:
 
 
 def read_column_map(path: Path) -> object:
-    from alice_survey.vehicle.identification.foreign import read_column_map as read
+    from alice_survey.sim.vehicle.identification.foreign import read_column_map as read
 
     return read(path)
 
@@ -262,19 +262,19 @@ def swelling_bag(folder: Path, packed: str, size: int) -> Path:
 
 
 def read_foreign(path: Path) -> object:
-    from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
+    from alice_survey.sim.vehicle.identification.foreign import read_column_map, read_foreign_log
 
     return read_foreign_log(path.with_name("log.csv"), read_column_map(path.with_name("map.toml")))
 
 
 def read_vehicle(path: Path) -> object:
-    from alice_survey.vehicle.files import speeds_missing, vehicle_from_file
+    from alice_survey.sim.vehicle.files import speeds_missing, vehicle_from_file
 
     return vehicle_from_file(path), speeds_missing(path)
 
 
 def _vehicle(folder: Path) -> None:
-    source = _HERE.parent / "alice_survey" / "vehicle" / "identification" / "bluerov2.toml"
+    source = _HERE.parent / "alice_survey" / "sim" / "vehicle" / "identification" / "bluerov2.toml"
     (folder / "v.toml").write_bytes(source.read_bytes())
 
 
@@ -292,7 +292,7 @@ def _coefficients() -> list[str]:
 
 
 def read_coefficients(path: Path) -> object:
-    from alice_survey.vehicle.files import coefficients_from_file
+    from alice_survey.sim.vehicle.files import coefficients_from_file
 
     return coefficients_from_file(path)
 
@@ -302,7 +302,7 @@ def _pulls() -> list[str]:
 
 
 def read_pulls(path: Path) -> object:
-    from alice_survey.vehicle.identification.bollard import read_pulls as read
+    from alice_survey.sim.vehicle.identification.bollard import read_pulls as read
 
     return read(path)
 
@@ -313,7 +313,7 @@ def _current() -> list[str]:
 
 
 def read_current(path: Path) -> object:
-    from alice_survey.vehicle.sea import read_current
+    from alice_survey.sim.vehicle.sea import read_current
 
     return read_current(path)
 

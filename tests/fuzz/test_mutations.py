@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import PlanError, WorkspaceError
+from alice_survey.core.errors import PlanError, WorkspaceError
 from tests.fuzz.judge import Sandbox, judge
 from tests.fuzz.mutations import mutate
 from tests.fuzz.targets import TARGETS, Trial

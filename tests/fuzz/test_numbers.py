@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey.base.config import load_config
-from alice_survey.base.errors import AliceError
-from alice_survey.cli.main import app
+from alice_survey.app.cli.main import app
+from alice_survey.core.config import load_config
+from alice_survey.core.errors import AliceError
 from tests.fuzz import areas
 from tests.fuzz.judge import LONGEST_S, Sandbox, bounded, judge
 from tests.fuzz.workspace import read_and_check_survey

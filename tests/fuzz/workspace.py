@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.frames import Datum
+from alice_survey.core.frames import Datum
 from missions.values.plan_file import Plan
 from tests.fuzz.target import Target
 
@@ -29,15 +29,15 @@ def _survey(folder: Path, name: str) -> None:
 
 
 def read_survey(path: Path) -> object:
-    from alice_survey.base.config import load_config
+    from alice_survey.core.config import load_config
 
     return load_config(path)
 
 
 def read_and_check_survey(path: Path) -> object:
     """The settings, used up to where lines are laid; what planning refuses is one line here."""
-    from alice_survey.base.config import load_config
-    from alice_survey.base.errors import ConfigError, PlanError, VehicleError
+    from alice_survey.core.config import load_config
+    from alice_survey.core.errors import ConfigError, PlanError, VehicleError
     from camera_calib.rig import design_rig
     from missions.plan.ready import check_ready
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.config import SurveyConfig, parse_config
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
+from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.floor import FloorGrid, floor_depth
+from alice_survey.sim.vehicle.pilot.safety import REASONS, TOO_LOW
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import flown, planned

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey.base.config import SurveyConfig, changed, parse_config
-from alice_survey.base.errors import ConfigError, VehicleError
-from alice_survey.base.executor import SERIAL
-from alice_survey.cli.main import app
-from alice_survey.vehicle import files
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.app.cli.main import app
+from alice_survey.core.config import SurveyConfig, changed, parse_config
+from alice_survey.core.errors import ConfigError, VehicleError
+from alice_survey.core.executor import SERIAL
+from alice_survey.sim.vehicle import files
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from missions.fly.compare import (
     EQUAL,
     IMPROVED,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from alice_survey.base.config import parse_config
-from alice_survey.vehicle.navigation import tick as navigation
+from alice_survey.core.config import parse_config
+from alice_survey.sim.vehicle.navigation import tick as navigation
 from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
 from missions.fly.flight_records import rpm_of
 from missions.values.flight import Flight, rms

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig, parse_config
-from alice_survey.base.errors import PlanError, VehicleError
-from alice_survey.base.executor import SERIAL
-from alice_survey.stages import spec
-from alice_survey.vehicle.pilot.memory import FOLLOW, LEG, PHASE
+from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig, parse_config
+from alice_survey.core.errors import PlanError, VehicleError
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.stages import spec
+from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
 from missions.fly.flight_route import (
@@ -179,7 +179,7 @@ def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step
 
 
 def test_the_settings_choose_the_dive(tmp_path: Path) -> None:
-    from alice_survey.base.artefacts import write_json
+    from alice_survey.core.artefacts import write_json
 
     folder = tmp_path / "plan"
     folder.mkdir()

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from alice_survey.base.config import SurveyConfig, parse_config
-from alice_survey.base.errors import PlanError, VehicleError, WorkspaceError
-from alice_survey.base.executor import SERIAL
-from alice_survey.base.frames import interpolate_poses
-from alice_survey.base.trajectory import read_columns, read_track
-from alice_survey.stages import spec
-from alice_survey.survey import FlightChanges, run
-from alice_survey.vehicle.log import read_vehicle_log
+from alice_survey.app.pipeline import FlightChanges, run
+from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.errors import PlanError, VehicleError, WorkspaceError
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.frames import interpolate_poses
+from alice_survey.core.stages import spec
+from alice_survey.core.trajectory import read_columns, read_track
+from alice_survey.sim.vehicle.log import read_vehicle_log
 from missions.values.plan_file import read_plan
 from tests.missions.flown_plans import terrain_of
 

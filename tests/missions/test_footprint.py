@@ -9,9 +9,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import LineString, Polygon, box
 from shapely.ops import unary_union
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import rotation_from_attitude
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
 from missions.values.footprint import (
     camera_swath,

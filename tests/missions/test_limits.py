@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.core.config import SurveyConfig, parse_config
 from camera_calib.rig import design_rig
 from missions.exports.format import Export
 from missions.exports.options import options_of

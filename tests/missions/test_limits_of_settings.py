@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig, load_config, parse_config
-from alice_survey.base.errors import AliceError, ConfigError
+from alice_survey.core.config import SurveyConfig, load_config, parse_config
+from alice_survey.core.errors import AliceError, ConfigError
 from camera_calib.rig import design_rig
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.settings_table import settings_table

@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.config import SurveyConfig, load_config, parse_config, with_settings
-from alice_survey.base.errors import AliceError, PlanError, VehicleError
-from alice_survey.survey import plan_report
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.app.pipeline import plan_report
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.config import SurveyConfig, load_config, parse_config, with_settings
+from alice_survey.core.errors import AliceError, PlanError, VehicleError
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.pilot.gains import gains_for
 from missions.plan.strength import survey_costs
 from missions.route.energy import battery_wh, craft_of, hotel_w
 from missions.values.flight import Flight, rms
 from tests.missions.flown_plans import flown, planned
 
-HEAVY = Path(__file__).parents[2] / "alice_survey/vehicle/fleet_files/bluerov2_heavy.toml"
+HEAVY = Path(__file__).parents[2] / "alice_survey/sim/vehicle/fleet_files/bluerov2_heavy.toml"
 PLACES = {"position_body_m": [0.2, -0.05, 0.1], "dvl_position_body_m": [-0.1, 0.0, 0.12]}
 
 
@@ -90,7 +90,7 @@ def test_gains_of_roll_and_pitch_are_damped_with_their_lag() -> None:
     craft = vehicle_from("bluerov2_heavy")
     gains = gains_for(craft, 0.2)
     assert gains.holds_level
-    from alice_survey.vehicle.pilot.gains import LAG, MASS, PLACE, RATE
+    from alice_survey.sim.vehicle.pilot.gains import LAG, MASS, PLACE, RATE
 
     for row, degree in ((4, 3), (5, 4)):
         axis = gains.axes[row]

@@ -5,7 +5,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.core.config import SurveyConfig, load_config
 from missions.fly.simulation import floor_grid
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import flown, planned, terrain_of

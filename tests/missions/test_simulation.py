@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from alice_survey.base.config import (
+from alice_survey.core.config import (
     CameraConfig,
     SeaConfig,
     SurveyConfig,
     WaterConfig,
     parse_config,
 )
-from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
-from alice_survey.vehicle.pilot.thrust_watch import ThrustWatch
-from alice_survey.vehicle.sea import current_at
+from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.floor import FloorGrid
+from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
+from alice_survey.sim.vehicle.pilot.thrust_watch import ThrustWatch
+from alice_survey.sim.vehicle.sea import current_at
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
 from missions.fly.simulation import current_of

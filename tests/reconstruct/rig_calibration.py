@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import Executor, local_executor
+from alice_survey.core.executor import Executor, local_executor
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import differences, in_air, views_of_some

@@ -18,16 +18,16 @@ from PIL import Image
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.config import ImagingConfig, SeafloorConfig
-from alice_survey.base.executor import Executor, local_executor
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Datum, rotation_from_attitude
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import RegistrationRecord
-from alice_survey.seafloor.light import CameraLight, camera_light
-from alice_survey.seafloor.renderer import Scene, render
-from alice_survey.seafloor.sensor import MIDDLE_GREY, Sensor, develop, expose
-from alice_survey.seafloor.terrain import build_terrain
-from alice_survey.seafloor.texture import survey_texture
+from alice_survey.core.config import ImagingConfig, SeafloorConfig
+from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Datum, rotation_from_attitude
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import RegistrationRecord
+from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.renderer import Scene, render
+from alice_survey.sim.seafloor.sensor import MIDDLE_GREY, Sensor, develop, expose
+from alice_survey.sim.seafloor.terrain import build_terrain
+from alice_survey.sim.seafloor.texture import survey_texture
 from camera_calib.camera import Camera
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, design_rig
 from reconstruct.matching.matches import PairMatches

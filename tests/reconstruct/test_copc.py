@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from laspy.copc import Bounds
 
-from alice_survey.base.executor import SERIAL, Executor, local_executor
+from alice_survey.core.executor import SERIAL, Executor, local_executor
 from reconstruct import copc
 from reconstruct.copc import PointSpool, write_copc
 

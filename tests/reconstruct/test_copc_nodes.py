@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from laspy.copc import Bounds, CopcReader
 
-from alice_survey.base.errors import AliceError, ReconstructionError, WorkspaceError
+from alice_survey.core.errors import AliceError, ReconstructionError, WorkspaceError
 from reconstruct import copc, copc_nodes
 from reconstruct.copc_nodes import read_node, read_nodes
 from tests.reconstruct.test_copc import CLOUDS, OFFSET_M, STEP_M, new_header, write

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import ReconstructionError, WorkspaceError
-from alice_survey.base.frames import Datum
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Datum
 from reconstruct.views.model import WorldFrame, read_frame, read_warps, write_frame
 from reconstruct.views.model_files import read_reconstruction
 from tests.reconstruct.scenes import make_scene

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import SurveyConfig, changed
-from alice_survey.base.errors import ConfigError, ReconstructionError, heard
-from alice_survey.base.plane_settings import parse_plane, parse_planes
+from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.errors import ConfigError, ReconstructionError, heard
+from alice_survey.core.plane_settings import parse_plane, parse_planes
 from reconstruct.planes import (
     LEVEL_PLANE,
     Plane,

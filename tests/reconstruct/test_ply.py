@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.ply import read_ply_points
 
 XYZ = np.random.default_rng(2).normal(0, 100, (50, 3))

@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.raster import (
     DemGrid,
     crs_of,

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.executor import local_executor
-from alice_survey.base.records import PortRecord
-from alice_survey.survey import run
+from alice_survey.app.pipeline import run
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.executor import local_executor
+from alice_survey.core.records import PortRecord
 from camera_calib.rig import Rig, read_rig
 from tests.reconstruct.rig_calibration import calibrated_rig, errors_over_sigmas
 from tests.reconstruct.rig_survey import (

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped

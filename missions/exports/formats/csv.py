@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv
+from alice_survey.core.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import dive_of_line, lat_lon, line_depths_m
 from missions.exports.waypoints import Waypoint

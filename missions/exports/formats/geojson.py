@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.executor import progress
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.executor import progress
+from alice_survey.core.frames import Array, Datum
 from camera_calib.rig import Rig
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import (

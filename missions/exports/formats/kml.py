@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import lat_lon, line_depths_m, rings_ne, route_ne
 from missions.exports.xml_text import child, degrees, metres, write_xml

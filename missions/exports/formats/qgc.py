@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import warn
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import warn
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import grown, lat_lon
 from missions.exports.mavlink import (

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import write_json
+from alice_survey.core.artefacts import write_json
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.formats.qgc import (
     ALTITUDE_MODES,

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.core.artefacts import atomic_path
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.mavlink import FRAME_GLOBAL, NAV_WAYPOINT, Item, item_of, mission_of
 from missions.exports.xml_text import degrees

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.contents import shown
-from alice_survey.base.errors import WorkspaceError, warn
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import WorkspaceError, warn
 from reconstruct.annotations.backdrops import Backdrops
 from reconstruct.annotations.formats.common import (
     Format,

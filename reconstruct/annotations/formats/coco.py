@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.formats.common import (
     OURS,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from alice_survey.base.contents import first_fault, shown
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.contents import first_fault, shown
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.keyhole import joined, parted
 from reconstruct.annotations.values import (

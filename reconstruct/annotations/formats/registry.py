@@ -1,6 +1,6 @@
 """The formats of annotations by their names."""
 
-from alice_survey.base.errors import ConfigError
+from alice_survey.core.errors import ConfigError
 from reconstruct.annotations.formats.biigle import BIIGLE
 from reconstruct.annotations.formats.coco import COCO
 from reconstruct.annotations.formats.common import Format

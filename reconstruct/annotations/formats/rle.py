@@ -11,7 +11,7 @@ import numpy as np
 import rasterio.features
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.annotations.values import signed_area
 
 Ring = tuple[tuple[float, float], ...]

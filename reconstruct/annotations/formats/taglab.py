@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.annotations.backdrops import Backdrop, Backdrops
 from reconstruct.annotations.formats.common import (
     OURS,

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import shift as shift_picture
 
-from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
-from alice_survey.base.seawater import n_water
+from alice_survey.core.errors import CalibrationError, ConfigError, ImageError
+from alice_survey.core.seawater import n_water
 from camera_calib.approximation.dispersion import (
     channel_cameras,
     channel_maps,

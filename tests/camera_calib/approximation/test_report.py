@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import AliceError
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import AliceError
 from camera_calib.approximation.report import draw_residuals, residual_report
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, approximations
 from camera_calib.rig import design_rig, write_rig

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import CalibrationError, ConfigError
+from alice_survey.core.errors import CalibrationError, ConfigError
 from camera_calib.approximation.residual import (
     COLMAP_PARAMETERS,
     Residual,

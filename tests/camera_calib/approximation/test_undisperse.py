@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import AliceError
-from alice_survey.base.executor import local_executor
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import AliceError
+from alice_survey.core.executor import local_executor
 from camera_calib.approximation.dispersion import channel_cameras, channel_maps, undisperse
 from camera_calib.approximation.undisperse import undisperse_files
 from camera_calib.rig import design_rig, write_rig

@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from benchmarks.camera_calibration import (
     GOAL_OF_BOUND,
     GOAL_OF_SIGMA,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.observability import held_effect
 from camera_calib.calibrate.solve import (

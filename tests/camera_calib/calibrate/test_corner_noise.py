@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.executor import SERIAL
 from benchmarks.target_calibration import (
     GOAL_OF_SIGMA,
     MOST_GROWTH,

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import AliceError, CalibrationError
-from alice_survey.base.executor import SERIAL
-from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
+from alice_survey.core.errors import AliceError, CalibrationError
+from alice_survey.core.executor import SERIAL
+from alice_survey.sim.seafloor.board import PoolBoard, board_records, pool_poses, render_board
 from camera_calib.calibrate import from_pictures
 from camera_calib.calibrate.by_options import calibrated
 from camera_calib.calibrate.detect_views import detect_views

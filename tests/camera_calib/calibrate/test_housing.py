@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.by_options import calibrated
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.housing import housing_lines

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.by_options import calibrated, port_kinds
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.options import CalibrateOptions, check_settings

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.errors import CalibrationError
+from alice_survey.core.executor import SERIAL
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.moments import clock_offset, track_of, views_at_moments
 from camera_calib.calibrate.options import CalibrateOptions

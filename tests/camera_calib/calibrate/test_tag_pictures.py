@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.executor import SERIAL
 from benchmarks.camera_calibration import cramer_rao
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.colmap import read_colmap, write_colmap, write_refractive

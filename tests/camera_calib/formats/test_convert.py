@@ -11,9 +11,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import AliceError, CalibrationError
-from alice_survey.cli.main import main
+from alice_survey.app.cli.main import main
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import AliceError, CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.convert import Conversion, convert, in_water
 from camera_calib.formats.registry import FORMATS, detect

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.formats.metashape import read_metashape, write_metashape
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.mrcal import read_mrcal, write_mrcal
 from camera_calib.formats.registry import detect

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.lenses.fisheye import FisheyeLens

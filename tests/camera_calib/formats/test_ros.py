@@ -12,7 +12,7 @@ import yaml
 from hypothesis import assume, given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.ros import read_ros, write_ros

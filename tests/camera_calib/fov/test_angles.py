@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.base.config import CameraConfig
-from alice_survey.base.errors import ConfigError
-from alice_survey.base.seawater import n_water as n_of
+from alice_survey.core.config import CameraConfig
+from alice_survey.core.errors import ConfigError
+from alice_survey.core.seawater import n_water as n_of
 from camera_calib.fov.angles import ANGLES_DEG, angle_table
 
 PORT = CameraConfig()

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import ConfigError
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import ConfigError
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.fov.table import FovChoices, fov_table

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from alice_survey.base.config import CameraConfig
+from alice_survey.core.config import CameraConfig
 from camera_calib.fov.paper import PAPER_TABLE, PaperCheck, PaperValidation, validate_paper
 from camera_calib.fov.table import FovChoices, fov_table
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import CalibrationError, ConfigError
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import CalibrationError, ConfigError
 from camera_calib.camera import Camera
 from camera_calib.formats.rigs import led_by
 from camera_calib.fov.focus import apparent_distance_m

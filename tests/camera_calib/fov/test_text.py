@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.base.config import CameraConfig
-from alice_survey.base.errors import ConfigError
+from alice_survey.core.config import CameraConfig
+from alice_survey.core.errors import ConfigError
 from camera_calib.fov.angles import angle_table
 from camera_calib.fov.paper import PaperValidation, validate_paper
 from camera_calib.fov.plot import draw_fov

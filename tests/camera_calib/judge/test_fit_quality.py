@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import json_values
+from alice_survey.core.artefacts import json_values
 from camera_calib.judge.fit_quality import (
     CORNERS,
     camera_residuals,

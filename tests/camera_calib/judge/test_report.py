@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.calibration import Calibration, Rejection, TargetView
 from camera_calib.judge.judgement import judge
 from camera_calib.judge.report import write_report

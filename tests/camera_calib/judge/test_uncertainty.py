@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.freedom import POSE
 from camera_calib.judge.judgement import anchors_cam
 from camera_calib.judge.uncertainty import (

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.freedom import (

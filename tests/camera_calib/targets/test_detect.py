@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.targets.detect import Detection, detect, detect_with_reasons
 from camera_calib.targets.grow import chessboard_size
 from camera_calib.targets.target import Target, parse_target

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from pypdf import PdfReader
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.targets.detect import detect
 from camera_calib.targets.sheet import BAR_MM, PAPERS_MM, lay_out, print_target, write_sheet
 from camera_calib.targets.target import Target, parse_target

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, aruco_dictionary, parse_target, write_target
 

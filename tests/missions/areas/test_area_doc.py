@@ -7,7 +7,7 @@ import pyogrio.raw
 import pytest
 import shapely
 
-from alice_survey.base.config import AreaConfig, load_config
+from alice_survey.core.config import AreaConfig, load_config
 from missions.areas.files import SUFFIXES
 from missions.areas.survey import survey_area
 

@@ -10,8 +10,8 @@ import shapely
 from pyproj import Transformer
 from rasterio.transform import Affine, from_origin
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array, Datum
 from missions.areas import bathymetry as module
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from tests.oracles_energy import bilinear

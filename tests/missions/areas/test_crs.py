@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from pyproj import CRS, Geod, Transformer
 from shapely.geometry import Polygon
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Datum
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Datum
 from missions.areas.crs import LocalFrame, geographic_shapes, parse_crs
 from missions.areas.raw import from_geometries
 from missions.areas.survey import survey_area

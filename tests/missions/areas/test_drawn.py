@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.errors import PlanError, collected_by
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.errors import PlanError, collected_by
 from missions.areas.drawn import (
     FILES,
     DrawnPolygon,

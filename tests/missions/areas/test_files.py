@@ -13,8 +13,8 @@ from pyproj import Transformer
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.errors import PlanError
 from missions.areas import safe
 from missions.areas.files import read_area_file
 from missions.areas.survey import survey_area

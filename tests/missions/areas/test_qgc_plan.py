@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import shapely
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.errors import PlanError
 from missions.areas.survey import survey_area
 from missions.values.area import Area
 

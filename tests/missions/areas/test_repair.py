@@ -6,9 +6,9 @@ import pytest
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.base.config import AreaConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Datum
+from alice_survey.core.config import AreaConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Datum
 from missions.areas.crs import LocalFrame
 from missions.areas.raw import RawShapes, no_points
 from missions.areas.repair import Repaired, repaired

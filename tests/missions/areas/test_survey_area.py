@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from alice_survey.base.config import AreaConfig, parse_config
-from alice_survey.base.errors import AliceError, PlanError
-from alice_survey.base.frames import Datum
+from alice_survey.core.config import AreaConfig, parse_config
+from alice_survey.core.errors import AliceError, PlanError
+from alice_survey.core.frames import Datum
 from missions.areas.survey import survey_area
 from missions.values.area import Area
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
 from missions.values.navigation import BelievedNavigation

@@ -10,8 +10,8 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
-from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
+from alice_survey.core.errors import PlanError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import find_holes

@@ -10,9 +10,9 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.artefacts import Stage, run_stage, write_json
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
+from alice_survey.core.artefacts import Stage, run_stage, write_json
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import NavigationError, PlanError, WorkspaceError
 from alice_survey.kit.words import share
 from camera_calib.mount import mount_rotation
 from camera_calib.rig import Rig, design_rig, write_rig

@@ -9,12 +9,12 @@ import pytest
 import shapely
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord, write_manifest
-from alice_survey.base.trajectory import Trajectory, write_track
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord, write_manifest
+from alice_survey.core.trajectory import Trajectory, write_track
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.dive_record import DiveRecord, assign_lines, read_dive_record
 from missions.coverage.stations import Stations, stations_of_plan

@@ -5,7 +5,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.growing import AT_OVERLAP, OUTSIDE, SEEN, STEREO, GrowingCoverage

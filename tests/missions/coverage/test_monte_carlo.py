@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import shapely
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import PlanError
-from alice_survey.base.executor import SERIAL
-from alice_survey.vehicle.floor import level_floor
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import PlanError
+from alice_survey.core.executor import SERIAL
+from alice_survey.sim.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
 from missions.fly.monte_carlo import MonteCarlo, monte_carlo
 from missions.fly.simulation import flight_settings

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.stations import Stations, stations_of_lines
 from missions.values.footprint import footprint_size_m, step_for_overlap

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.executor import local_executor
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.executor import local_executor
 from camera_calib.rig import design_rig
 from missions.coverage import certificate as module
 from missions.coverage.certificate import certificate

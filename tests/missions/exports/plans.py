@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Datum
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Datum
 from camera_calib.rig import Rig, design_rig
 from missions.values.area import Area
 from missions.values.legs import Leg, Route

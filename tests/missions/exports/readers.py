@@ -9,8 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 from pyproj import Geod
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array, Datum
 from camera_calib.rig import Rig, design_rig
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import line, plan_of

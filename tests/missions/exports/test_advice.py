@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
-from alice_survey.base.errors import heard
-from alice_survey.vehicle.pilot.cola2 import steady_drift
+from alice_survey.core.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
+from alice_survey.core.errors import heard
+from alice_survey.sim.vehicle.pilot.cola2 import steady_drift
 from missions.coverage.stations import stations_of_plan
 from missions.exports.follower import (
     end_tolerance_m,

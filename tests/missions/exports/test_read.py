@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from pymavlink import mavwp
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exports.read import read_mission
 from missions.exports.write import write_exports
 from missions.values.mission import Mission

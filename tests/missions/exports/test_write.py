@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.config import parse_config
-from alice_survey.base.errors import PlanError
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.config import parse_config
+from alice_survey.core.errors import PlanError
 from missions.exports import formats
 from missions.exports.options import Options
 from missions.exports.registry import format_named, format_names, formats_table
@@ -153,7 +153,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_names_of_formats_are_known_without_importing_them() -> None:
     code = (
-        "import sys, alice_survey.cli.plan\n"
+        "import sys, alice_survey.app.cli.plan\n"
         "print([name for name in sys.modules if name.startswith('missions.exports.formats.')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from alice_survey.base.config import parse_config
+from alice_survey.core.config import parse_config
 from camera_calib.rig import Rig
 from missions.exposure.settings import ImagingSetup
 

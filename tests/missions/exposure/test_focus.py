@@ -4,7 +4,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from camera_calib.fov.table import FovChoices, fov_table
 from missions.exposure.focus import largest_f_number, needed_f_number, plan_focus, too_open
 from tests.missions.exposure.surveys import survey

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from camera_calib.camera import Camera
 from missions.exposure.footprints import (
     altitude_for_pixel_m,

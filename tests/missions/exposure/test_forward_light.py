@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from alice_survey.base.config import Jerlov
+from alice_survey.core.config import Jerlov
 from camera_calib.water import ASYMMETRY, phase_per_sr, water_optics
 from missions.exposure.forward_light import LIT_SHARE, SEEN_SHARE, share_within
 from missions.exposure.lamp import watts_per_lumen

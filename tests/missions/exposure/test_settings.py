@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exposure.settings import imaging_settings
 from missions.exposure.settings_table import WIDTH, Setting, settings_table
 from tests.missions.exposure.surveys import survey

@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import PlanError
 from missions.exposure.settings import imaging_settings
 from missions.exposure.solve import lenses_for_resolution, speeds_for_rate
 from missions.values.footprint import footprint_size_m

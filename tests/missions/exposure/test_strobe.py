@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exposure.storage import raw_bytes, storage_load
 from missions.exposure.strobe import BUS_V, EFFICACY_LM_W, capacitor_f, duty_limit, strobe_load
 from tests.missions.exposure.surveys import number_in, survey

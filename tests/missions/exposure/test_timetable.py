@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exposure.settings import imaging_settings
 from missions.exposure.timetable import HEADER, trigger_edges, trigger_table, write_timetable
 from tests.missions.exposure.surveys import survey

@@ -2,7 +2,7 @@ import re
 
 import pytest
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exposure.settings import imaging_settings
 from missions.exposure.trigger import paper_rule, trigger_rows
 from missions.values.footprint import footprint_size_m

@@ -1,6 +1,6 @@
 from typing import Any
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.exposure.ways_out import Settings, Way, conflict, with_ways_that_work
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import read_dive_record

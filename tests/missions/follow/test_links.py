@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array
 from missions.follow.links import (
     MavlinkSource,
     OdometryRows,

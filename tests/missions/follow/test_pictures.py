@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.follow.rows import ALTITUDE, DEPTH, HEADING, LATITUDE, ROLL, Piece, SteadyTimes
 from missions.follow.tail import NavigationTail
 from tests.missions.follow.dives import PLAN, Followed, at_once, route_rows, same, text_of

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.follow.progress import PRIOR_SIGMA, FlightPace, Progress
 from missions.values.costs import leg_costs, time_costs
 from missions.values.legs import Route

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import VehicleError
+from alice_survey.core.errors import VehicleError
 from missions.follow.links import RosSource
 from missions.live import ros_messages
 from missions.live.loop import Odometry

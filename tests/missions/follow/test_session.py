@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey.base.errors import NavigationError, WorkspaceError
-from alice_survey.cli.main import app
-from alice_survey.survey import settings
+from alice_survey.app.cli.main import app
+from alice_survey.app.pipeline import settings
+from alice_survey.core.errors import NavigationError, WorkspaceError
 from missions.follow.session import DiveSession, follow_report, open_source
 from missions.follow.tail import ReplayedLog
 from missions.values.plan_file import read_plan
-from tests.alice_survey.studio.test_follow import GAP, LINE_S, PLAN, ROWS, workspace_of
+from tests.alice_survey.app.studio.test_follow import GAP, LINE_S, PLAN, ROWS, workspace_of
 from tests.missions.follow.dives import RIG, text_of
 
 UNTIL_S = 100.0 + 3.5 * (LINE_S + 5.0)

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon, box
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.lines.hops import chain_j, comparable
 from missions.lines.lay import lay_lines, ordered, stops
 from missions.route.ways import Ways

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from missions.lines.rows import lay_rows, reaches, rooms, row_offsets, to_uv
 from missions.route.fence import edges_of
 from missions.values.area import multipolygon

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon, box
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.lines import sweep as sweep_module
 from missions.lines.lay import Laid, laid
 from missions.lines.sweep import best_heading, least_width, widths_m

@@ -13,14 +13,14 @@ import numpy as np
 from pymavlink import mavutil
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.artefacts import write_csv
-from alice_survey.base.config import SurveyConfig, load_config
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation
-from alice_survey.vehicle.allocation import AXIS_WEIGHTS
-from alice_survey.vehicle.floor import floor_range
-from alice_survey.vehicle.navigation.sensors import DVL
-from alice_survey.vehicle.pilot.command import allocate, new_allocation
-from alice_survey.vehicle.pilot.gains import (
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.config import SurveyConfig, load_config
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation
+from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS
+from alice_survey.sim.vehicle.floor import floor_range
+from alice_survey.sim.vehicle.navigation.sensors import DVL
+from alice_survey.sim.vehicle.pilot.command import allocate, new_allocation
+from alice_survey.sim.vehicle.pilot.gains import (
     HEAVE,
     LEAST,
     MASS,
@@ -30,8 +30,8 @@ from alice_survey.vehicle.pilot.gains import (
     YAW,
     gains_for,
 )
-from alice_survey.vehicle.rotations import wrapped
-from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
+from alice_survey.sim.vehicle.rotations import wrapped
+from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
 from missions.live.mission import plan_to_fly
 from tests.missions.live.flights import vehicle_afloat
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.frames import Array
-from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.simulated_vehicle import SimulatedVehicle
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.live.loop import LinkLimits, Odometry
 from missions.live.mission import LiveMission, mission_of

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.core.config import SurveyConfig
 from missions.live.loop import LinkState
 from missions.values.flight import trigger_times
 from tests.missions.flown_plans import flown

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import VehicleError
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import VehicleError
 from missions.fly.simulation import flight_settings
 from missions.live.loop import LinkLimits, LinkState
 from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot, pilot_over_mavlink

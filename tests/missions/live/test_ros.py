@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import read_csv
-from alice_survey.base.config import SurveyConfig, load_config
-from alice_survey.base.errors import VehicleError
-from alice_survey.base.frames import Array, attitude_from_rotation, interpolate_poses
-from alice_survey.base.trajectory import read_track
-from alice_survey.vehicle.floor import floor_depth
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.config import SurveyConfig, load_config
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import Array, attitude_from_rotation, interpolate_poses
+from alice_survey.core.trajectory import read_track
+from alice_survey.sim.vehicle.floor import floor_depth
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, plan_pattern, stations_of_flight

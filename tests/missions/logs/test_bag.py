@@ -9,8 +9,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Datum, rotation_from_attitude
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Datum, rotation_from_attitude
 from missions.logs.bag import BagRecord, write_bag
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, Datum
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, Datum
 from missions.logs.dead_reckoning import (
     TrackErrors,
     dead_reckoned,

@@ -10,9 +10,9 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Datum, attitude_from_rotation, rotation_from_attitude
-from alice_survey.vehicle.log import read_vehicle_log
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Datum, attitude_from_rotation, rotation_from_attitude
+from alice_survey.sim.vehicle.log import read_vehicle_log
 from missions.logs.bag import write_bag
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.ros_frames import flipped_quaternion

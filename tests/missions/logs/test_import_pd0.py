@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Array, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors
 from missions.logs.import_log import ImportOptions, import_log, read_dive
 from missions.logs.pd0 import is_pd0

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import NavigationError
-from alice_survey.base.frames import Datum
+from alice_survey.core.errors import NavigationError
+from alice_survey.core.frames import Datum
 from missions.logs.dead_reckoning import TrackErrors
 from missions.logs.import_log import ImportOptions, import_log, read_dive
 from tests.missions.logs.test_import_bag import numbers

@@ -5,7 +5,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import NavigationError
+from alice_survey.core.errors import NavigationError
 from missions.logs.navigation_csv import find_zone, read_navigation, warn_of_gaps
 
 HEADER = "time_s,latitude_deg,longitude_deg,depth_m,heading_deg,altitude_m"

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.config import SurveyConfig, load_config, parse_settings
-from alice_survey.base.errors import AliceError, ConfigError, collected_by
-from alice_survey.survey import template_text
+from alice_survey.app.pipeline import template_text
+from alice_survey.core.config import SurveyConfig, load_config, parse_settings
+from alice_survey.core.errors import AliceError, ConfigError, collected_by
 from missions.areas.drawn import FILES, DrawnPolygon, DrawnShapes, area_drawing
 from missions.plan.draft import drafted
 from missions.plan.preview import preview

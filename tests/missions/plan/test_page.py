@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from alice_survey.base.config import SeaConfig
-from alice_survey.base.frames import Datum
+from alice_survey.core.config import SeaConfig
+from alice_survey.core.frames import Datum
 from alice_survey.kit.document import Link, PictureLayer, ShapeLayer
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate

@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, box
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import parse_config
-from alice_survey.base.errors import PlanError
+from alice_survey.core.config import parse_config
+from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig, design_rig
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.fly.flight_route import one_dive, path_of

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig, changed, parse_config, with_settings
-from alice_survey.base.errors import collected_by
+from alice_survey.core.config import SurveyConfig, changed, parse_config, with_settings
+from alice_survey.core.errors import collected_by
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from alice_survey.base.config import SurveyConfig, parse_config, with_settings
+from alice_survey.core.config import SurveyConfig, parse_config, with_settings
 from camera_calib.rig import design_rig
 from missions.exposure.ways_out import ConflictError
 from missions.plan.planner import Planned, plan_survey

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from alice_survey.base.config import SurveyConfig, parse_config
-from alice_survey.base.errors import ConfigError, PlanError
+from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.errors import ConfigError, PlanError
 from camera_calib.rig import design_rig
 from missions.exposure.ways_out import ConflictError
 from missions.plan.planner import plan_survey

@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.route.dives import DEAREST_TIE, split_dives
 from missions.route.turns import legs_alone, line_table, route_of
 from missions.route.ways import Ways

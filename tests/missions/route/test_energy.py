@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import ConfigError, PlanError
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.steady import steady_flight
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import ConfigError, PlanError
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.steady import steady_flight
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.plan.strength import arcs_fit, held_current_mps, survey_costs, too_strong
 from missions.plan.trade import current_report, draw_trade, energy_report, three_ways
@@ -372,7 +372,7 @@ def test_costs_compile_nothing() -> None:
     """A cold start pays for no kernel of the simulator."""
     code = (
         "from numba.core import event\n"
-        "from alice_survey.base.config import SurveyConfig\n"
+        "from alice_survey.core.config import SurveyConfig\n"
         "from missions.plan.strength import survey_costs\n"
         "with event.install_recorder('numba:compile') as seen:\n"
         "    survey_costs(SurveyConfig())\n"

@@ -5,9 +5,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.pilot.memory import FOLLOW, LEG, PHASE
+from alice_survey.core.config import SurveyConfig
+from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey

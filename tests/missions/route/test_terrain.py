@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from alice_survey.base.errors import PlanError
-from alice_survey.base.frames import Array, Datum
-from alice_survey.vehicle.files import vehicle_from
-from alice_survey.vehicle.hull import Hull
+from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array, Datum
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.hull import Hull
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
 from missions.route.terrain import (
     Reach,

@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.route.fence import TOUCH_M
 from missions.route.joins import LONGEST_SWAY_M
 from missions.route.turns import Turns

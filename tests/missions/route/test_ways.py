@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
-from alice_survey.base.errors import PlanError
+from alice_survey.core.errors import PlanError
 from missions.route.fence import OPEN_WATER, TOUCH_M, arc_inside, straight_inside
 from missions.route.ways import Ways
 from missions.values.area import multipolygon

@@ -10,9 +10,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.frames import Array
-from alice_survey.base.records import RangeRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.frames import Array
+from alice_survey.core.records import RangeRecord
 from benchmarks.bend_pipeline import Adjusted, adjusted
 from camera_calib.rig import Covariance
 from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey

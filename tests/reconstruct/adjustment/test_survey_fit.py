@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.records import RangeRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations, survey_fit

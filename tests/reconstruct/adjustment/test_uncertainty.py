@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.block_solver import BlockStep
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.block_solver import BlockStep
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from benchmarks.block_size import block
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.frames import Array
-from alice_survey.base.records import RangeRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.frames import Array
+from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey

@@ -13,7 +13,7 @@ from rasterio.features import rasterize
 from rasterio.transform import Affine as GridAffine
 from shapely.geometry import Polygon
 
-from alice_survey.base.errors import AliceError
+from alice_survey.core.errors import AliceError
 from reconstruct.annotations.backdrops import Backdrops
 from reconstruct.annotations.formats.registry import FORMATS
 from reconstruct.annotations.formats.rle import decoded, encoded, outlines, packed, unpacked

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.seafloor.terrain import Terrain, read_terrain
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.sim.seafloor.terrain import Terrain, read_terrain
 from camera_calib.rig import read_rig
 from reconstruct.annotations.marks import sigma_of_area
 from reconstruct.annotations.projection import OnPlane, Projector

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from rasterio.transform import Affine as GridAffine
 
-from alice_survey.base.edited_files import StaleError
-from alice_survey.base.errors import ConfigError, WorkspaceError
-from alice_survey.base.frames import Datum
+from alice_survey.core.edited_files import StaleError
+from alice_survey.core.errors import ConfigError, WorkspaceError
+from alice_survey.core.frames import Datum
 from reconstruct.annotations.marks import MeasuredMark
 from reconstruct.annotations.store import (
     FILE,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from alice_survey.base.errors import ConfigError
+from alice_survey.core.errors import ConfigError
 from reconstruct.annotations.marks import MarkMeasures, MeasuredMark
 from reconstruct.annotations.store import change_annotations
 from reconstruct.annotations.surfaces import MarkPart, MarkSurfaces, SurfaceFigures
@@ -16,7 +16,7 @@ from reconstruct.annotations.table import EACH, HEADER, part_in, table
 from reconstruct.annotations.transfer import frame_of
 from reconstruct.annotations.values import Annotation, AnnotationSet, DrawnShape, Label
 from reconstruct.measure.surface import MeasuredSurface
-from tests.alice_survey.report.tiny import SLOPE, tiny_workspace
+from tests.alice_survey.app.report.tiny import SLOPE, tiny_workspace
 from tests.reconstruct.measure.synthetic import grid, without_errors
 
 PIXEL = 0.01

@@ -3,8 +3,8 @@ from dataclasses import replace
 import laspy
 import numpy as np
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.executor import SERIAL
 from reconstruct.dense import cloud as cloud_module
 from reconstruct.dense.cloud import (
     VERTEX,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import heard
+from alice_survey.core.errors import heard
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.dense.pose_part import ErrorsOfPoses, find_errors_of_poses

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import ReconstructionError
+from alice_survey.core.errors import ReconstructionError
 from reconstruct.dense.stereo_pairs import (
     PointsInSight,
     choose_partners,

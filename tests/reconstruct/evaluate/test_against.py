@@ -12,9 +12,9 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely import Point, Polygon
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import ReconstructionError, WorkspaceError, heard
-from alice_survey.base.frames import Datum
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, heard
+from alice_survey.core.frames import Datum
 from reconstruct.evaluate.against import compare_elevations, evaluate_against
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu
 from reconstruct.evaluate.height_registration import register_heights, rough_shifts

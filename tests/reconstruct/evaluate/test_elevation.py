@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.evaluate import elevation
 from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.raster import read_cells

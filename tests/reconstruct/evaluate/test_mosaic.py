@@ -9,9 +9,9 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.config import SeafloorConfig
-from alice_survey.seafloor.terrain import Terrain, build_terrain
-from alice_survey.seafloor.texture import Texture, survey_texture
+from alice_survey.core.config import SeafloorConfig
+from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
+from alice_survey.sim.seafloor.texture import Texture, survey_texture
 from reconstruct.evaluate.figures import compare_lengths
 from reconstruct.evaluate.mosaic import score_mosaic
 from reconstruct.evaluate.truth import surface_material

@@ -12,8 +12,8 @@ from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import ReconstructionError, WorkspaceError
-from alice_survey.base.frames import Datum
+from alice_survey.core.errors import ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Datum
 from reconstruct.evaluate.cloud_files import read_reference
 from reconstruct.evaluate.cloud_registration import (
     ReferenceSurface,

@@ -8,10 +8,10 @@ import shapely
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.base.config import SeafloorConfig
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Datum
-from alice_survey.seafloor.terrain import Terrain, build_terrain
+from alice_survey.core.config import SeafloorConfig
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Datum
+from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line, LineKind

@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 from shapely import contains_xy
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.config import CameraConfig, SeafloorConfig, WaterConfig
-from alice_survey.seafloor.terrain import Terrain, build_terrain
+from alice_survey.core.config import CameraConfig, SeafloorConfig, WaterConfig
+from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from camera_calib.rig import Rig, design_rig
 from missions.values.footprint import footprint_polygon, level_pose
 from reconstruct.evaluate.mesh import distance_from_mesh, score_mesh, spread_over

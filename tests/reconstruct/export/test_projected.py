@@ -12,7 +12,7 @@ import pyproj
 import pytest
 import rasterio
 
-from alice_survey.base.errors import ConfigError, ReconstructionError
+from alice_survey.core.errors import ConfigError, ReconstructionError
 from reconstruct.evaluate.elevation import elevation_in
 from reconstruct.export.projected import export_projected
 from reconstruct.views.model import read_frame

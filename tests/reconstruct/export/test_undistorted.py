@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.executor import SERIAL
 from reconstruct.evaluate.mesh import read_mesh
 from reconstruct.export.undistorted import bilinear, export_undistorted, exported_name
 from reconstruct.views.model import View, read_model, read_warps

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import SERIAL, local_executor
+from alice_survey.core.executor import SERIAL, local_executor
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import model_groups
 from reconstruct.mapping.global_mapper import average_poses, station_groups

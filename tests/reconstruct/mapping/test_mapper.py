@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import ReconstructionError, heard
+from alice_survey.core.errors import ReconstructionError, heard
 from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
@@ -211,7 +211,7 @@ def test_cameras_that_took_no_pictures_together_calibrate_themselves() -> None:
 
 def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequence[str]) -> Scene:
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
-    from alice_survey.base.manifest import ImageRecord
+    from alice_survey.core.manifest import ImageRecord
     from reconstruct.matching.matches import PairMatches
 
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])

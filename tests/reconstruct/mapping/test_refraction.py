@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import ReconstructionError, heard
-from alice_survey.base.executor import SERIAL
+from alice_survey.core.errors import ReconstructionError, heard
+from alice_survey.core.executor import SERIAL
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import Rig
 from reconstruct.mapping.working_range import (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.frusta import frusta_of, near_pairs, shared
 from reconstruct.matching.pairs import choose_pairs, neighbours, placed_pictures

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.executor import SERIAL
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.mapping.learned_ties import Taken, all_pixels, quarter_turns, with_learned
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.learned import (

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.matching import matches as matching
 from reconstruct.matching.features import Features, load_features, save_features
 from reconstruct.matching.matches import (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import SERIAL
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.features import Features, save_features
 from reconstruct.matching.pairs import (

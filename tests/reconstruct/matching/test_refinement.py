@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.executor import local_executor
+from alice_survey.core.executor import local_executor
 from reconstruct.matching.refinement import (
     affine_from_neighbours,
     align_coarser,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.adjustment.uncertainty import SharedMotions
 from reconstruct.measure.errors import on_lattice, own_correlation
 from reconstruct.measure.surface import MeasuredSurface

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import write_json
+from alice_survey.core.artefacts import write_json
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import SharedMotions, Uncertainty, write_uncertainty
 from reconstruct.measure.errors import FigureSlopes, in_plane, own_correlation, shared_errors
 from reconstruct.measure.lines import measure_line
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.planes import LEVEL_PLANE, Plane, facing
-from tests.alice_survey.report.tiny import SIGMA_M, SLOPE, tiny_workspace
+from tests.alice_survey.app.report.tiny import SIGMA_M, SLOPE, tiny_workspace
 from tests.reconstruct.measure.synthetic import FRAME
 
 BOUNDS = (0.0, 0.0, 0.8, 1.2)

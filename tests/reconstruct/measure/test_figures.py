@@ -12,8 +12,8 @@ import shapely
 from rasterio.windows import Window
 from scipy.special import ellipe
 
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from reconstruct.measure.areas import surface_within
 from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured

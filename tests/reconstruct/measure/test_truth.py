@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.base.frames import Array
-from alice_survey.seafloor.terrain import read_terrain
+from alice_survey.core.frames import Array
+from alice_survey.sim.seafloor.terrain import read_terrain
 from camera_calib.rig import read_rig
 from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.measure.lines import measure_line

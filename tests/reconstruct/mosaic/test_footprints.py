@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.base.artefacts import read_json, write_json
-from alice_survey.base.errors import ConfigError
+from alice_survey.core.artefacts import read_json, write_json
+from alice_survey.core.errors import ConfigError
 from reconstruct.mosaic.annotation import mosaic_tiles
 from reconstruct.mosaic.footprints import picture_footprint, surface_points, write_footprints
 from reconstruct.raster import DemGrid, crs_of, transform_of

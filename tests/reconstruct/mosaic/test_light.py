@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.light.parts import Histogram, Parts, percentiles, values_in
 from reconstruct.light.solve import (
     GRID,

@@ -8,7 +8,7 @@ import rasterio
 from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import local_executor
+from alice_survey.core.executor import local_executor
 from camera_calib.approximation.pinhole_warp import Pinhole
 from reconstruct.mosaic.occluders import Occluders, find_occluders, hidden_by, read_occluders
 from reconstruct.planes import LEVEL_PLANE

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.mosaic.picture_measures import linear_table
 from reconstruct.mosaic.reference import ReferencePatch, read_references
 from tests.oracles_dense import Scene, flat, sparse_model, stereo_views, write_workspace

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import BODY_FROM_NADIR_CAM
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera

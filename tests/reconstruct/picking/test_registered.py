@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.picking.registered import RegisteredPictures, tangents

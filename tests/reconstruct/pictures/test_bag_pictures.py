@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import AliceError, ImageError, collected_by
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.errors import AliceError, ImageError, collected_by
+from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.bag_pictures import pixels_of
 from reconstruct.pictures.importing import import_images
 from tests.missions.logs.log_files import Bag

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import AliceError, ImageError, WorkspaceError, heard
-from alice_survey.base.executor import local_executor
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import AliceError, ImageError, WorkspaceError, heard
+from alice_survey.core.executor import local_executor
+from alice_survey.core.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import shapely
 
-from alice_survey.base.artefacts import Stage, run_stage, write_json
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.errors import CalibrationError, ImageError, PlanError, WorkspaceError
-from alice_survey.base.frames import Datum
-from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
-from alice_survey.base.records import PicturesRecord, PlaceRecord
-from alice_survey.stages import is_imported, rig_file
+from alice_survey.core.artefacts import Stage, run_stage, write_json
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import CalibrationError, ImageError, PlanError, WorkspaceError
+from alice_survey.core.frames import Datum
+from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.core.records import PicturesRecord, PlaceRecord
+from alice_survey.core.stages import is_imported, rig_file
 from camera_calib.rig import design_rig, read_rig, write_rig
 from missions.coverage.dive_record import assign_lines
 from missions.coverage.stations import stations_of_plan

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import ImageError
+from alice_survey.core.errors import ImageError
 from reconstruct.pictures.normalise import even_light, normalise, read_deep
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile, JpegImagePlugin
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.errors import ImageError, heard
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.errors import ImageError, heard
+from alice_survey.core.manifest import read_manifest
 from camera_calib.picture_files import without_orientation
 from reconstruct.pictures.files import decode, exif_focal_px, inspect
 from reconstruct.pictures.heic import can_read_heic

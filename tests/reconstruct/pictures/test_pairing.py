@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.base.errors import ImageError, heard
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.errors import ImageError, heard
+from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.pairing import pair_by_time
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.base.errors import ImageError, NavigationError
+from alice_survey.core.errors import ImageError, NavigationError
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.preview import cameras_in, preview_import
 from tests.reconstruct.pictures.dated import BEGAN, navigation, take

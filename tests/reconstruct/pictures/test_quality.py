@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from alice_survey.base.errors import ImageError
-from alice_survey.base.executor import SERIAL
-from alice_survey.base.manifest import ImageRecord, write_manifest
+from alice_survey.core.errors import ImageError
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.manifest import ImageRecord, write_manifest
 from reconstruct.pictures.quality import PictureQuality, judge, measure
 from reconstruct.pictures.quality_sheet import quality_report, worst_first
 

@@ -8,9 +8,9 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.errors import ImageError, heard
-from alice_survey.base.manifest import read_manifest
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.errors import ImageError, heard
+from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.gpmf import read_fixes
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.mp4 import payloads, read_mp4

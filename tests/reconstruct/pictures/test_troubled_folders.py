@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import PicturesRecord, RegistrationRecord
-from alice_survey.cli.main import main
+from alice_survey.app.cli.main import main
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import PicturesRecord, RegistrationRecord
 from camera_calib.rig import design_rig, write_rig
 
 START = datetime(2024, 7, 1, 12, tzinfo=UTC)

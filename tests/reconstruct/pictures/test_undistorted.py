@@ -5,8 +5,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import ImageError, WorkspaceError
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import ImageError, WorkspaceError
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps

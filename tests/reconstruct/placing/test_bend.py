@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.bend import Bend
 from reconstruct.placing.georeference import fit_navigation, level
 from tests.reconstruct.placing.test_sigmas import (

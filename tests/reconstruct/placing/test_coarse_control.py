@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.errors import heard
+from alice_survey.core.errors import heard
 from reconstruct.placing.coarse_control import real_sigma_factor, widened, without_wrong_points
 from reconstruct.placing.control import ControlFit, describe, tie_control
 from reconstruct.placing.control_file import Control, KnownPoint

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import WorkspaceError, collected_by
+from alice_survey.core.errors import WorkspaceError, collected_by
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control

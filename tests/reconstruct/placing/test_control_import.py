@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import WorkspaceError, collected_by, heard
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord, write_manifest
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import WorkspaceError, collected_by, heard
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord, write_manifest
 from reconstruct.placing.control_file import read_control, read_picks
 from reconstruct.placing.control_import import import_control
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.base.edited_files import StaleError
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.core.edited_files import StaleError
+from alice_survey.core.errors import WorkspaceError
 from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.control_tables import (
     save_control,

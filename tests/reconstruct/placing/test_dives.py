@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.generalised_fit import dives_of
 from tests.reconstruct.placing.test_sigmas import SIGMA, flight, place, records_of
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.placing.placement_fit import PlacementFit

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.executor import local_executor
-from alice_survey.base.frames import Array
-from alice_survey.base.records import RangeRecord, RegistrationRecord
-from alice_survey.survey import run
+from alice_survey.app.pipeline import run
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.executor import local_executor
+from alice_survey.core.frames import Array
+from alice_survey.core.records import RangeRecord, RegistrationRecord
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.normal_equations import Gauge
 from reconstruct.adjustment.uncertainty import Uncertainty

@@ -9,10 +9,10 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.frames import Datum
-from alice_survey.base.manifest import ImageRecord
-from alice_survey.base.records import MappingRecord, PicturesRecord
+from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.frames import Datum
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import MappingRecord, PicturesRecord
 from camera_calib.freedom import part_of_rig
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.georeference import fit_navigation, level

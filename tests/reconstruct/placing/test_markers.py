@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import write_json
-from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.frames import Array
-from alice_survey.base.manifest import write_manifest
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import write_manifest
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.camera import Camera
 from reconstruct.placing.control_file import read_picks

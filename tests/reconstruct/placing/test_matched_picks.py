@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import CameraConfig, WaterConfig
-from alice_survey.base.frames import Array
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.placing.control_file import Pick

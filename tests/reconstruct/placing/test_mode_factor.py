@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array
+from alice_survey.core.frames import Array
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.placing.placement_fit import PlacementFit
 from tests.reconstruct.placing.test_sigmas import BODY_FROM_CAM, DATUM, flight, flown

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import collected_by, warn
-from alice_survey.base.frames import Array
+from alice_survey.core.errors import collected_by, warn
+from alice_survey.core.frames import Array
 from camera_calib.mount import mount_rotation
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.placing.mount import fit_with_mount

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.base.config import load_config
-from alice_survey.base.executor import SERIAL
-from alice_survey.base.manifest import read_manifest
-from alice_survey.base.records import FrameRecord, GeoreferenceRecord, RegistrationRecord
-from alice_survey.stages import spec
+from alice_survey.core.config import load_config
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import FrameRecord, GeoreferenceRecord, RegistrationRecord
+from alice_survey.core.stages import spec
 from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.pictures.importing import import_images
 from reconstruct.placing.track import read_track_poses

@@ -11,13 +11,13 @@ from PIL import Image
 from pyproj import Transformer
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.config import ReconstructConfig, SurveyConfig
-from alice_survey.base.errors import AliceError, ReconstructionError
-from alice_survey.base.executor import SERIAL, Executor, local_executor
-from alice_survey.base.manifest import read_manifest, write_manifest
-from alice_survey.base.records import RegistrationRecord
-from alice_survey.stages import spec
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.config import ReconstructConfig, SurveyConfig
+from alice_survey.core.errors import AliceError, ReconstructionError
+from alice_survey.core.executor import SERIAL, Executor, local_executor
+from alice_survey.core.manifest import read_manifest, write_manifest
+from alice_survey.core.records import RegistrationRecord
+from alice_survey.core.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.placing.control_import import import_control
@@ -246,7 +246,7 @@ def test_real_stereo_without_calibration_gets_one_rigid_rig(
 
 
 def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None:
-    from alice_survey.base.config import CameraConfig, WaterConfig
+    from alice_survey.core.config import CameraConfig, WaterConfig
     from camera_calib.rig import design_rig, write_rig
 
     folder = tmp_path / "w"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.correlated_errors import correlated_share, standard_residuals, whiten
 from reconstruct.placing.georeference import fit_navigation, level
 from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
@@ -315,7 +315,7 @@ def test_placing_is_the_same_twice() -> None:
 @pytest.mark.slow
 def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     """The built-in flight simulator, its sensors and its filter, 20 times over one small plan."""
-    from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
+    from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
     from camera_calib.rig import design_rig
     from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
     from missions.plan.planner import plan_survey

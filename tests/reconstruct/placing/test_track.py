@@ -10,8 +10,8 @@ import pytest
 import rasterio
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.errors import WorkspaceError
-from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from reconstruct.adjustment.soft_modes import SoftModes, no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.frames import Datum
-from alice_survey.base.manifest import ImageRecord
+from alice_survey.core.frames import Datum
+from alice_survey.core.manifest import ImageRecord
 from reconstruct.mapping.unregistered import reasons, write_reasons
 from reconstruct.matching.matches import PairMatches
 from reconstruct.placing.track import TrackRow

@@ -10,11 +10,11 @@ import pytest
 import rasterio
 from PIL import Image
 
-from alice_survey.base.artefacts import json_values, read_json
-from alice_survey.base.config import NavigationConfig, ReconstructConfig, SurveyConfig, load_config
-from alice_survey.base.errors import ConfigError, PlanError
-from alice_survey.base.executor import SERIAL
-from alice_survey.survey import run
+from alice_survey.app.pipeline import run
+from alice_survey.core.artefacts import json_values, read_json
+from alice_survey.core.config import NavigationConfig, ReconstructConfig, SurveyConfig, load_config
+from alice_survey.core.errors import ConfigError, PlanError
+from alice_survey.core.executor import SERIAL
 from benchmarks import bend_survey
 from benchmarks.precision import errors, errors_of_drawn_logs, swayed
 from camera_calib.rig import Rig, design_rig

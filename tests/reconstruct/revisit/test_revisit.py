@@ -11,8 +11,8 @@ import scipy.sparse as sp
 import shapely
 from numpy.typing import NDArray
 
-from alice_survey.base.config import SurveyConfig
-from alice_survey.base.records import RegistrationRecord
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, joined, stations_of_plan

@@ -7,8 +7,8 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.errors import (
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.errors import (
     CalibrationError,
     ImageError,
     ReconstructionError,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.values import LensValues

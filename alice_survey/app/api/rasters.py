@@ -1,0 +1,174 @@
+"""Surface and mosaic of a workspace as arrays."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+from rasterio.windows import Window
+
+from alice_survey.core.frames import Array
+from reconstruct.raster import opened_raster
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Placed:
+    west: float
+    """Left edge, in the raster's coordinates (metres where the model is scaled)."""
+    north: float
+    """Upper edge."""
+    cell: float
+    """Side of a cell."""
+    unit: str
+    """Unit of lengths: `m`, or `model units` where the scale is not known."""
+    crs: Any
+    """`rasterio.crs.CRS`, or None where the model has no place on the Earth."""
+
+    def _repr_html_(self) -> str:
+        title, _, text = repr(self).partition(": ")
+        return f"<b>{title}</b>: {text}"
+
+    def _extent_of(self, cells: NDArray[Any]) -> tuple[float, float, float, float]:
+        rows, columns = cells.shape[:2]
+        return (
+            self.west, self.west + columns * self.cell,
+            self.north - rows * self.cell, self.north,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Dem(_Placed):
+    """Heights of the surface, with their standard deviations.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> dem = alice.Survey("small").dem
+        >>> bool(dem.height.shape == dem.sigma.shape)
+        True
+    """
+
+    height: Array
+    """(rows, columns) heights, positive up, row 0 in the north; NaN where nothing was measured."""
+    sigma: Array
+    """(rows, columns) standard deviations of the heights."""
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south and north edges, as `matplotlib.imshow` takes them."""
+        return self._extent_of(self.height)
+
+    def height_at(self, east: Array, north: Array) -> Array:
+        """Heights of the cells at given coordinates; NaN outside or where none is known.
+
+        Args:
+            east: in the raster's coordinates.
+            north: array of the same shape.
+        """
+        rows, columns = self.height.shape
+        row = np.floor((self.north - np.asarray(north, dtype=float)) / self.cell).astype(int)
+        column = np.floor((np.asarray(east, dtype=float) - self.west) / self.cell).astype(int)
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        found: Array = np.where(
+            inside, self.height[row.clip(0, rows - 1), column.clip(0, columns - 1)], np.nan
+        )
+        return found
+
+    def __repr__(self) -> str:
+        rows, columns = self.height.shape
+        known = np.isfinite(self.height)
+        return (
+            f"DEM: {columns} x {rows} cells of {self.cell:.4g} {self.unit}, "
+            f"{known.mean():.0%} known, median sigma {np.nanmedian(self.sigma):.3g} {self.unit}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Mosaic(_Placed):
+    """The orthomosaic.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.Survey("small").mosaic.rgba.shape[2]
+        4
+    """
+
+    rgba: NDArray[np.uint8]
+    """(rows, columns, 4); alpha is 0 where no picture shows the sea floor."""
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south and north edges, as `matplotlib.imshow` takes them."""
+        return self._extent_of(self.rgba)
+
+    def __repr__(self) -> str:
+        rows, columns = self.rgba.shape[:2]
+        share = (self.rgba[..., 3] > 0).mean()
+        return (
+            f"mosaic: {columns} x {rows} pixels of {self.cell:.4g} {self.unit}, {share:.0%} painted"
+        )
+
+
+def read_dem(workspace: str | Path, most_cells: int = 4000) -> Dem:
+    """Read the surface of a reconstructed workspace.
+
+    Args:
+        workspace: its folder.
+        most_cells: rows and columns at most; a larger raster is averaged by blocks.
+
+    Raises:
+        WorkspaceError: there is no surface, or its file is damaged.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.read_dem("small", most_cells=50).height.shape[0] <= 50
+        True
+    """
+    folder = Path(workspace) / "dense"
+    height, place = _read(folder / "dem.tif", [1], most_cells)
+    sigma, _ = _read(folder / "sigma.tif", [1], most_cells)
+    return Dem(height=height[0].astype(float), sigma=sigma[0].astype(float), **place)
+
+
+def read_mosaic(workspace: str | Path, most_pixels: int = 4000) -> Mosaic:
+    """Read the mosaic of a reconstructed workspace.
+
+    Args:
+        workspace: its folder.
+        most_pixels: rows and columns at most; a larger raster is averaged by blocks.
+
+    Raises:
+        WorkspaceError: there is no mosaic, or its file is damaged.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.read_mosaic("small", most_pixels=100).rgba.dtype
+        dtype('uint8')
+    """
+    bands, place = _read(Path(workspace) / "mosaic" / "mosaic.tif", [1, 2, 3, 4], most_pixels)
+    return Mosaic(rgba=np.ascontiguousarray(bands.transpose(1, 2, 0)), **place)
+
+
+def _read(path: Path, bands: list[int], most: int) -> tuple[Any, dict[str, Any]]:
+    """Bands (B, rows, columns), and where they lie."""
+    with opened_raster(path) as raster:
+        shrink = max(1, math.ceil(max(raster.height, raster.width) / most))
+        shape = max(1, raster.height // shrink), max(1, raster.width // shrink)
+        # Whole blocks only, so that cells stay square: less than one at the south and east edges.
+        window = Window(0, 0, shape[1] * shrink, shape[0] * shrink)
+        values = raster.read(
+            bands,
+            window=window,
+            out_shape=(len(bands), *shape),
+            resampling=Resampling.average,
+        )
+        place = {
+            "west": raster.transform.c,
+            "north": raster.transform.f,
+            "cell": raster.transform.a * shrink,
+            "unit": raster.tags().get("UNIT", "m"),
+            "crs": raster.crs,
+        }
+    return values, place

@@ -1,0 +1,131 @@
+"""A survey's workspace as one object."""
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alice_survey.app.api.rasters import Dem, Mosaic, read_dem, read_mosaic
+from alice_survey.app.api.track import Track, read_track
+from alice_survey.core.config import SurveyConfig
+from camera_calib.rig import Rig, design_rig, read_rig
+from missions.values.plan_file import Plan, read_plan
+from reconstruct.views.model import SparseModel, read_model
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A workspace: the folder that holds the settings and the stages of one survey.
+
+    Args:
+        folder: the workspace; it need not exist yet.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> reef = alice.Survey.new("reef")
+        >>> plan = reef.plan()
+        >>> len(plan.lines), round(plan.duration_s / 60)
+        (17, 30)
+    """
+
+    folder: Path
+
+    def __init__(self, folder: str | Path) -> None:
+        object.__setattr__(self, "folder", Path(folder))
+
+    @classmethod
+    def new(
+        cls, folder: str | Path, *, area: str | Path | None = None, example: str = "survey"
+    ) -> "Survey":
+        """Create a workspace with a commented `survey.toml`.
+
+        Args:
+            folder: the workspace; created if missing.
+            area: GeoJSON, KML, GeoPackage, shapefile or WKT of the area to survey.
+            example: `survey` (the paper's mission), `demo` or `caesarea`.
+
+        Raises:
+            WorkspaceError: there is a `survey.toml` already, or the folder cannot be written.
+
+        Example:
+            >>> import alice_survey as alice
+            >>> alice.Survey.new("harbour", example="caesarea").config.plan.altitude_m
+            3.0
+        """
+        from alice_survey.app.pipeline import init_survey
+
+        init_survey(Path(folder), f"{example}.toml", None if area is None else Path(area))
+        return cls(folder)
+
+    @property
+    def config(self) -> SurveyConfig:
+        """The settings of `survey.toml`; defaults where a workspace holds imported pictures."""
+        from alice_survey.app.pipeline import settings
+        from alice_survey.core.stages import is_imported
+
+        return settings(self.folder, None, needed=not is_imported(self.folder))
+
+    def run(self, *stages: str, threads: int | None = None) -> dict[str, Any]:
+        """Run stages in the order given; those that are up to date are skipped.
+
+        Args:
+            stages: names as `alice-survey status` shows them; all when none is given.
+            threads: cores to use; None for all.
+
+        Returns:
+            Results by stage, as in its summary.
+
+        Raises:
+            AliceError: a stage cannot be done; the message states what to change.
+        """
+        from alice_survey.app.pipeline import run
+        from alice_survey.core.executor import local_executor
+        from alice_survey.core.stages import names
+
+        return run(stages or names(), self.folder, None, executor=local_executor(threads))[1]
+
+    def plan(self) -> Plan:
+        """Plan the survey if its plan is missing or stale, and return the plan."""
+        self.run("plan")
+        return read_plan(self.folder / "plan" / "plan.json")
+
+    def status(self) -> dict[str, str]:
+        """State of each stage: up to date, stale (and why), interrupted or missing."""
+        from alice_survey.app.pipeline import workspace_status
+
+        states: dict[str, str] = workspace_status(self.folder, None)[1]["stages"]
+        return states
+
+    @property
+    def rig(self) -> Rig:
+        """The calibrated rig, or the rig as designed where none has been calibrated."""
+        path = self.folder / "calibration" / "rig.json"
+        config = self.config
+        return read_rig(path) if path.is_file() else design_rig(config.camera, config.water)
+
+    @property
+    def model(self) -> SparseModel:
+        """Registered views and points."""
+        return read_model(self.folder / "sparse")
+
+    @property
+    def track(self) -> Track:
+        """Positions of the pictures, with covariances."""
+        return read_track(self.folder)
+
+    @property
+    def dem(self) -> Dem:
+        """Heights of the surface with their sigmas, at most 4,000 cells a side."""
+        return read_dem(self.folder)
+
+    @property
+    def mosaic(self) -> Mosaic:
+        """The orthomosaic, at most 4,000 pixels a side."""
+        return read_mosaic(self.folder)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{html.escape(stage)}</td><td>{html.escape(state)}</td></tr>"
+            for stage, state in self.status().items()
+        )
+        return f"<b>{html.escape(str(self.folder))}</b><table>{rows}</table>"

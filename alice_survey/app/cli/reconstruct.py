@@ -1,0 +1,286 @@
+"""The commands that turn pictures into a model, measure in it, and score it."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from alice_survey.app.cli.options import (
+    CONTEXT,
+    WORK,
+    AsJson,
+    ClusterFile,
+    Device,
+    Scheduler,
+    SurveyFile,
+    Threads,
+    Workspace,
+    examples,
+    executor_of,
+    executor_on,
+    print_result,
+)
+
+app = typer.Typer()
+reconstruct_app = typer.Typer(
+    invoke_without_command=True,
+    context_settings=CONTEXT,
+    rich_markup_mode=None,
+    epilog=examples(
+        "reconstruct -w reef",
+        "reconstruct -w reef --threads 2 --json",
+        "reconstruct -w reef --scheduler tcp://10.0.0.1:8786",
+        "reconstruct -w quay --plane level --plane 'wall=facing 180'",
+        "reconstruct -w reef --export undistorted",
+        "reconstruct -w reef --crs EPSG:32636",
+        "reconstruct pair left.png right.png --rig rig.json -o stingray",
+    ),
+)
+
+
+@reconstruct_app.callback()
+def reconstruct(
+    context: typer.Context,
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    plane: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Plane of DEM and mosaic, any number: level, auto (the best one), or "
+            "'NAME=facing DEGREES tilt DEGREES': where the surface faces, and its lean back."
+        ),
+    ] = None,
+    export: Annotated[
+        Literal["undistorted"] | None,
+        typer.Option(
+            help="Then write for other programs: pictures without refraction and distortion, with "
+            "the COLMAP model and nerfstudio's transforms.json."
+        ),
+    ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="EPSG:N",
+            help="Then write rasters, cloud, mesh and track in this projected system too.",
+        ),
+    ] = None,
+    threads: Threads = None,
+    scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Turn pictures into a model.
+
+    Camera track, DEM, point cloud, orthomosaic and textured mesh.
+    """
+    if context.invoked_subcommand is None:
+        from alice_survey.app.pipeline import run
+        from alice_survey.core.stages import names
+
+        stages = names("calibrate", "reconstruct")
+        with executor_on(workspace, threads, scheduler, cluster, device) as executor:
+            text, values = run(stages, workspace, survey, None, executor, planes=plane)
+            if export is not None:
+                from reconstruct.export.undistorted import export_undistorted
+
+                more, values[export] = export_undistorted(workspace, executor)
+                text = f"{text}\n{more}"
+        if crs is not None:
+            from reconstruct.export.projected import export_projected
+
+            more, values["crs"] = export_projected(workspace, crs)
+            text = f"{text}\n{more}"
+        print_result(text, values, as_json)
+
+
+@reconstruct_app.command(
+    epilog=examples(
+        "reconstruct pair left.png right.png --rig rig.json -o stingray",
+        "reconstruct pair left.png right.png --rig rig.json -o ray --near 0.8 --far 2.5",
+    )
+)
+def pair(
+    left: Annotated[Path, typer.Argument(help="Picture of the rig's first camera, as taken.")],
+    right: Annotated[
+        Path, typer.Argument(help="Picture of the second camera, of the same moment.")
+    ],
+    rig: Annotated[Path, typer.Option(help="The rig.json of these cameras.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")] = Path("pair"),
+    near: Annotated[float | None, typer.Option(min=0.01, help="Nearest distance, m.")] = None,
+    far: Annotated[float | None, typer.Option(min=0.01, help="Farthest distance, m.")] = None,
+    scale: Annotated[
+        float | None, typer.Option(min=0.05, max=1, help="Shrink pictures for matching.")
+    ] = None,
+    triangles: Annotated[int, typer.Option(min=100, help="Most that the mesh has.")] = 200_000,
+    as_json: AsJson = False,
+) -> None:
+    """Reconstruct one stereo pair.
+
+    Depth and its sigma, cloud and textured mesh of what both pictures show; 'alice-survey measure'
+    then gives lengths.
+    """
+    from reconstruct.station.pair import reconstruct_pair
+
+    result = reconstruct_pair(
+        left, right, rig, output, near_m=near, far_m=far, scale=scale, triangles=triangles
+    )
+    print_result(*result, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "measure stingray --points '1210,804 1893,850'",
+        "measure reef --points 'left/000012.png:301,255 left/000012.png:640,270' --json",
+    )
+)
+def measure(
+    points: Annotated[
+        str,
+        typer.Option(
+            help="Two or more: 'x,y' in the left picture of a pair, 'IMAGE:x,y' in a workspace, "
+            "or 'IMAGE:x,y=IMAGE:x,y' where two pictures show the spot."
+        ),
+    ],
+    pick_sigma: Annotated[float, typer.Option(min=0, help="Sigma of a picked pixel, px.")] = 0.0,
+    n_water_sigma: Annotated[
+        float, typer.Option(min=0, help="Of the water's index, where the rig does not say.")
+    ] = 0.0,
+    workspace: Workspace = WORK,
+    as_json: AsJson = False,
+) -> None:
+    """Measure between picked pixels.
+
+    The distance of two points with its sigma; of more, their path and the area they enclose.
+    """
+    from reconstruct.station.measure import measure as measured
+
+    result = measured(workspace, points, pick_sigma_px=pick_sigma, n_water_sigma=n_water_sigma)
+    print_result(*result, as_json)
+
+
+@app.command(epilog=examples("control -w reef", "control -w reef --dictionary DICT_5X5_250"))
+def control(
+    workspace: Workspace = WORK,
+    dictionary: Annotated[
+        str | None, typer.Option(help="Of the coded markers; found out when not given (slow).")
+    ] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find coded markers, and prepare the picking of control points.
+
+    Known points, bars and markers stand in WORKSPACE/control.csv; the next 'reconstruct' places
+    and scales the model by those for control, and scores those for check.
+    """
+    from reconstruct.placing.markers import survey_control
+
+    result = survey_control(workspace, dictionary=dictionary, executor=executor_of(threads))
+    print_result(*result, as_json)
+
+
+@app.command(epilog=examples("quality -w reef", "quality -w reef --json"))
+def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJson = False) -> None:
+    """Judge the pictures.
+
+    Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
+    """
+    from reconstruct.pictures.quality_sheet import quality_report
+
+    print_result(*quality_report(workspace, executor_of(threads)), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
+        "scale -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
+    )
+)
+def scale(
+    points: Annotated[
+        str,
+        typer.Option(
+            help="Two points: 'x,y,z x,y,z', or spots in pictures, 'IMAGE:x,y IMAGE:x,y'."
+        ),
+    ],
+    length: Annotated[float, typer.Option(min=1e-6, help="Their true distance, m.")],
+    workspace: Workspace = WORK,
+) -> None:
+    """Scale a model by a known length."""
+    from reconstruct.placing.scale import scale_model
+
+    typer.echo(scale_model(workspace, points, length))
+
+
+@app.command(
+    epilog=examples(
+        "evaluate -w reef",
+        "evaluate -w reef --reference laser.laz",
+        "evaluate -w reef --against last_year --json",
+    )
+)
+def evaluate(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="A cloud (LAZ, LAS, PLY) or DEM (GeoTIFF) instead.")
+    ] = None,
+    free_scale: Annotated[
+        bool | None,
+        typer.Option("--free-scale/--hold-scale", help="Fit the scale to the reference too."),
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="Workspace of an earlier survey of the site.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for these two.")
+    ] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score a survey.
+
+    A simulated one against its truth: camera track, surface, mosaic, mesh. A real one against
+    a reference, or against an earlier survey: what has changed, how surely, and its volume.
+    """
+    if reference is not None:
+        from reconstruct.evaluate.reference import evaluate_reference
+
+        result = evaluate_reference(workspace, reference, free_scale=free_scale, out=output)
+    elif against is not None:
+        from reconstruct.evaluate.against import evaluate_against
+
+        result = evaluate_against(workspace, against, output)
+    else:
+        from alice_survey.app.pipeline import run
+
+        result = run(["evaluate"], workspace, survey, None, executor_of(threads))
+    print_result(*result, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "mosaic-tiles -w reef -o tiles", "mosaic-tiles -w reef -o tiles --side 32767 --kind tif"
+    )
+)
+def mosaic_tiles(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    workspace: Workspace = WORK,
+    side: Annotated[int, typer.Option(min=256, max=32_767, help="Side of a tile, px.")] = 8192,
+    overlap: Annotated[int, typer.Option(min=0, help="Overlap of neighbours, px.")] = 0,
+    kind: Annotated[Literal["png", "jpg", "tif"], typer.Option(help="Format.")] = "png",
+    scale_bar: Annotated[
+        bool, typer.Option("--scale-bar", help="Draw one into every tile.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Cut the mosaic for annotation tools.
+
+    Tiles that TagLab, BIIGLE and others take, each with a world file; tiles.csv lists their scale.
+    """
+    from reconstruct.mosaic.annotation import mosaic_tiles as cut
+
+    result = cut(
+        workspace, output, side_px=side, overlap_px=overlap, kind=kind, scale_bar=scale_bar
+    )
+    print_result(*result, as_json)

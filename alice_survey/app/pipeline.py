@@ -1,0 +1,395 @@
+"""The whole loop: which stages run, their results, and the state of a workspace."""
+
+import contextlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from filelock import FileLock, Timeout
+
+from alice_survey.core import stages as survey_stages
+from alice_survey.core.artefacts import read_json, read_stage
+from alice_survey.core.config import (
+    SurveyConfig,
+    changed,
+    load_config,
+    parse_config,
+    parse_current,
+    parse_health,
+    settings_in,
+)
+from alice_survey.core.errors import ConfigError, WorkspaceError, warn
+from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.run.progress import part
+from alice_survey.core.stages import is_imported, names, spec
+
+if TYPE_CHECKING:
+    from alice_survey.core.settings_text import Values
+
+_VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightChanges:
+    """Flight settings that the command line may override; None leaves the setting."""
+
+    vehicle: str | None = None
+    controller: str | None = None
+    current: str | None = None
+    """SPEED@DIRECTION."""
+    failed: Sequence[str] | None = None
+    """NAME of a thruster that has failed, NAME=SHARE that is left of it, NAME:propeller of
+    one that turns on, either @SECONDS."""
+    dive: int | None = None
+    """Number of the dive to fly, from 1."""
+    mission: Path | None = None
+    """Mission file to fly instead of the plan's route."""
+    follower: Literal["cola2", "ardusub"] | None = None
+    """Autopilot by whose law it is flown."""
+
+    def applied(self, config: SurveyConfig) -> SurveyConfig:
+        """The survey with these changes.
+
+        Raises:
+            ConfigError: a value is not allowed.
+        """
+        speed, towards = parse_current(self.current)
+        if self.current is not None:  # instead of a measured one
+            sea = config.sea.model_copy(update={"current_file": None})
+            config = config.model_copy(update={"sea": sea})
+        config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
+        health = parse_health(self.failed)
+        return changed(
+            config, "vehicle",
+            name=self.vehicle, controller=self.controller,
+            thruster_health=health.at_start, failures=health.later,
+            lost_propellers=health.propellers, dive=self.dive,
+            mission_file=self.mission, follower=self.follower,
+        )  # fmt: skip
+
+
+def run(
+    stages: Sequence[str],
+    workspace: Path,
+    survey: Path | None,
+    scale: int | None = None,
+    executor: Executor | None = None,
+    flight: FlightChanges | None = None,
+    planes: Sequence[str] | None = None,
+) -> tuple[str, dict[str, Any]]:
+    """Run stages one after the other; those that are up to date are skipped.
+
+    Args:
+        stages: names in order.
+        workspace: folder of the survey.
+        survey: settings file; None looks for survey.toml in the workspace, then here.
+        scale: overrides `imaging.scale`.
+        executor: where tasks run; None for all cores of this machine.
+        flight: overrides vehicle and sea.
+        planes: overrides `reconstruct.planes`.
+
+    Returns:
+        Results of each stage, as text and as JSON values.
+    """
+    stages = [spec(stage).name for stage in stages]
+    imported = is_imported(workspace)
+    simulated = all(spec(stage).simulated for stage in stages)
+    config = settings(workspace, survey, needed=not imported, simulated=simulated)
+    as_written = config
+    planned = config = changed(config, "imaging", scale=scale)
+    if planned.imaging.scale != as_written.imaging.scale:
+        warn(
+            f"--scale {scale} holds for this run alone, the next without it renders the pictures "
+            f"again: to keep it, put scale = {scale} below [imaging] in survey.toml"
+        )
+    if flight is not None and flight != FlightChanges():
+        config = flight.applied(config)
+        warn("these options hold for this run alone: to keep them, put them into survey.toml")
+    if planes:
+        config = changed(config, "reconstruct", planes=list(planes))
+        if config.reconstruct.planes != planned.reconstruct.planes:
+            warn(
+                "these planes hold for this run alone, the next without them makes the surface "
+                f"again: to keep them, put planes = {json.dumps(list(planes))} below "
+                "[reconstruct] in survey.toml"
+            )
+    if imported:
+        if len(stages) > 1:  # a rig of real pictures comes with them
+            stages = [stage for stage in stages if stage != "calibrate"]
+        for stage in map(spec, stages):
+            if stage.simulated:
+                raise WorkspaceError(
+                    f"{workspace} holds imported pictures; '{stage.command}' is for simulated "
+                    "surveys: choose another workspace with -w"
+                )
+    from alice_survey.app.computing import task_memory_mib
+
+    lines, found = [], {}
+    executor = executor or local_executor()
+    with only_one(workspace):
+        if "fly" in stages and "plan" not in stages:
+            by = flight or FlightChanges()  # what a plan may have been made with
+            alike = [planned, changed(planned, "vehicle", name=by.vehicle)]
+            alike.append(changed(alike[1], "vehicle", controller=by.controller))
+            states = [spec("plan").state(workspace, one, {}) for one in alike]
+            if all(state.startswith("stale") for state in states):
+                warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
+        for number, stage in enumerate(map(spec, stages), 1):
+            with part(stage.folder, number, len(stages)):
+                task_mib = task_memory_mib(stage.name, workspace, config)
+                done = stage.make(workspace, config, replace(executor, task_mib=task_mib))
+            text, data = stage.summary(workspace / stage.folder)
+            found[stage.name] = {"done": done, **data}
+            lines.append(f"{stage.name}: {text}" if done else f"{stage.name}: (up to date) {text}")
+    return "\n".join(lines), found
+
+
+def plan_report(
+    workspace: Path,
+    survey: Path | None,
+    *,
+    every_setting: bool = False,
+    vehicle: str | None = None,
+) -> tuple[str, dict[str, Any]]:
+    """Plan a survey, and show its main settings; or every one with its equation and source.
+
+    A vehicle by name or file counts for this plan instead of the survey's.
+
+    What imaging and reconstruction will take on this machine follows.
+    """
+    from alice_survey.app.computing import GROUPS
+    from missions.plan.rows import main_settings
+
+    text, found = run(["plan"], workspace, survey, flight=FlightChanges(vehicle=vehicle))
+    cost, found["cost"] = _predicted(workspace, survey, GROUPS)
+    folder = workspace / "plan"
+    if every_setting:
+        table = (folder / "settings.txt").read_text(encoding="utf-8")
+    else:
+        table = main_settings(read_json(folder / "plan.json"))
+    return f"{table}\n{text}\n{cost}", found
+
+
+def _predicted(
+    workspace: Path,
+    survey: Path | None,
+    groups: Mapping[str, Sequence[str]],
+    workers: int | None = None,
+    done: Sequence[str] = (),
+) -> tuple[str, dict[str, Any]]:
+    """What groups of stages of a workspace will take; the stages that are done correct it."""
+    from alice_survey.app.computing import summary, workspace_size
+
+    config = settings(workspace, survey, needed=not is_imported(workspace))
+    size = workspace_size(
+        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
+    )
+    if size is None:
+        return "", {}
+    records = {name: read_stage(workspace / spec(name).folder) for name in done}
+    made = {name: record for name, record in records.items() if record is not None}
+    return summary(size, groups, workers=workers, records=made)
+
+
+def settings(
+    workspace: Path, survey: Path | None, *, needed: bool, simulated: bool = True
+) -> SurveyConfig:
+    """The settings of a workspace.
+
+    Args:
+        workspace: folder of the survey.
+        survey: the file; None looks for survey.toml in the workspace, then here.
+        needed: whether there must be one.
+        simulated: whether they are for stages of simulated surveys alone.
+
+    Raises:
+        ConfigError: the file is wrong, or none is there though it is needed.
+    """
+    if survey is not None:
+        return load_config(survey)
+    for path in (workspace / "survey.toml", Path("survey.toml")):
+        if path.is_file():
+            return load_config(path)
+    if not needed:
+        return SurveyConfig()
+    if not simulated and _holds_pictures(workspace):
+        raise ConfigError(
+            f"{workspace} holds pictures, but not a survey: 'alice-survey import-images "
+            f"{workspace} -w WORKSPACE' makes one of them"
+        )
+    raise ConfigError(
+        f"no survey.toml in {workspace} or here: 'alice-survey init {workspace}' writes one"
+    )
+
+
+def _holds_pictures(folder: Path) -> bool:
+    """Whether a folder holds pictures or videos, itself or in folders below."""
+    from reconstruct.pictures.files import PLAIN, RAW, TIFF
+
+    suffixes = {*PLAIN, *TIFF, *RAW, *_VIDEOS}
+    return any(path.suffix.lower() in suffixes for path in folder.rglob("*"))
+
+
+def init_survey(
+    folder: Path,
+    template: str = "survey.toml",
+    area: Path | None = None,
+    *,
+    name: str | None = None,
+    values: "Values | None" = None,
+) -> Path:
+    """Write a commented settings file, never over one that is there.
+
+    Args:
+        folder: where to.
+        template: which.
+        area: a file with the area to survey instead of the template's.
+        name: of the survey.
+        values: settings instead of the template's.
+
+    Raises:
+        WorkspaceError: the file exists, the folder cannot be written, or the area is missing.
+        ConfigError: a value is not one that a survey may have.
+    """
+    if area is not None and not area.is_file():
+        raise WorkspaceError(f"{area}: no such file")
+    path = folder / "survey.toml"
+    if path.exists():
+        raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
+    from alice_survey.core.settings_text import with_settings_changed
+
+    text = template_text(template)
+    if name is not None:
+        line = f"name = {json.dumps(name)}"  # the first, before all sections
+        text = re.sub(r'^name = ".*"', lambda _: line, text, count=1, flags=re.M)
+    if values:
+        text = with_settings_changed(text, values)
+    parse_config(settings_in(text, "the new survey"), "the new survey")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(text if area is None else _with_area(text, area, folder), encoding="utf-8")
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
+
+
+def template_text(template: str = "survey.toml") -> str:
+    """The commented settings that a new survey starts from."""
+    return (resources.files("alice_survey") / template).read_text(encoding="utf-8")
+
+
+def _with_area(text: str, area: Path, folder: Path) -> str:
+    """Settings whose rectangle is replaced by the area of a file, named from the folder."""
+    rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg", "datum_at")
+    own = re.compile(rf"^(?=({'|'.join(rectangle)}) = )", re.MULTILINE)
+    try:
+        named = Path(os.path.relpath(area.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        named = area.resolve().as_posix()
+    return re.sub(
+        r"^# file = .*$",
+        lambda _: f"file = {json.dumps(named)}",
+        own.sub("# ", text),
+        count=1,
+        flags=re.M,
+    )
+
+
+def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str, Any]]:
+    """Run the whole loop on the built-in survey, and report where its pictures are."""
+    if not (workspace / "survey.toml").exists():
+        init_survey(workspace, "demo.toml")
+    text, found = run(names(), workspace, None, None, executor)
+    rows = [
+        f"  {stage.name:12} {workspace / stage.folder / stage.picture}"
+        for stage in survey_stages.STAGES
+        if stage.picture
+    ]
+    page = f"  {'all of it':12} {workspace / 'report' / 'report.html'}"
+    return "\n".join([text, "", "To look at:", *rows, page]), found
+
+
+def stage_states(workspace: Path, config: SurveyConfig) -> dict[str, str]:
+    """State of each stage that the survey of a workspace has, as `StageSpec.state` gives it."""
+    imported = is_imported(workspace)
+    states: dict[str, str] = {}
+    for stage in survey_stages.STAGES:
+        if not (imported and stage.simulated and stage.name != "image"):
+            states[stage.name] = stage.state(workspace, config, states)
+    return states
+
+
+def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
+    """State of a workspace, stage by stage, and the next command."""
+    if not workspace.is_dir():
+        raise WorkspaceError(f"{workspace}: no such folder; 'alice-survey init' makes one")
+    imported = is_imported(workspace)
+    config = settings(workspace, survey, needed=not imported)
+    states = stage_states(workspace, config)
+    rows = []
+    for stage in map(spec, states):
+        record = read_stage(workspace / stage.folder)
+        took = f"{record.took_s:8.1f} s" if record else " " * 10
+        rows.append(f"{stage.name:10} {stage.folder + '/':13} {states[stage.name]:32} {took}")
+    pending = [name for name, state in states.items() if state != "up to date"]
+    command = f"alice-survey {spec(pending[0]).command} -w {workspace}" if pending else None
+    after = f"next: {command}" if command else "nothing is left to do"
+    return "\n".join([*rows, after]), {"stages": states, "next": command}
+
+
+def status_report(
+    workspace: Path, survey: Path | None, workers: int | None = None
+) -> tuple[str, dict[str, Any]]:
+    """State of a workspace, and what the stages that are left will take.
+
+    Args:
+        workspace: folder of the survey.
+        survey: its settings; None looks for survey.toml in the workspace, then here.
+        workers: of a cluster that does them; None for all cores of this machine.
+    """
+    from alice_survey.app.computing import PREDICTED
+
+    text, found = workspace_status(workspace, survey)
+    states = found["stages"]
+    left = [name for name in PREDICTED if states.get(name, "up to date") != "up to date"]
+    if not left:
+        return text, found
+    done = [name for name, state in states.items() if state == "up to date"]
+    cost, found["cost"] = _predicted(workspace, survey, {"left": left}, workers, done)
+    return "\n".join(filter(None, (text, cost))), found
+
+
+def is_locked(workspace: Path) -> bool:
+    """Whether a command is working in a workspace now."""
+    lock = workspace / ".lock"
+    if not lock.is_file():
+        return False
+    try:
+        with FileLock(lock, timeout=0):
+            return False
+    except Timeout:
+        return True
+    except OSError:  # of a workspace that cannot be written, where nothing works either
+        return False
+
+
+@contextlib.contextmanager
+def only_one(workspace: Path) -> Iterator[None]:
+    """Lock the workspace so that no second run writes into it."""
+    lock = FileLock(workspace / ".lock", timeout=0)
+    try:
+        workspace.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout:
+        raise WorkspaceError(f"another command is working in {workspace}; wait for it") from None
+    except OSError as error:
+        raise WorkspaceError(f"{workspace} cannot be written: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        lock.release()

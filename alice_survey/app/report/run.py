@@ -1,0 +1,137 @@
+"""The stage `report`: `report.html`, `report.pdf` and `report.json` of whatever is there."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from alice_survey.app.report.figures import Figures
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.mesh_copy import mesh_copy
+from alice_survey.app.report.rasters import picture_layers
+from alice_survey.app.report.sections import sections
+from alice_survey.app.report.shapes import shape_layers
+from alice_survey.app.report.verdicts import facts, summary, verdicts
+from alice_survey.core.artefacts import STAGE_FILE, atomic_path
+from alice_survey.core.executor import Executor
+from alice_survey.core.records import ReportRecord
+from alice_survey.core.run import progress
+from alice_survey.kit.document import OWN_AXES, PictureLayer, Report, ShapeLayer, SurveyMap
+from alice_survey.kit.map_figure import with_stills
+from alice_survey.kit.page import render_html
+from alice_survey.kit.paper import render_pdf
+
+
+def run_report(workspace: Path, folder: Path, executor: Executor) -> None:
+    """Write the report of what the workspace holds."""
+    held = Held.of(workspace)
+    report, data = build_report(held, folder)
+    with progress.step("write the page"), atomic_path(folder / "report.html") as path:
+        path.write_text(render_html(report), encoding="utf-8")
+    with progress.step("write the PDF"), atomic_path(folder / "report.pdf") as path:
+        path.write_bytes(render_pdf(report, last_worked_on(held)))
+    ReportRecord.save(folder / "report.json", data)
+    if report.mesh is not None:
+        report.mesh.glb.unlink()
+
+
+def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
+    """The report, and the same numbers for programs.
+
+    Args:
+        held: the workspace.
+        folder: for the mesh's light copy.
+    """
+    figures = Figures(held=held)
+    found = verdicts(figures)
+    said, known = summary(figures, found), facts(figures)
+    with progress.step("draw the maps"):
+        layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
+        chart = None
+        if layers:
+            chart = with_stills(survey_map(held, layers))
+    mesh = mesh_copy(held, folder / "mesh.glb")
+    parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
+    report = Report(
+        title=held.name,
+        subtitle=_subtitle(held),
+        summary=said,
+        facts=known,
+        verdicts=found,
+        sections=parts,
+        map=chart,
+        mesh=mesh,
+        citation=_title_block(held),
+    )
+    return report, _data(figures, found, said, known)
+
+
+def _subtitle(held: Held) -> str:
+    kind = "simulated survey" if held.simulated else "survey"
+    when = f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"
+    place = _place(held)
+    return f"{kind}; {place}; last worked on {when}" if place else f"{kind}; last worked on {when}"
+
+
+def last_worked_on(held: Held) -> datetime:
+    """When the newest of its stages was finished."""
+    newest = max((held.workspace / n / STAGE_FILE).stat().st_mtime for n in held.stages)
+    return datetime.fromtimestamp(newest, UTC)
+
+
+def _place(held: Held) -> str:
+    """Latitude and longitude of the survey; empty where unknown."""
+    datum = held.frame.datum
+    if datum is None:
+        return ""
+    return f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84)"
+
+
+def _title_block(held: Held) -> list[tuple[str, str]]:
+    """Citation details of the report."""
+    program = f"alice-survey {version('alice-survey')}"
+    rows = [
+        ("Survey", "simulated" if held.simulated else "of pictures that were taken"),
+        ("Last worked on", f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"),
+        ("Position", _place(held)),
+        ("Software", f"{program}; versions of its libraries are in the last section"),
+        ("Cite as", f"{held.name}, survey report, {program}, {last_worked_on(held):%Y-%m-%d}"),
+    ]
+    return [row for row in rows if row[1]]
+
+
+def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> SurveyMap:
+    """The map of a workspace, with some layers."""
+    datum = held.frame.datum
+    if held.plane is not None:
+        origin = f"the plane {held.plane.name}, {held.plane.about}: right and up in it"
+        return SurveyMap(layers=layers, unit=held.unit, origin=origin, axes=("right", "up"))
+    if datum is None or held.frame.name != "ned":
+        return SurveyMap(
+            layers=layers, unit=held.unit, origin="the model's own axes", axes=OWN_AXES
+        )
+    place = f"{datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"
+    return SurveyMap(layers=layers, unit=held.unit, origin=f"metres east and north of {place}")
+
+
+def _data(figures: Figures, found: Any, said: Any, known: Any) -> dict[str, Any]:
+    surface = figures.surface
+    return {
+        "format": "alice-survey report",
+        "version": 1,
+        "name": figures.held.name,
+        "unit": figures.held.unit,
+        "summary": dict(said),
+        "facts": dict(known),
+        "verdicts": [vars(verdict) for verdict in found],
+        "surface": None if surface is None else _finite(vars(surface)),
+        "stages": {
+            name: {"version": stage.version, "digest": stage.digest, "took_s": stage.took_s}
+            for name, stage in figures.held.stages.items()
+        },
+    }
+
+
+def _finite(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if value == value else None for name, value in values.items()}

@@ -1,0 +1,261 @@
+"""What the tab of the model asks for: values at a place, profiles, measures, the mesh."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from alice_survey.app.report.colours import number_rasters
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.mesh_copy import mesh_about
+from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
+from alice_survey.core.config import Config
+from alice_survey.core.errors import AliceError
+from alice_survey.core.records import MeshRecord
+from reconstruct.measure.errors import SharedErrors
+from reconstruct.measure.export import Measurement, as_csv, as_geojson
+from reconstruct.measure.figures import Measured
+from reconstruct.measure.lines import measure_line, measure_points, profile
+from reconstruct.measure.polygons import measure_polygon, quadrats
+from reconstruct.measure.surface import MOSAIC, RASTERS, MeasuredSurface, values_at
+
+_MOST_PLACES = 2000
+_MOST_MEASURES = 1000
+_READ = (*RASTERS, "mosaic/mosaic_source.tif", "sparse/frame.json", "sparse/covariance.npz",
+         "sparse/registration.json", "sparse/track.csv", "dense/surface.json", "dense/plane.json",
+         "dense/stage.json", "sparse/stage.json")  # fmt: skip
+"""Files that figures are of."""
+_MOST_DRAWN = 1200
+"""Samples of a profile that a page draws."""
+_OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", ""),
+         "dense/lower.tif": ("Lowest surface", None),
+         "mosaic/coverage.tif": ("Pictures", ""),
+         MOSAIC: ("Colour", "red, green, blue")}  # fmt: skip
+"""Titles and units of rasters that are no layers of numbers; None is the unit of lengths."""
+
+Place = tuple[float, float]
+
+
+class AskedProfile(Config):
+    """A line on the surface."""
+
+    places: list[Place] = Field(min_length=2, max_length=_MOST_PLACES)
+
+
+class AskedMeasure(Config):
+    """A line, points in space, or a polygon."""
+
+    kind: Literal["line", "points", "polygon"]
+    places: list[tuple[float, ...]] = Field(min_length=2, max_length=_MOST_PLACES)
+    base: float | Literal["rim"] | None = None
+    """Plane of a polygon's volume."""
+    quadrat: float | None = Field(None, gt=0)
+    """Side of quadrats within a polygon."""
+
+
+class ExportedFigure(Config):
+    """A figure as it was measured."""
+
+    name: str
+    title: str
+    value: float | None
+    sigma: float | None
+    own: float | None
+    shared: float | None
+    unit: str
+
+
+class ExportedMeasure(Config):
+    """A measurement as the page keeps it."""
+
+    name: str = Field(max_length=200)
+    kind: Literal["line", "points", "polygon"]
+    places: list[tuple[float, ...]] = Field(min_length=1, max_length=_MOST_PLACES)
+    figures: list[ExportedFigure] = Field(max_length=100)
+    notes: list[str] = Field(default=[], max_length=20)
+
+
+class AskedExport(Config):
+    """Measurements to write."""
+
+    form: Literal["csv", "geojson"]
+    measures: list[ExportedMeasure] = Field(min_length=1, max_length=_MOST_MEASURES)
+
+
+def plane_json(held: Held) -> dict[str, Any] | None:
+    """Axes of the plane that the map is of, east, north, up; None of the level one."""
+    plane = held.plane
+    return None if plane is None else {
+        "origin": plane.origin_enu, "right": plane.right_enu, "up": plane.up_enu,
+        "out": plane.out_enu,
+    }  # fmt: skip
+
+
+class _ModelTab:
+    def __init__(self, studio: Studio) -> None:
+        self.studio = studio
+        self._kept = KeptValue(lambda: MeasuredSurface.of(studio.workspace.folder))
+
+    @contextmanager
+    def _surface(self) -> Iterator[MeasuredSurface]:
+        """The surface as it is now; what is replaced meanwhile is the page's to load again."""
+        with self._unchanged() as state:
+            if not self.studio.workspace.has("dense/dem.tif"):
+                raise FileNotFoundError("dense/dem.tif")
+            yield self._kept.of(state)
+
+    @contextmanager
+    def _unchanged(self) -> Iterator[tuple[str, ...]]:
+        """Tokens of the files that figures are of; a link among them is refused."""
+        workspace = self.studio.workspace
+        for path in _READ:
+            if (workspace.folder / path).exists() and not workspace.has(path):
+                raise AliceError(f"{path} is, or lies behind, a link: files of a survey are none")
+        with workspace.unchanged(_READ) as state:
+            yield state
+
+    def value(self, call: Call) -> dict[str, Any]:
+        """Value and sigma of every raster at a place."""
+        place = (call.number("east"), call.number("north"))
+        workspace = self.studio.workspace
+        with self._unchanged():
+            files = [path for path in RASTERS if workspace.has(path)]
+            found = values_at(workspace.folder, place, files)
+        unit = Held.of(workspace.folder).unit
+        numbers = {one.file: one for one in number_rasters(unit)}
+        rows = []
+        for file, values in found.items():
+            if file in numbers:
+                one = numbers[file]
+                title, what = one.title, one.label.partition(", ")[2].replace("degrees", "°")
+                value: Any = one.factor * values[0]
+            else:
+                title, other = _OTHERS[file]
+                what = unit if other is None else other
+                value = [round(v) for v in values] if file == MOSAIC else values[0]
+            rows.append({"file": file, "title": title, "value": value, "unit": what})
+        height, sigma = (found.get(f"dense/{name}.tif") for name in ("dem", "sigma"))
+        return {
+            "values": rows,
+            "height": None if height is None else height[0],
+            "sigma": None if sigma is None else sigma[0],
+            "unit": unit,
+        }
+
+    def about(self, call: Call) -> dict[str, Any]:
+        """What is measured on, and what sigmas count."""
+        with self._surface() as surface:
+            errors: SharedErrors = surface.errors
+            return {
+                "unit": surface.unit,
+                "cell": surface.grid.cell,
+                "axes": surface.axes,
+                "plane": None if surface.plane.is_level else surface.plane.about,
+                "notes": errors.notes,
+                "vertical_datum": surface.frame.vertical_datum,
+            }
+
+    def profile(self, call: Call) -> dict[str, Any]:
+        """Heights along a line with their sigmas, thinned to what a page draws."""
+        asked = call.read(AskedProfile)
+        with self._surface() as surface:
+            found = profile(surface, asked.places)
+            sigma = found.samples.sigma
+            step = max(1, -(-len(found.along) // _MOST_DRAWN))
+            kept = np.unique(
+                [*range(0, len(found.along), step), *found.corners, len(found.along) - 1]
+            )
+            return {
+                "along": found.along[kept].tolist(),
+                "height": found.samples.height[kept].tolist(),
+                "sigma": sigma[kept].tolist(),
+                "places": found.samples.places[kept].tolist(),
+                "corners": [float(found.along[n]) for n in found.corners],
+                "every": step,
+                "unit": surface.unit,
+            }
+
+    def measure(self, call: Call) -> dict[str, Any]:
+        """All figures of a line, of points in space, or of a polygon."""
+        asked = call.read(AskedMeasure)
+        size = 3 if asked.kind == "points" else 2
+        if any(len(place) != size for place in asked.places):
+            raise AliceError(f"the request: places of {asked.kind!r} have {size} numbers")
+        notes: tuple[str, ...] = ()
+        squares: list[dict[str, Any]] = []
+        figures: tuple[Measured, ...]
+        with self._surface() as surface:
+            if asked.kind == "line":
+                figures = measure_line(surface, asked.places)
+            elif asked.kind == "points":
+                figures, notes = measure_points(surface, asked.places)
+            else:
+                figures, notes = measure_polygon(surface, asked.places, asked.base)
+                if asked.quadrat is not None:
+                    found = quadrats(surface, asked.places, asked.quadrat)
+                    squares = [
+                        {
+                            "places": square.vertices,
+                            "figures": [one.to_json() for one in square.figures],
+                        }
+                        for square in found
+                    ]
+            return {
+                "figures": [one.to_json() for one in figures],
+                "notes": notes,
+                "quadrats": squares,
+                "unit": surface.unit,
+            }
+
+    def export(self, call: Call) -> Content:
+        """Measurements of the page as a file."""
+        asked = call.read(AskedExport)
+        measurements = [
+            Measurement(
+                name=one.name, kind=one.kind, places=one.places, notes=one.notes,
+                figures=[figure.model_dump() for figure in one.figures],
+            )
+            for one in asked.measures
+        ]  # fmt: skip
+        if asked.form == "csv":
+            text, kind = as_csv(measurements), "text/csv; charset=utf-8"
+        else:
+            with self._surface() as surface:
+                placed = surface.frame.name == "ned" and surface.plane.is_level
+                datum = surface.frame.datum if placed else None
+                text = as_geojson(measurements, datum, surface.unit)
+            kind = "application/geo+json"
+        return Content(data=text.encode(), kind=kind, name=f"measures.{asked.form}")
+
+    def mesh(self, call: Call) -> dict[str, Any]:
+        """Where the mesh is to be had, and how its points lie on the map."""
+        workspace = self.studio.workspace
+        held = Held.of(workspace.folder)
+        record = held.read(MeshRecord)
+        if record is None or not workspace.has("mesh/mesh.glb"):
+            raise FileNotFoundError("mesh/mesh.glb")
+        tiles = "mesh/tiles/tileset.json"
+        return {
+            "address": f"/mesh.glb?v={workspace.token('mesh/mesh.glb')}",
+            "about": mesh_about(record),
+            "triangles": record.triangles,
+            "still": "/files/mesh/mesh.png" if workspace.has("mesh/mesh.png") else None,
+            "tiles": f"/files/{tiles}" if workspace.has(tiles) else None,
+            "offset": record.offset_east_north_up,
+            "plane": plane_json(held),
+        }
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """Of the model."""
+    model = _ModelTab(studio)
+    return (
+        Endpoint(path="/api/model/about", answer=model.about),
+        Endpoint(path="/api/model/value", answer=model.value),
+        Endpoint(path="/api/model/mesh", answer=model.mesh),
+        Endpoint(path="/api/model/profile", answer=model.profile, method="POST"),
+        Endpoint(path="/api/model/measure", answer=model.measure, method="POST"),
+        Endpoint(path="/api/model/export", answer=model.export, method="POST", most_bytes=16 << 20),
+    )

@@ -1,0 +1,442 @@
+"""The studio's pictures: which show a place, picks and control in them, lengths between spots."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
+from alice_survey.app.studio.taken_pictures import TILE_PX, levels_of
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.config import Config
+from alice_survey.core.errors import AliceError, ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import ControlRecord, MappingRecord
+from reconstruct.picking.lengths import Lengths, spot_residuals
+from reconstruct.picking.preview import preview_control
+from reconstruct.picking.refine import refine
+from reconstruct.picking.registered import RegisteredPictures, Sight
+from reconstruct.picking.surface import ModelSurface, SurfacePlace
+from reconstruct.placing.control_file import (
+    CONTROL_FILE,
+    MARKERS_FILE,
+    PICKS_FILE,
+    Control,
+    Pick,
+    read_control,
+    read_picks,
+)
+from reconstruct.placing.control_tables import (
+    save_control,
+    save_picks,
+    table_token,
+)
+from reconstruct.placing.picked_points import Spot, find_spots
+from reconstruct.placing.scale import note_scale
+
+T = TypeVar("T")
+_MOST_LISTED = 500
+_MOST_SEEING = 60
+_MODEL = ("sparse/cameras.json", "sparse/model/images.bin", "sparse/frame.json")
+
+Name = Annotated[str, Field(min_length=1, max_length=1000)]
+Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+
+
+class _AskedPick(Config):
+    """Pixels count from 0 at the middle of the first, as in `picks.csv`."""
+
+    image: Name
+    point: Annotated[str, Field(max_length=200)] = "spot"
+    x: Pixel
+    y: Pixel
+    sigma_px: Annotated[float, Field(gt=0, le=100)] = 0.5
+    matched_to: Annotated[str, Field(max_length=1000)] = ""
+
+    @property
+    def pick(self) -> Pick:
+        return Pick(
+            image=self.image, point=self.point, x_px=self.x + 0.5, y_px=self.y + 0.5,
+            sigma_px=self.sigma_px, matched_to=self.matched_to,
+        )  # fmt: skip
+
+
+class _Refine(Config):
+    pick: _AskedPick
+    images: Annotated[list[Name], Field(max_length=_MOST_SEEING)] | None = None
+    """The best of those that see the spot where they are not named."""
+
+
+class _SavePicks(Config):
+    token: str
+    points: Annotated[list[Name], Field(max_length=1000)]
+    picks: Annotated[list[_AskedPick], Field(max_length=20_000)]
+
+
+class _SaveControl(Config):
+    token: str
+    rows: Annotated[
+        list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)
+    ]
+    names: Annotated[tuple[tuple[Name, Name], ...], Field(max_length=5000)] = ()
+
+
+class _AskedSpot(Config):
+    picks: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
+
+
+class _AskedEnds(Config):
+    """Two spots, each by the picks of it."""
+
+    first: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
+    second: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
+
+
+class _AskedScale(_AskedEnds):
+    length_m: Annotated[float, Field(gt=0)]
+
+
+class _OpenModel:
+    """A registered model, as long as its files are what they were."""
+
+    def __init__(self, studio: Studio) -> None:
+        folder = studio.workspace.folder
+        self.pictures = RegisteredPictures.read(folder)
+        self.surface = ModelSurface(folder)
+        self.lengths = Lengths(folder, self.pictures)
+        self.lock = threading.Lock()
+
+
+class _Tab:
+    def __init__(self, studio: Studio) -> None:
+        self._studio = studio
+        self._taken, self._writing = studio.taken, threading.Lock()
+        self._model = KeptValue(lambda: _OpenModel(studio))
+
+    # ---- Pictures ----
+
+    def listed(self, call: Call) -> dict[str, Any]:
+        """Pictures in the order of the manifest, some at a time, and where they were taken."""
+        records = list(self._taken.records().values())
+        words = call.query.get("find", "").lower()
+        found = [record for record in records if words in record.image.lower()]
+        first = _count(call, "first", 0)
+        model = self._read_model() if self._has_model() else None
+        return {
+            "total": len(found),
+            "pictures": [
+                self._about(record, model)
+                for record in found[first : first + _count(call, "count", 100, _MOST_LISTED)]
+            ],
+        }
+
+    def _about(self, record: ImageRecord, model: _OpenModel | None) -> dict[str, Any]:
+        place = None
+        if model is not None and record.image in model.pictures:
+            place = model.pictures.centres[model.pictures.row(record.image)].tolist()
+        return {
+            "name": record.image, "camera": record.camera, "station": record.station,
+            "registered": place is not None, "place": place,
+        }  # fmt: skip
+
+    def picture(self, call: Call) -> dict[str, Any]:
+        """Size and tiles of a picture."""
+        name = call.path["name"]
+        width, height = self._taken.size(name)
+        return {
+            "name": name, "width": width, "height": height, "tile": TILE_PX,
+            "levels": levels_of(width, height), "token": self._taken.token(name),
+        }  # fmt: skip
+
+    def tile(self, call: Call) -> Content:
+        """A tile of a picture as taken, WebP; level 0 is the coarsest."""
+        level, x, y = (call.whole(key) for key in ("level", "x", "y"))
+        name = call.path["name"]
+        token = self._taken.token(name)
+        wide, high = self._taken.size(name)
+        halvings = levels_of(wide, high) - 1 - level
+        if halvings < 0:
+            raise FileNotFoundError(name)
+        data = self._taken.tile(name, halvings, x, y)
+        return Content(data=data, kind="image/webp", tag=f"{token}-{level}-{x}-{y}")
+
+    def seeing(self, call: Call) -> dict[str, Any]:
+        """Pictures that see a place of the surface, the best first.
+
+        The place is north and east (`n`, `e`), or where the ray of a pixel (`image`, `x`, `y`)
+        meets the surface.
+        """
+        model = self._read_model()
+        place = self._place(model, call)
+        seen, hidden = _unhidden(model, place)
+        most = _count(call, "count", 24, _MOST_SEEING)
+        return {
+            "place": {
+                "n": place.point[0], "e": place.point[1], "down": place.point[2],
+                "sigma": place.sigma, "dense": model.surface.is_dense,
+            },
+            "total": len(seen), "hidden": hidden,
+            "pictures": [
+                {
+                    "name": one.image, "x": one.pixel[0] - 0.5, "y": one.pixel[1] - 0.5,
+                    "resolution": one.pixels_per_unit,
+                    "off_nadir_deg": float(np.degrees(one.off_nadir_rad)),
+                }
+                for one in seen[:most]
+            ],
+        }  # fmt: skip
+
+    def _place(self, model: _OpenModel, call: Call) -> SurfacePlace:
+        if "image" not in call.query:
+            return model.surface.below(call.number("n"), call.number("e"))
+        return self._met(model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5)
+
+    @staticmethod
+    def _met(model: _OpenModel, image: str, x_px: float, y_px: float) -> SurfacePlace:
+        size = model.pictures.warp(image).size_px
+        if not (0 <= x_px <= size[0] and 0 <= y_px <= size[1]):
+            raise ReconstructionError(
+                f"{image}: {x_px - 0.5:g}, {y_px - 0.5:g} is outside of its {size[0]} x {size[1]} "
+                "pixels"
+            )
+        start, way = model.pictures.picture(image).ray(np.array([x_px, y_px]))
+        if not np.isfinite(start + way).all():
+            raise ReconstructionError(f"{image}: that pixel is beyond the reach of the lens")
+        return model.surface.met_by(start, way)
+
+    # ---- Picks ----
+
+    def refine(self, call: Call) -> dict[str, Any]:
+        """A pick found again in other pictures; nothing is written."""
+        asked, model = call.read(_Refine), self._read_model()
+        pick = asked.pick.pick
+        place = self._met(model, pick.image, pick.x_px, pick.y_px)
+        images = asked.images
+        if images is None:
+            images = [s.image for s in _unhidden(model, place)[0]][: _MOST_SEEING // 3]
+        for image in images:
+            model.pictures.row(image)
+        found = refine(pick, images, place, model.pictures.picture, self._taken.grey)
+        return {
+            "picks": [_pick_json(one) for one in found.picks],
+            "matches": [
+                {"name": m.image, "correlation": m.correlation, "moved_px": m.moved_px}
+                for m in found.matches
+            ],
+            "refused": [{"name": one.image, "why": one.why} for one in found.refused],
+            "factor": found.factor,
+            "spot": None if found.spot is None else _spot_json(found.spot),
+        }
+
+    def picks(self, call: Call) -> dict[str, Any]:
+        """All picks, the spots that they show, residuals, and what control says to them."""
+        folder = self._studio.workspace.folder
+        own, coded = self._read(PICKS_FILE, read_picks), self._read(MARKERS_FILE, read_picks)
+        picks = [*(own or []), *(coded or [])]
+        control = self._read(CONTROL_FILE, read_control) or Control()
+        model = self._read_model() if self._has_model() else None
+        spots: dict[str, Spot] = {}
+        lost: dict[str, str] = {}
+        off: list[Array | None] = [None] * len(picks)
+        if model is not None:
+            known = {p.image for p in picks if p.image in model.pictures}
+            cameras = {name: model.pictures.picture(name) for name in known}
+            spots, lost = find_spots(picks, cameras)
+            off = spot_residuals(spots, picks, model.pictures)
+        points: dict[str, dict[str, Any]] = {}
+        for number, (pick, miss) in enumerate(zip(picks, off, strict=True)):
+            spot = spots.get(pick.point)
+            about = points.setdefault(
+                pick.point,
+                {
+                    "name": pick.point,
+                    "picks": [],
+                    "why": lost.get(pick.point, ""),
+                    "coded": number >= len(own or []),
+                    "spot": None if spot is None else _spot_json(spot),
+                },
+            )
+            left_out = spot is not None and pick.image in spot.left_out
+            about["picks"].append(
+                {
+                    **_pick_json(pick),
+                    "left_out": left_out,
+                    "residual": None if miss is None else miss.tolist(),
+                }
+            )
+        record = ControlRecord.made(folder / ControlRecord.path)
+        mapped = MappingRecord.made(folder / MappingRecord.path)
+        return {
+            "token": table_token(folder / PICKS_FILE),
+            "points": list(points.values()),
+            "control": None if model is None
+            else preview_control(control, spots, lost, model.pictures.frame),
+            "last": None if record is None else record.to_json(),
+            "unit": "m" if model is None else model.pictures.frame.unit,
+            "scaled_by_rig": mapped is not None and mapped.scaled,
+        }  # fmt: skip
+
+    def save(self, call: Call) -> dict[str, Any]:
+        """Replace the picks of some points in `picks.csv`."""
+        asked = call.read(_SavePicks)
+        records = self._taken.records()
+        strange = [p.image for p in asked.picks if p.image not in records]
+        if strange:
+            raise AliceError(f"{strange[0]!r} is no picture of this survey")
+        picks = [one.pick for one in asked.picks]
+        return self._written(
+            PICKS_FILE, lambda path: save_picks(path, asked.token, picks, set(asked.points))
+        )
+
+    # ---- Control ----
+
+    def control(self, call: Call) -> dict[str, Any]:
+        """The rows of `control.csv` as they stand."""
+        path = self._studio.workspace.folder / CONTROL_FILE
+        rows = []
+        if self._read(CONTROL_FILE, read_control) is not None:
+            table = read_csv(path, ("kind", "name", "use"), fault=WorkspaceError)[1]
+            rows = [
+                {"line": line, **{name: cell for name, cell in row.items() if cell}}
+                for line, row in table
+                if not next(iter(row.values())).startswith("# ")
+            ]
+        return {"token": table_token(path), "rows": rows}
+
+    def save_control(self, call: Call) -> dict[str, Any]:
+        """Replace rows of `control.csv` by kind and name."""
+        asked = call.read(_SaveControl)
+        return self._written(
+            CONTROL_FILE, lambda path: save_control(path, asked.token, asked.rows, asked.names)
+        )
+
+    # ---- Spots and lengths ----
+
+    def spot(self, call: Call) -> dict[str, Any]:
+        """The spot that picks show and how far each misses it; nothing is written."""
+        asked, model = call.read(_AskedSpot), self._read_model()
+        picks = [p.pick for p in asked.picks]
+        found = model.lengths.spot(picks)
+        off = spot_residuals({p.point: found for p in picks}, picks, model.pictures)
+        return {
+            "spot": _spot_json(found),
+            "residuals": [
+                {
+                    "image": pick.image, "left_out": pick.image in found.left_out,
+                    "residual": None if miss is None else miss.tolist(),
+                }
+                for pick, miss in zip(picks, off, strict=True)
+            ],
+        }  # fmt: skip
+
+    def length(self, call: Call) -> dict[str, Any]:
+        """The distance between two spots and its sigma; nothing is written."""
+        asked, model = call.read(_AskedEnds), self._read_model()
+        with model.lock:
+            found = model.lengths.between(
+                [p.pick for p in asked.first], [p.pick for p in asked.second]
+            )
+        return {
+            "value": found.value, "sigma": found.sigma, "unit": model.pictures.frame.unit,
+            "sigma_picks": found.sigma_picks, "sigma_poses": found.sigma_poses,
+            "sigma_scale": found.sigma_scale, "scaled": model.pictures.frame.scaled,
+        }  # fmt: skip
+
+    def scale(self, call: Call) -> dict[str, Any]:
+        """Note a known length in `scale.json`."""
+        asked, model = call.read(_AskedScale), self._read_model()
+        ends = [[p.pick for p in one] for one in (asked.first, asked.second)]
+        places = [model.lengths.spot(picks).model for picks in ends]
+        names = [
+            "+".join(f"{p.image}:{p.x},{p.y}" for p in one) for one in (asked.first, asked.second)
+        ]
+        with self._writing, self._studio.only_writer():
+            line = note_scale(
+                self._studio.workspace.folder, (names[0], names[1]), places[0], places[1],
+                asked.length_m,
+            )  # fmt: skip
+        self._studio.publish("picks", {"scale": True})
+        return {"line": line}
+
+    # ---- What all use ----
+
+    def _written(self, name: str, write: Callable[[Any], str]) -> dict[str, Any]:
+        path = self._studio.workspace.folder / name
+        if path.is_symlink():
+            raise AliceError(f"{name} is a link: the studio changes files of the survey alone")
+        with self._writing, self._studio.only_writer():
+            try:
+                token = write(path)
+            except WorkspaceError as error:  # a row of the page, or of the file by its line
+                raise AliceError(str(error)) from None
+        self._studio.publish("picks", {"file": name, "token": token})
+        return {"token": token}
+
+    def _read(self, name: str, read: Callable[[Any], T]) -> T | None:
+        path = self._studio.workspace.folder / name
+        if path.is_symlink() or not path.is_file():
+            return None
+        return read(path)
+
+    def _has_model(self) -> bool:
+        return all(self._studio.workspace.has(path) for path in _MODEL)
+
+    def _read_model(self) -> _OpenModel:
+        workspace = self._studio.workspace
+        if not self._has_model():
+            raise AliceError("no model yet: run 'alice-survey reconstruct' first")
+        return self._model.of(workspace.state((*_MODEL, "dense/dem.tif")))
+
+
+def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]:
+    """Pictures that see a place with nothing between, and how many it is hidden from."""
+    found = model.pictures.seeing(place.point, place.normal)[: 4 * _MOST_SEEING]
+    centres = np.array([model.pictures.centres[model.pictures.row(s.image)] for s in found])
+    hidden = model.surface.hidden(place, centres.reshape(-1, 3))
+    return [s for s, out in zip(found, hidden, strict=True) if not out], int(hidden.sum())
+
+
+def _pick_json(pick: Pick) -> dict[str, Any]:
+    return {
+        "image": pick.image, "point": pick.point, "x": pick.x_px - 0.5, "y": pick.y_px - 0.5,
+        "sigma_px": pick.sigma_px, "matched_to": pick.matched_to,
+    }  # fmt: skip
+
+
+def _spot_json(spot: Spot) -> dict[str, Any]:
+    return {
+        "n": spot.model[0], "e": spot.model[1], "down": spot.model[2],
+        "sigma": np.sqrt(np.diag(spot.covariance)).tolist(), "views": spot.views,
+        "rms_px": spot.rms_px,
+    }  # fmt: skip
+
+
+def _count(call: Call, name: str, usual: int, most: int = 1_000_000_000) -> int:
+    text = call.query.get(name, str(usual))
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise AliceError(f"{name}={text!r} is no count")
+    return min(int(text), most)
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """Pictures, picks, control, lengths and scale."""
+    tab = _Tab(studio)
+    return (
+        Endpoint(path="/api/pictures", answer=tab.listed),
+        Endpoint(path="/api/pictures/seeing", answer=tab.seeing),
+        Endpoint(path="/api/pictures/{name:path}/about", answer=tab.picture),
+        Endpoint(path="/api/pictures/{name:path}/tile/{level}/{x}/{y}.webp", answer=tab.tile),
+        Endpoint(path="/api/picks", answer=tab.picks),
+        Endpoint(path="/api/picks/refine", answer=tab.refine, method="POST"),
+        Endpoint(path="/api/picks/save", answer=tab.save, method="POST", writes=True,
+                 most_bytes=8 << 20),
+        Endpoint(path="/api/picks/spot", answer=tab.spot, method="POST"),
+        Endpoint(path="/api/picks/length", answer=tab.length, method="POST"),
+        Endpoint(path="/api/control", answer=tab.control),
+        Endpoint(path="/api/control/save", answer=tab.save_control, method="POST", writes=True,
+                 most_bytes=8 << 20),
+        Endpoint(path="/api/scale", answer=tab.scale, method="POST", writes=True),
+    )  # fmt: skip

@@ -1,0 +1,432 @@
+"""The tab Plan: settings and shapes as they are, planned again while they change, and saved."""
+
+import base64
+import math
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+from pydantic_core import to_json
+
+from alice_survey.app.pipeline import init_survey, run, template_text
+from alice_survey.app.studio.endpoints.base import (
+    Call,
+    Content,
+    Endpoint,
+    Studio,
+    scale_json,
+    zipped,
+)
+from alice_survey.app.studio.newest import Newest, SupersededError
+from alice_survey.app.studio.paths import RefusedError
+from alice_survey.app.studio.setting_limits import setting_limits
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
+from alice_survey.core.edited_files import check_token, content_of, content_token
+from alice_survey.core.errors import AliceError, ConfigError, PlanError, collected_by, heard
+from alice_survey.core.executor import local_executor
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.stages import spec
+from alice_survey.core.trajectory import read_columns, read_track
+from alice_survey.kit.document import PictureLayer
+from alice_survey.sim.vehicle.files import known_vehicles
+from camera_calib.rig import design_rig
+from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing_of_file
+from missions.areas.files import SUFFIXES
+from missions.exports.registry import format_named, format_names
+from missions.plan.draft import Draft, drafted
+from missions.plan.planner import plan_survey
+from missions.plan.playback import play
+from missions.plan.preview import preview, refusal_json
+from missions.values.plan_file import read_plan
+from reconstruct.precision.candidates import Candidate, worst_bend
+from reconstruct.precision.run import heights_layer, heights_raster, summary
+
+SETTINGS = "survey.toml"
+_MOST_REQUEST = 8 << 20
+_MOST_FILE = 32 << 20
+_MOST_PRECISION = 3000
+"""Stations of which the precision is predicted while somebody waits."""
+_MOST_MOMENTS = 4000
+"""Moments of a playback."""
+_LENSES_MM = (12.5, 25.0)
+"""Of the paper."""
+_JSON = "application/json"
+
+
+def prepare_planning() -> None:
+    """Import and compile the planner before a page asks for it: 20 s after an installation."""
+    with _quiet():
+        preview(SurveyConfig())
+
+
+class PlanRequest(Config):
+    """Settings that a page has changed, and what it has drawn."""
+
+    changes: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    shapes: DrawnShapes | None = None
+    token: str | None = None
+    """Of the settings that the page has seen."""
+    page: str = ""
+    """Names the page: the newest request of each is answered."""
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """survey.toml as it is, or the template where there is none."""
+
+    text: str
+    token: str
+    """Empty where there is no file."""
+
+
+@dataclass(eq=False)
+class _PlanTab:
+    studio: Studio
+    newest: Newest = field(default_factory=Newest)
+    saving: threading.Lock = field(default_factory=threading.Lock)
+    kept: tuple[str, dict[str, Any]] | None = None
+    """Preview of what is saved, with the token of its settings and their files."""
+
+    @property
+    def path(self) -> Path:
+        return self.studio.workspace.folder / SETTINGS
+
+    @cached_property
+    def limits(self) -> dict[str, dict[str, Any]]:
+        return setting_limits(template_text())
+
+    def settings(self) -> _Settings:
+        """The settings file.
+
+        Raises:
+            ConfigError: it cannot be read.
+        """
+        try:
+            data = self.studio.workspace.file([SETTINGS]).read_bytes()
+        except (FileNotFoundError, RefusedError):
+            return _Settings(template_text(), "")
+        except OSError as error:
+            raise ConfigError(f"{self.path}: cannot be read: {error.strerror}") from None
+        try:
+            text = data.decode("utf-8")
+        except UnicodeDecodeError:
+            raise ConfigError(f"{self.path}: is not text") from None
+        return _Settings(text, content_token(data))
+
+    def draft(self, request: PlanRequest) -> Draft:
+        """The settings with a page's changes."""
+        with _quiet():
+            return drafted(self.settings().text, self.path, request.changes, request.shapes)
+
+    def overview(self, call: Call) -> Content:
+        """Settings, limits and shapes, and the plan that is saved."""
+        return _json(self._overview())
+
+    def _overview(self) -> dict[str, Any]:
+        found = self.settings()
+        common: dict[str, Any] = {
+            "token": found.token,
+            "error": None,
+            "written": {},
+            "limits": self.limits,
+            "vehicles": known_vehicles(),
+            "formats": format_names(),
+            "suffixes": list(SUFFIXES),
+            "stage": "missing",
+            "saved": None,
+        }
+        try:
+            written = settings_in(found.text, SETTINGS)
+            config = parse_settings(found.text, self.path)
+        except ConfigError as error:
+            return {**common, **_about(SurveyConfig(), None), "error": str(error)}
+        common["written"] = {
+            name: list(part) for name, part in written.items() if isinstance(part, dict)
+        }
+        if not found.token:  # a new survey, of which nothing is drawn yet
+            return {**common, **_about(config, None)}
+        drawing = None
+        try:
+            with _quiet():
+                drawing = area_drawing(config.area)
+        except AliceError as error:
+            common["error"] = str(error)
+        common["stage"] = spec("plan").state(self.studio.workspace.folder, config, {})
+        common["saved"] = self.saved(found.token, config)
+        return {**common, **_about(config, drawing)}
+
+    def saved(self, token: str, config: SurveyConfig) -> dict[str, Any]:
+        """The preview of the saved settings; kept while these and their files stay."""
+        files = [path.stat() for path in config.area.files]
+        key = f"{token} {[(status.st_mtime_ns, status.st_size) for status in files]}"
+        if self.kept is None or self.kept[0] != key:
+            self.kept = (key, preview(config))
+        return self.kept[1]
+
+    def preview(self, call: Call) -> Content:
+        """Plan with a page's changes; nothing is written."""
+        request = call.read(PlanRequest)
+        try:
+            found = self.newest.run(request.page, lambda: self._preview(request))
+        except SupersededError as error:
+            found = {**refusal_json(error), "superseded": True}
+        return _json(found)
+
+    def _preview(self, request: PlanRequest) -> dict[str, Any]:
+        try:
+            draft = self.draft(request)
+        except AliceError as error:
+            return {**refusal_json(error), "cpu_s": 0.0}
+        with _drawn(draft) as config:
+            return preview(config)
+
+    def precision(self, call: Call) -> dict[str, Any]:
+        """What the model of a plan is expected to be worth."""
+        with _drawn(self.draft(call.read(PlanRequest))) as config, _quiet():
+            plan = plan_survey(config, design_rig(config.camera, config.water)).plan
+            if plan.stations > _MOST_PRECISION:
+                raise PlanError(
+                    f"{plan.stations:,} stations: the precision of up to {_MOST_PRECISION:,} is "
+                    "predicted here; save, and run 'alice-survey plan precision'"
+                )
+            # What calibrates and what flies is heavy, and needed here alone.
+            from reconstruct.precision.instruments import expected_rig
+
+            folder = self.studio.workspace.folder
+            rig = expected_rig(folder, config.camera, config.water, config.imaging)
+            found = Candidate(config=config, made=plan, rig=rig).precision
+        bend_m, station_m = worst_bend(found), np.linalg.norm(found.shape_m, axis=1)
+        return {
+            "bend_mm": 1e3 * bend_m,
+            "scale_ppm": 1e6 * found.scale,
+            "height_mm": 1e3 * found.heights_rms_m,
+            "station_mm": 1e3 * float(np.sqrt((station_m**2).mean())),
+            "layer": _layer(heights_layer(*heights_raster(found))),
+            "text": summary(found),
+        }
+
+    def play(self, call: Call) -> dict[str, Any]:
+        """The dive: as it was simulated where that is of this plan, else as it is planned."""
+        draft = self.draft(call.read(PlanRequest))
+        folder, states = self.studio.workspace.folder, dict[str, str]()
+        for name in ("plan", "fly"):
+            states[name] = "missing" if draft.files else spec(name).state(
+                folder, draft.config, states
+            )  # fmt: skip
+        track = folder / "flight" / "truth" / "track.csv"
+        if set(states.values()) == {"up to date"} and track.is_file():
+            return _flown(folder / "flight", draft.config)
+        with _drawn(draft) as config, _quiet():
+            planned = plan_survey(config, design_rig(config.camera, config.water))
+            played = play(planned.plan, planned.costs, planned.bathymetry)
+        place = np.column_stack([played.glass_ne, played.depth_m])
+        return _moments("planned", played.time_s, place, played.altitude_m, played.heading_rad,
+                        played.pictures_s)  # fmt: skip
+
+    def dropped(self, call: Call) -> dict[str, Any]:
+        """The shapes of a file that was dropped on the page."""
+        name = Path(call.query.get("name", "")).name
+        role: Any = call.query.get("role", "survey")
+        if role not in ("survey", "no_go", "allowed"):
+            raise PlanError(f"role {role[:20]!r}: it is survey, no_go or allowed")
+        if Path(name).suffix.lower() not in SUFFIXES:
+            raise PlanError(f"{name[:60]!r} is not read; those that are: {', '.join(SUFFIXES)}")
+        found = self.settings()
+        config = parse_settings(found.text, self.path)
+        with tempfile.TemporaryDirectory() as scratch, heard() as warnings, _quiet():
+            file = Path(scratch) / f"dropped{Path(name).suffix.lower()}"
+            file.write_bytes(call.body)
+            try:
+                drawing = drawing_of_file(
+                    file, config.area, role=role, layer=call.query.get("layer"),
+                    crs=call.query.get("crs"),
+                    datum=_datum_asked(call, found.token, config),
+                )  # fmt: skip
+            except PlanError as error:
+                text = str(error).replace(str(file), name).replace(file.name, name)
+                raise PlanError(text) from None
+        texts = [text.replace(file.name, name) for text in warnings]
+        return {**_shapes(drawing.shapes), "datum": _datum(drawing.datum), "warnings": texts}
+
+    def text(self, call: Call) -> dict[str, Any]:
+        """The settings file as it would be saved."""
+        return {"survey_toml": self.draft(call.read(PlanRequest)).text}
+
+    def save(self, call: Call) -> Content:
+        """Write the settings, and plan as the command line does."""
+        request = call.read(PlanRequest)
+        folder = self.studio.workspace.folder
+        with self.saving, _quiet():
+            with self.studio.only_writer():
+                check_token(SETTINGS, content_of(self.path), request.token or "")
+                draft = self.draft(request)
+                if not request.token:
+                    init_survey(folder)
+                draft.write()
+            token = self.settings().token
+            self.studio.publish("plan", {"token": token})
+            fault = None
+            try:
+                run(["plan"], folder, None, executor=local_executor(1))
+            except AliceError as error:
+                fault = error
+            config = parse_settings(draft.text, self.path)
+            shown = self.saved(token, config)
+            if fault is not None and shown["ok"]:
+                shown = refusal_json(fault)
+        return _json({"token": token, "saved": shown})
+
+    def export(self, call: Call) -> Content:
+        """A file of the saved plan; of one a dive all of them, zipped."""
+        name = call.query.get("format", "")
+        files = format_named(name).files
+        folder = self.studio.workspace.folder / "plan"
+        plan = read_plan(self.studio.workspace.file(["plan", "plan.json"]))
+        names = [
+            file.name.format(dive + 1)
+            for file in files
+            for dive in range(len(plan.dives) if "{}" in file.name else 1)
+        ]
+        paths = [self.studio.workspace.file(["plan", "exports", one]) for one in names]
+        if len(paths) == 1:
+            return Content(
+                data=paths[0].read_bytes(), kind="application/octet-stream", name=names[0]
+            )
+        exports = folder / "exports"
+        return zipped(f"{name}.zip", {str(one.relative_to(exports)): one for one in paths})
+
+
+def _json(found: Mapping[str, Any]) -> Content:
+    """JSON, quicker than of the shell: plans have many thousand lines."""
+    return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
+
+
+def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:
+    """The datum that a dropped file is to count to; None for its own middle.
+
+    `datum` of the query is `middle`, or latitude and longitude with a comma between; where it is
+    left out that of the survey counts, and for a new survey the middle.
+    """
+    asked = call.query.get("datum", "" if token else "middle")
+    if asked == "middle":
+        return None
+    if not asked:
+        return area_drawing(config.area).datum
+    try:
+        latitude_deg, longitude_deg = map(float, asked.split(","))
+        area = AreaConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    except ValueError:
+        raise PlanError(f"datum {asked[:40]!r}: it is 'middle' or LATITUDE,LONGITUDE") from None
+    return Datum(area.latitude_deg, area.longitude_deg)
+
+
+@contextmanager
+def _drawn(draft: Draft) -> Iterator[SurveyConfig]:
+    """The settings of a draft, with its files in a folder that lasts as long as this block."""
+    with tempfile.TemporaryDirectory() as scratch:
+        yield draft.config_with(Path(scratch))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without notes and warnings on the terminal."""
+    with collected_by(lambda _, __: None):
+        yield
+
+
+def _about(config: SurveyConfig, drawing: AreaDrawing | None) -> dict[str, Any]:
+    """Settings as JSON values, their area as shapes."""
+    datum = Datum(config.area.latitude_deg, config.area.longitude_deg)
+    return {
+        "settings": json_values(config.model_dump(mode="json")),
+        "shapes": _shapes(DrawnShapes() if drawing is None else drawing.shapes),
+        "datum": _datum(datum if drawing is None else drawing.datum),
+        "lenses_mm": sorted({*_LENSES_MM, config.camera.focal_mm}),
+        "bathymetry": config.area.bathymetry_file is not None,
+    }
+
+
+def _shapes(shapes: DrawnShapes) -> dict[str, Any]:
+    found: dict[str, Any] = shapes.model_dump(mode="json")
+    return found
+
+
+def _datum(datum: Datum) -> dict[str, float]:
+    return {"latitude_deg": datum.latitude_deg, "longitude_deg": datum.longitude_deg}
+
+
+def _layer(layer: PictureLayer) -> dict[str, Any]:
+    """A picture for the map, and what its colours mean."""
+    [png] = layer.tiles.values()
+    return {
+        "png": f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}",
+        "north": layer.north_m,
+        "west": layer.west_m,
+        "pixel": layer.pixel_m,
+        "title": layer.title,
+        "scale": scale_json(layer),
+    }
+
+
+def _flown(folder: Path, config: SurveyConfig) -> dict[str, Any]:
+    """The simulated dive as it truly was, of the left port's glass; altitudes are its log's."""
+    track = read_track(folder / "truth" / "track.csv")
+    log = read_columns(folder / "navigation.csv", ("time_s", "altitude_m"))
+    pictures_s = read_columns(folder / "triggers.csv", ("time_s",))["time_s"]
+    poses, known = track.ned_from_body, np.isfinite(log["altitude_m"])
+    altitude_m = np.full(len(track.time_s), np.nan)
+    if known.any():
+        altitude_m = np.interp(track.time_s, log["time_s"][known], log["altitude_m"][known])
+    return _moments(
+        "flown", track.time_s, poses.apply(np.array(config.camera.position_body_m)), altitude_m,
+        np.unwrap(attitude_from_rotation(poses.rotation)[:, 2]), pictures_s,
+    )  # fmt: skip
+
+
+def _moments(
+    what: str, time_s: Array, glass_ned: Array, altitude_m: Array, heading_rad: Array,
+    pictures_s: Array,
+) -> dict[str, Any]:  # fmt: skip
+    """A playback as JSON values, of so many moments as can be seen."""
+    step = max(1, math.ceil(len(time_s) / _MOST_MOMENTS))
+    shown = np.unique(np.append(np.arange(0, len(time_s), step), len(time_s) - 1))
+    return {
+        "what": what,
+        "t_s": np.round(time_s[shown], 2).tolist(),
+        "n": np.round(glass_ned[shown, 0], 3).tolist(),
+        "e": np.round(glass_ned[shown, 1], 3).tolist(),
+        "depth_m": np.round(glass_ned[shown, 2], 3).tolist(),
+        "altitude_m": np.round(altitude_m[shown], 3).tolist(),
+        "heading_deg": np.round(np.rad2deg(heading_rad[shown]) % 360.0, 2).tolist(),
+        "pictures_s": np.round(pictures_s, 2).tolist(),
+    }
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """All of the tab Plan."""
+    plan = _PlanTab(studio)
+
+    def post(name: str, answer: Callable[[Call], Any], **options: Any) -> Endpoint:
+        return Endpoint(
+            path=f"/api/plan/{name}", answer=answer, method="POST",
+            **{"most_bytes": _MOST_REQUEST, **options},
+        )  # fmt: skip
+
+    return (
+        Endpoint(path="/api/plan", answer=plan.overview),
+        Endpoint(path="/api/plan/export", answer=plan.export),
+        post("preview", plan.preview),
+        post("precision", plan.precision),
+        post("play", plan.play),
+        post("import", plan.dropped, most_bytes=_MOST_FILE),
+        post("text", plan.text),
+        post("save", plan.save, writes=True),
+    )

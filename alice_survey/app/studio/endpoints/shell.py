@@ -1,0 +1,123 @@
+"""What every tab needs: the state of the workspace, and the map of what it holds."""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.run import survey_map
+from alice_survey.app.report.shapes import shape_layers
+from alice_survey.app.studio.chart import CHART, contours_of
+from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio, scale_json
+from alice_survey.core.errors import PlanError, warn
+from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
+from alice_survey.kit.map import map_data, map_extent
+
+TABS = ("plan", "model", "pictures", "annotate", "compare", "follow", "run")
+_PRODUCTS = {
+    "plan": "plan/plan.json", "flight": "flight/navigation.csv", "pictures": "images/manifest.csv",
+    "sparse": "sparse/track.csv", "dem": "dense/dem.tif", "mosaic": "mosaic/mosaic.tif",
+    "mesh": "mesh/mesh.glb", "cloud": "dense/cloud.copc.laz", "report": "report/report.html",
+    "survey": "survey.toml",
+}  # fmt: skip
+_EMPTY_M = 50.0
+"""Half a side of the map of a workspace that holds nothing."""
+
+
+@dataclass(frozen=True)
+class _Shell:
+    studio: Studio
+
+    def state(self, call: Call) -> dict[str, Any]:
+        """The workspace in short: what it is called, what it holds, where its map lies."""
+        workspace = self.studio.workspace
+        held = Held.of(workspace.folder)
+        found = survey_map(held, ())
+        datum = held.frame.datum
+        placed = found.axes == EAST_NORTH or not held.has(
+            "sparse"
+        )  # a plan is drawn on east and north
+        web = resources.files("alice_survey.app.studio") / "web"
+        return {
+            "workspace": str(workspace.folder),
+            "name": held.name,
+            "stages": sorted(held.stages),
+            "unit": found.unit,
+            "axes": EAST_NORTH if placed else found.axes,
+            "placed": placed,
+            "origin": found.origin,
+            "simulated": held.simulated,
+            "plane": None if held.plane is None else held.plane.name,
+            "datum": None if datum is None else [datum.latitude_deg, datum.longitude_deg],
+            "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},
+            "log": self.studio.log,
+            "background": self.studio.background,
+            "tabs": [name for name in TABS if (web / f"{name}.js").is_file()],
+        }
+
+    def map(self, call: Call) -> dict[str, Any]:
+        """The layers of what the workspace holds, as the map's script takes them."""
+        with self.studio.workspace.unchanged():
+            return self._map()
+
+    def _map(self) -> dict[str, Any]:
+        held = Held.of(self.studio.workspace.folder)
+        pictures = self.studio.layers.picture_layers()
+        layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
+        surveyed = [layer for layer in layers if layer.name != CHART]
+        extent = (-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M)
+        if surveyed:
+            extent = map_extent(survey_map(held, surveyed))
+        chart, place = self.studio.layers.chart, held.frame.datum
+        if chart is not None and place is not None:
+            try:
+                layers += contours_of(chart, place, extent)
+            except PlanError as fault:
+                warn(f"the chart has no contours: {fault}")
+        found: dict[str, Any] = {"layers": []}
+        if layers:
+            found = json.loads(map_data(survey_map(held, layers))[0])
+        found["extent"] = extent
+        for described, layer in zip(found["layers"], layers, strict=True):
+            described |= _listed(layer)
+        return found
+
+
+def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
+    """What the list of layers says of one."""
+    is_base = isinstance(layer, PictureLayer) and layer.base
+    group = "Background" if layer.name in (CHART, "contours") else layer.group
+    if is_base:
+        group = "Base layer"
+    return {
+        "title": layer.title,
+        "about": layer.about,
+        "shown": layer.shown,
+        "group": group,
+        "under": layer.name == CHART,
+        "scale": scale_json(layer) if isinstance(layer, PictureLayer) else None,
+    }
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """State and map."""
+    shell = _Shell(studio)
+    return (
+        Endpoint(path="/api/state", answer=shell.state),
+        Endpoint(path="/api/map", answer=shell.map),
+    )
+
+
+def all_endpoints(studio: Studio) -> Iterable[Endpoint]:
+    """The endpoints of every module here."""
+    import importlib
+    import pkgutil
+
+    from alice_survey.app.studio import endpoints as package
+
+    for module in sorted(found.name for found in pkgutil.iter_modules(package.__path__)):
+        of_module = importlib.import_module(f"{package.__name__}.{module}")
+        if hasattr(of_module, "endpoints"):
+            yield from of_module.endpoints(studio)

@@ -1,0 +1,176 @@
+"""The first start: a survey to plan, or pictures that are there, become a workspace."""
+
+import base64
+import binascii
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from alice_survey.app.pipeline import init_survey
+from alice_survey.app.studio.commands import ImportImagesArguments
+from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
+from alice_survey.app.studio.folders import Folders
+from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import Config, load_config
+from alice_survey.core.edited_files import StaleError
+from alice_survey.core.errors import AliceError, WorkspaceError
+from alice_survey.core.settings_text import Values
+from missions.areas.files import SUFFIXES
+from missions.areas.survey import survey_area
+from reconstruct.pictures.preview import cameras_in, preview_import
+
+_MOST_BYTES = 12 << 20
+_COLOUR = '[reconstruct]\ncolour = "{}"\n'
+"""Settings of a survey of real pictures that has no others."""
+_TRIAL: Values = {
+    "seafloor": {"grid_m": 0.02},
+    "imaging": {"scale": 6, "pool_views": 12},
+    "reconstruct": {"max_features": 1200},
+}
+"""Settings that take a few square metres from plan to report within minutes; the number of features
+is what pictures of a quarter of a megapixel hold."""
+_SINGLE = tuple(suffix for suffix in SUFFIXES if suffix != ".shp")
+"""Kinds of area files that are one file."""
+
+
+class _AskedFolder(Config):
+    path: str = Field("", max_length=4000)
+    typed: bool = False
+
+
+class _DroppedArea(Config):
+    name: str = Field(max_length=300)
+    base64: str
+
+
+class _NewSurvey(Config):
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    length_m: float | None = None
+    width_m: float | None = None
+    seafloor_depth_m: float | None = None
+    focal_mm: float | None = None
+    area: _DroppedArea | None = None
+    trial: bool = False
+
+
+class _NewPictures(Config):
+    arguments: ImportImagesArguments
+    colour: Literal["water", "even", "raw"] = "water"
+
+
+@dataclass(frozen=True)
+class _StartPage:
+    studio: Studio
+    folders: Folders = field(default_factory=Folders)
+
+    def listed(self, call: Call) -> Any:
+        """Folders inside one."""
+        asked = call.read(_AskedFolder)
+        return asdict(self.folders.listed(asked.path, typed=asked.typed))
+
+    def preview(self, call: Call) -> Any:
+        """What an import would find, and whether folders inside look like those of a rig."""
+        given = call.read(ImportImagesArguments)
+        folders = given.folders
+        rig = cameras_in(folders[0]) if len(folders) == 1 and not given.recursive else {}
+        try:
+            found = preview_import(
+                () if rig else folders, cameras=rig or given.cameras, videos=given.videos,
+                recursive=given.recursive, navigation=given.navigation, rig=given.rig,
+                clock_offset_s=given.clock_offset or 0.0, time_zone=given.time_zone or "UTC",
+            )  # fmt: skip
+        except WorkspaceError as fault:  # of a rig that is none, which was chosen wrongly
+            raise AliceError(str(fault)) from None
+        return json_values(found) | {"rig_folders": {name: str(path) for name, path in rig.items()}}
+
+    def survey(self, call: Call) -> Any:
+        """Write the settings of a survey to plan."""
+        asked = call.read(_NewSurvey)
+        workspace = self.studio.workspace.folder
+        area = ("latitude_deg", "longitude_deg", "length_m", "width_m", "seafloor_depth_m")
+        values: dict[str, Mapping[str, Any]] = {
+            "area": _given(asked, area), "camera": _given(asked, ("focal_mm",)),
+            **(_TRIAL if asked.trial else {}),
+        }  # fmt: skip
+        if (asked.latitude_deg is None) != (asked.longitude_deg is None):
+            raise AliceError("latitude and longitude go together: give both, or neither")
+        if (workspace / "survey.toml").exists():
+            raise StaleError(f"{workspace} has a survey already: change it in the Plan tab")
+        with self.studio.only_writer():
+            if asked.area is None:
+                init_survey(workspace, name=asked.name, values=values)
+            else:
+                self._with_area(asked.area, asked.name, values)
+        return {"workspace": str(workspace)}
+
+    def _with_area(self, given: _DroppedArea, name: str, values: Values) -> None:
+        """Write an area file that was dropped, and the settings that name it; both or neither."""
+        suffix = Path(given.name).suffix.lower()
+        if suffix not in _SINGLE:
+            raise AliceError(
+                f"{given.name}: {suffix or 'no ending'!r} files are not read; those that are: "
+                f"{', '.join(_SINGLE)} (a shapefile as .zip)"
+            )
+        try:
+            content = base64.b64decode(given.base64, validate=True)
+        except binascii.Error:
+            raise AliceError(f"{given.name} did not arrive whole: drop it again") from None
+        folder = self.studio.workspace.folder
+        area, toml = folder / f"area{suffix}", folder / "survey.toml"
+        if area.exists():
+            raise StaleError(f"{area} exists already: remove it first")
+        try:
+            area.write_bytes(content)
+            init_survey(folder, area=area, name=name, values=values)
+            config = load_config(toml)
+            survey_area(config.area, turn_margin_m=3.0)
+        except BaseException:
+            toml.unlink(missing_ok=True)
+            area.unlink(missing_ok=True)
+            raise
+
+    def pictures(self, call: Call) -> Any:
+        """Import pictures, as a job; what differs from the usual goes into survey.toml."""
+        asked = call.read(_NewPictures)
+        given = asked.arguments.model_dump(mode="json", exclude_defaults=True)
+        self._keep_colour(asked.colour)
+        return {"job": self.studio.jobs.start("import-images", given)}
+
+    def _keep_colour(self, colour: str) -> None:
+        """Write the colours that are not the usual ones; what an earlier try has written goes."""
+        toml = self.studio.workspace.folder / "survey.toml"
+        text = "" if colour == "water" else _COLOUR.format(colour)
+        before = toml.read_text(encoding="utf-8") if toml.is_file() else ""
+        if before == text:
+            return
+        if before and before not in map(_COLOUR.format, ("even", "raw")):
+            raise StaleError(
+                f'{toml} is there already: set colour = "{colour}" below [reconstruct] in it, and '
+                "leave the colours here as they are"
+            )
+        with self.studio.only_writer():
+            if text:
+                toml.write_text(text, encoding="utf-8")
+            else:
+                toml.unlink()
+
+
+def _given(asked: _NewSurvey, names: Sequence[str]) -> dict[str, float]:
+    return {name: value for name in names if (value := getattr(asked, name)) is not None}
+
+
+def endpoints(studio: Studio) -> Sequence[Endpoint]:
+    """Folders, preview, and the two ways to begin."""
+    start = _StartPage(studio)
+    post: dict[str, Any] = {"method": "POST", "writes": True}
+    return (
+        Endpoint(path="/api/start/folders", answer=start.listed, **post),
+        Endpoint(path="/api/start/preview", answer=start.preview, **post),
+        Endpoint(path="/api/start/survey", answer=start.survey, most_bytes=_MOST_BYTES, **post),
+        Endpoint(path="/api/start/pictures", answer=start.pictures, **post),
+    )

@@ -1,0 +1,442 @@
+"""Commands that the studio runs in its workspace: one at a time, each a process of its own.
+
+A job writes what happens into an events file below `.studio/jobs/NUMBER/`, and this reads it: so a
+page that is loaded again, or a studio that was killed and started again, finds the job where it is.
+A job is the leader of a process group and has no terminal. It ends with the studio or by `stop`,
+both as Ctrl-C ends a command: its stages resume where they were.
+"""
+
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import psutil
+from filelock import FileLock
+from pydantic import Field
+
+from alice_survey.app.pipeline import is_locked
+from alice_survey.app.studio.commands import COMMANDS, words_of
+from alice_survey.app.studio.heard import EventsTail, Heard
+from alice_survey.core.artefacts import JsonRecord
+from alice_survey.core.errors import AliceError, WorkspaceError, why
+from alice_survey.core.run.interrupts import for_other_programs
+from alice_survey.core.stages import spec
+
+RECORD, OUTPUT, ERRORS = "job.json", "output.txt", "errors.txt"
+"""Files of a job."""
+FOLDER = Path(".studio", "jobs")
+_KEPT_JOBS = 20
+_LOOK_EVERY_S = 0.1
+_PUBLISH_EVERY_S = 0.25
+_ALIVE_EVERY_S = 2.0
+"""Time after which a job that says nothing is published again."""
+_HARDER_S = (8.0, 5.0)
+"""Time to wait after Ctrl-C, then after SIGTERM, before the next harder way to end a job."""
+_ENDING_S = 3.0
+"""Time to wait for a job where the studio ends; the job ends within some more by itself."""
+_LOCK_S = 2.0
+"""Longest wait for what holds the workspace for a moment."""
+_CREATED_S = 0.5
+"""Difference of a process's start as two readings of it may give it."""
+_CODES_OF_STOP = (130, 143, 129)
+_OUTPUT_TAIL = 8192
+_PROGRAM = (sys.executable, "-P", "-m", "alice_survey")
+"""This program, without modules of the folder that it is started in."""
+
+Publish = Callable[[str, Any], None]
+
+
+class BusyError(AliceError):
+    """Another command is working in the workspace."""
+
+
+class JobRecord(JsonRecord):
+    """`job.json` of a job: a command that the studio has started."""
+
+    number: int
+    name: str
+    title: str
+    command: str
+    """As a terminal takes it."""
+    started_utc: str
+    process: int
+    created_s: float
+    """When the process began, as the system counts: tells it from another of the same number."""
+    ended_utc: str | None = None
+    state: str = "running"
+    """running; done, failed, stopped by a person, or killed without a word."""
+    exit_code: int | None = None
+    line: str = ""
+    """Why it failed, or its result's first line."""
+    arguments: dict[str, Any] = Field(default_factory=dict)
+    stage: str = ""
+    """The stage that it came to last."""
+    finished: tuple[str, ...] = ()
+    """Stages that it has made or found up to date."""
+
+    def is_alive(self) -> bool:
+        """Whether its process still runs."""
+        with contextlib.suppress(psutil.Error):
+            process = psutil.Process(self.process)
+            same = abs(process.create_time() - self.created_s) < _CREATED_S
+            return same and process.status() != psutil.STATUS_ZOMBIE
+        return False
+
+
+class _Job:
+    """A job that is followed until its end."""
+
+    def __init__(
+        self, folder: Path, record: JobRecord, process: subprocess.Popen[bytes] | None
+    ) -> None:
+        self.folder, self.record = folder, record
+        self.heard, self.stopping = Heard(), False
+        self.ended = threading.Event()
+        self._process, self._tail = process, EventsTail(folder / "events.jsonl")
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this studio has started it."""
+        return self._process is not None
+
+    def is_alive(self) -> bool:
+        """Whether it runs; of one that this studio has started, what it leaves is taken away."""
+        return self.record.is_alive() if self._process is None else self._process.poll() is None
+
+    def listen(self) -> bool:
+        return self.heard.take(self._tail.read())
+
+    def finished(self) -> JobRecord:
+        """The record of its end."""
+        heard = self.heard
+        heard.end()
+        code = heard.exit_code
+        if code is None and self._process is not None:
+            code = self._process.returncode
+        state = "killed" if code is None or code < 0 else "done" if code == 0 else "failed"
+        if code in _CODES_OF_STOP or (self.stopping and state != "done"):
+            state = "stopped"
+        line = heard.error or ("" if state == "done" else _last_line(self.folder / ERRORS))
+        if state == "done":
+            line = _main_line(heard.result or _output(self.folder / OUTPUT), heard.finished)
+        elif state == "stopped":
+            line = "stopped: the same command goes on from where it was"
+        elif state == "killed" and not heard.error:
+            line = (
+                "it ended without a word, as a program does that was killed or that the system "
+                "had no memory for: start it again, with fewer threads if that happens again"
+            )
+        return self.record.model_copy(
+            update={
+                "state": state, "exit_code": code, "line": line, "stage": heard.stage,
+                "finished": tuple(heard.finished),
+                "ended_utc": _now(),
+            }
+        )  # fmt: skip
+
+    def send(self, number: int) -> None:
+        """Signal its process group; where there are none, end the process."""
+        with contextlib.suppress(OSError):
+            if self.is_alive():
+                if hasattr(os, "killpg"):
+                    os.killpg(self.record.process, number)
+                else:
+                    psutil.Process(self.record.process).terminate()
+
+    def stop(self) -> None:
+        """Ask it to end, ever more firmly; returns when it has."""
+        for number, patience_s in zip((_first_signal(), signal.SIGTERM), _HARDER_S, strict=True):
+            self.send(number)
+            if self.ended.wait(patience_s):
+                return
+        self.send(getattr(signal, "SIGKILL", signal.SIGTERM))
+
+    def to_json(self) -> dict[str, Any]:
+        """As a page takes it."""
+        record, heard = self.record, self.heard
+        began = datetime.fromisoformat(record.started_utc)
+        return {
+            "number": record.number, "name": record.name, "title": record.title,
+            "command": record.command, "state": "stopping" if self.stopping else record.state,
+            "started_utc": record.started_utc,
+            "elapsed_s": round((datetime.now(UTC) - began).total_seconds(), 1),
+            "stage": heard.stage, "stage_title": heard.title, "finished": list(heard.finished),
+            "steps": heard.steps, "warned": heard.warned, "warnings": list(heard.warnings)[-5:],
+            "lines": heard.lines_n,
+        }  # fmt: skip
+
+
+class Jobs:
+    """The jobs of one workspace."""
+
+    def __init__(
+        self, workspace: Path, publish: Publish, program: Sequence[str] = _PROGRAM
+    ) -> None:
+        """Look for a job that an earlier studio has left running.
+
+        Args:
+            workspace: folder of the survey; it need not exist yet.
+            publish: sends an event's name and its JSON values to all pages.
+            program: what takes the arguments of `alice-survey`.
+        """
+        self._workspace, self._publish = workspace.resolve(), publish
+        self._program = program
+        self._lock = threading.RLock()
+        self._job: _Job | None = None
+        self._adopt()
+
+    @property
+    def folder(self) -> Path:
+        """Where the jobs of the workspace are."""
+        return self._workspace / FOLDER
+
+    def start(self, name: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Start a command.
+
+        Args:
+            name: one of `COMMANDS`.
+            arguments: of it, JSON values.
+
+        Returns:
+            The job, as `running` gives it.
+
+        Raises:
+            ConfigError: there is no such command, or an argument is wrong.
+            BusyError: another command is working in the workspace.
+            WorkspaceError: the workspace cannot be written.
+        """
+        words = words_of(name, arguments or {}, self._workspace)
+        with self._lock:
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                with FileLock(self.folder / ".starting", timeout=_LOCK_S):
+                    self._adopt()
+                    self._check_free()
+                    self._job = job = self._started(name, arguments or {}, words)
+            except OSError as error:  # also of a lock that another studio holds too long
+                raise WorkspaceError(f"{self.folder}: no job can start: {why(error)}") from None
+        self._follow(job)
+        return job.to_json()
+
+    def stop(self) -> bool:
+        """Ask the running job to end, as Ctrl-C would; False where none runs."""
+        with self._lock:
+            job = self._job
+            if job is None or job.stopping:
+                return job is not None
+            job.stopping = True
+        threading.Thread(target=job.stop, name="stop", daemon=True).start()
+        self._publish("run", self.state())
+        return True
+
+    def close(self) -> None:
+        """End the running job, if this studio has started it, and wait a little for its end."""
+        job = self._job
+        if job is not None and job.is_own:
+            job.stopping = True
+            job.send(_first_signal())
+            job.ended.wait(_ENDING_S)
+
+    def running(self) -> dict[str, Any] | None:
+        """The job that runs now, by this studio or an earlier one; None without."""
+        job = self._job
+        return None if job is None else job.to_json()
+
+    def state(self) -> dict[str, Any]:
+        """The job that runs, the last one that ended, and whether another command is working."""
+        with self._lock:
+            self._adopt()
+            running = self.running()
+            last = next((one for one in self._records() if one.ended_utc is not None), None)
+        elsewhere = running is None and is_locked(self._workspace)
+        return {
+            "job": running,
+            "last": None if last is None else last.to_json(),
+            "elsewhere": _elsewhere(self._workspace) if elsewhere else None,
+        }
+
+    def history(self) -> list[dict[str, Any]]:
+        """Jobs that have ended, the last one first."""
+        return [one.to_json() for one in self._records() if one.ended_utc is not None]
+
+    def log(self, number: int, after: int = 0) -> dict[str, Any]:
+        """Lines of a job's log, and their number so far.
+
+        Args:
+            number: of the job.
+            after: lines that are known already.
+
+        Raises:
+            FileNotFoundError: there is no such job.
+        """
+        job = self._job
+        if job is not None and job.record.number == number:
+            heard, output = job.heard, ""
+        else:
+            folder = self.folder / f"{number:04d}"
+            if not (folder / RECORD).is_file():
+                raise FileNotFoundError(folder)
+            heard, tail = Heard(), EventsTail(folder / "events.jsonl")
+            heard.take(tail.read())
+            output = "" if heard.lines_n else _output(folder / ERRORS)
+        return {"lines": heard.log(after), "total": heard.lines_n, "output": output}
+
+    def _check_free(self) -> None:
+        if self._job is not None:
+            raise BusyError(
+                f"'{self._job.record.command}' is working here: wait for it, or stop it first"
+            )
+        until_s = time.monotonic() + _LOCK_S
+        while is_locked(self._workspace):
+            if time.monotonic() > until_s:
+                raise BusyError(f"another command is working in {self._workspace}: wait for it")
+            time.sleep(_LOOK_EVERY_S)
+
+    def _started(self, name: str, arguments: Mapping[str, Any], words: Sequence[str]) -> _Job:
+        folders = self._folders()
+        number = int(folders[0].name) + 1 if folders else 1
+        for old in folders[_KEPT_JOBS - 1 :]:
+            shutil.rmtree(old, ignore_errors=True)
+        folder = self.folder / f"{number:04d}"
+        folder.mkdir()
+        command = [
+            *self._program, *words[: len(name.split())],
+            f"--events={folder / 'events.jsonl'}", *words[len(name.split()) :],
+        ]  # fmt: skip
+        with (
+            (folder / OUTPUT).open("wb") as output,
+            (folder / ERRORS).open("wb") as errors,
+            for_other_programs(),
+        ):
+            process = subprocess.Popen(  # noqa: S603 (of a fixed list)
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=errors,
+                start_new_session=True, env=_environment(),
+            )  # fmt: skip
+        try:
+            created_s = psutil.Process(process.pid).create_time()
+        except psutil.Error:  # it has ended already
+            created_s = 0.0
+        record = JobRecord(
+            number=number, name=name, title=COMMANDS[name].title, arguments=dict(arguments),
+            command=shlex.join(["alice-survey", *words]), started_utc=_now(),
+            process=process.pid, created_s=created_s,
+        )  # fmt: skip
+        record.write(folder / RECORD)
+        return _Job(folder, record, process)
+
+    def _adopt(self) -> None:
+        """Follow the job of an earlier or of another studio; close the records of dead ones."""
+        with self._lock:
+            for record in self._records():
+                if record.ended_utc is not None:
+                    continue
+                if self._job is not None and self._job.record.number == record.number:
+                    continue
+                job = _Job(self.folder / f"{record.number:04d}", record, None)
+                if job.is_alive() and self._job is None:
+                    self._job = job
+                    self._follow(job)
+                elif not job.is_alive():
+                    job.listen()
+                    job.finished().write(job.folder / RECORD)
+
+    def _records(self) -> list[JobRecord]:
+        """Records of all jobs, the last one first."""
+        found = []
+        for folder in self._folders():
+            with contextlib.suppress(WorkspaceError):  # of one that is being written or is damaged
+                record = JobRecord.made(folder / RECORD)
+                found += [] if record is None else [record]
+        return found
+
+    def _folders(self) -> list[Path]:
+        try:
+            return sorted((p for p in self.folder.iterdir() if p.name.isdecimal()), reverse=True)
+        except OSError:
+            return []
+
+    def _follow(self, job: _Job) -> None:
+        threading.Thread(target=self._listen, args=(job,), name="job", daemon=True).start()
+
+    def _listen(self, job: _Job) -> None:
+        """Publish what a job reports until it ends."""
+        published_s, is_news = 0.0, True
+        while True:
+            is_alive = job.is_alive()  # before its last events are read
+            is_news |= job.listen()
+            if not is_alive:
+                break
+            since_s = time.monotonic() - published_s
+            if (is_news and since_s >= _PUBLISH_EVERY_S) or since_s >= _ALIVE_EVERY_S:
+                self._publish("run", {"job": job.to_json(), "last": None, "elsewhere": None})
+                published_s, is_news = time.monotonic(), False
+            time.sleep(_LOOK_EVERY_S)
+        record = job.finished()
+        with contextlib.suppress(OSError, WorkspaceError):  # a full disk, a folder that was removed
+            known = None if job.is_own else JobRecord.made(job.folder / RECORD)
+            if known is not None and known.ended_utc is not None:
+                record = known  # by the studio that has started it, which knows its exit code
+            else:
+                record.write(job.folder / RECORD)
+        with self._lock:
+            self._job = None
+        job.ended.set()
+        self._publish(
+            "run", {"job": None, "last": record.to_json(), "elsewhere": None, "ended": True}
+        )
+
+
+def _first_signal() -> signal.Signals:
+    """Ctrl-C; SIGTERM where this program ignores it, and so do those that it starts."""
+    is_ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    return signal.SIGTERM if is_ignored else signal.SIGINT
+
+
+def _environment() -> dict[str, str]:
+    """This environment; modules are found where this program found its own."""
+    places = [place or str(Path.cwd()) for place in sys.path]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(places)}
+
+
+def _elsewhere(workspace: Path) -> dict[str, Any]:
+    """What a command that another program has started seems to be doing."""
+    partial = [path for path in workspace.glob("*.partial") if path.is_dir()]
+    newest = max(partial, key=lambda path: path.stat().st_mtime, default=None)
+    return {"stage": "" if newest is None else newest.name.removesuffix(".partial")}
+
+
+def _output(path: Path) -> str:
+    """The end of what a job has printed."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _OUTPUT_TAIL))
+            return file.read().decode(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _main_line(result: str, finished: Sequence[str]) -> str:
+    """The line of a result that tells most: that of the last stage, else the first."""
+    lines = result.splitlines() or [""]
+    name = spec(finished[-1]).name if finished else ""
+    return next((line for line in lines if line.startswith(f"{name}: ")), lines[0])
+
+
+def _last_line(path: Path) -> str:
+    """The last line that a job has printed, without what marks it as an error."""
+    lines = [line.strip(" \u2502") for line in _output(path).splitlines()]
+    return next((x for x in reversed(lines) if x and x[0] not in "╭╰"), "").removeprefix("error: ")
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,453 @@
+"""Stages of a workspace: folders that appear whole or not at all, skipped while nothing changed.
+
+A stage folder is written as `NAME.partial` and renamed when complete. Its `stage.json` carries the
+stage's version, its settings and a digest of every input file, and a later run skips the stage
+while all of these are unchanged; also the resources used and the versions of the packages.
+"""
+
+import contextlib
+import csv
+import functools
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import to_jsonable_python
+
+from alice_survey.core.contents import first_fault, shown
+from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, why
+from alice_survey.core.run import progress
+from alice_survey.core.run.resources import Meter, Spent, processor, versions, watched
+
+T = TypeVar("T")
+
+STAGE_FILE = "stage.json"
+_SPENT_FILE = ".spent"
+"""In an unfinished stage: the resources used so far."""
+_TEMPORARY = re.compile(r"\..+\.tmp[0-9a-f]+(\..*)?")
+"""Names that `atomic_path` gives, and those that libraries derive from them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One step of the loop: its dependencies and the folder it writes."""
+
+    name: str
+    version: int
+    """Increase it when the stage's code changes its result."""
+    settings: Mapping[str, Any]
+    """Everything but files that the result depends on, as JSON values."""
+    inputs: Sequence[Path] = ()
+    """Files and folders that the result depends on; `stage.json` files inside do not count."""
+    resumes: bool = False
+    """Work can resume from what an interrupted run of the same digest left."""
+
+
+class JsonRecord(BaseModel):
+    """A JSON file of a workspace: a frozen value that is read and written whole.
+
+    Values that a subclass does not name are kept as they are, so that a file of another version of
+    the program is read and written without loss.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True)
+    path: ClassVar[str] = ""
+    """Path of the file, from the workspace."""
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            WorkspaceError: it is missing, not JSON, or lacks a value.
+        """
+        try:
+            return cls.model_validate(read_json(path))
+        except ValidationError as error:
+            raise WorkspaceError(
+                f"{path}: {first_fault(error, 'its content')}: the file is damaged or was edited; "
+                "remove the folder and run the command that makes it again"
+            ) from None
+
+    @classmethod
+    def made(cls, path: Path) -> Self | None:
+        """Read a file; None where it is missing."""
+        return cls.read(path) if path.is_file() else None
+
+    def to_json(self) -> dict[str, Any]:
+        """The values as JSON holds them."""
+        return self.model_dump(mode="json", by_alias=True)
+
+    @classmethod
+    def save(cls, path: Path, values: Mapping[str, Any]) -> Self:
+        """Write values that make up a file of this type."""
+        record = cls.model_validate(values)
+        record.write(path)
+        return record
+
+    def write(self, path: Path) -> None:
+        """Write the file, whole or not at all."""
+        write_json(path, self.to_json())
+
+
+class StageRecord(JsonRecord):
+    """`stage.json`: inputs of a finished stage, and the resources used."""
+
+    stage: str = ""
+    """Name of its folder."""
+    version: int = 0
+    digest: str = ""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    inputs: dict[str, tuple[int, int, str]] = Field(default_factory=dict)
+    """Size, modification time (ns) and digest of each file, by its path from the workspace."""
+    took_s: float = 0.0
+    cpu_s: float | None = None
+    peak_mib: float | None = None
+    processor: str = ""
+    """What it was made on; empty where an older version of the program made it."""
+    versions: dict[str, str] = Field(default_factory=dict)
+    """Versions of the packages that affect results."""
+
+
+def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> bool:
+    """Do a stage's work unless its folder exists and nothing it depends on has changed.
+
+    Args:
+        workspace: folder that holds the stage folders; made when missing.
+        stage: the stage to run.
+        work: writes its files into the folder it is given (`NAME.partial`).
+
+    Returns:
+        True when the work was done, False when it was skipped.
+    """
+    final, partial = workspace / stage.name, workspace / f"{stage.name}.partial"
+    replaced = workspace / f"{stage.name}.replaced"
+    if replaced.exists():  # a kill fell between the two renames below
+        if final.exists():
+            shutil.rmtree(replaced)
+        else:
+            replaced.rename(final)
+    previous = read_stage(final)
+    with progress.step(f"check what {stage.name} depends on"):
+        inputs = digest_inputs(stage.inputs, workspace, previous)
+    digest = _digest_stage(stage, inputs)
+    if previous is not None and previous.digest == digest:
+        if partial.exists():
+            shutil.rmtree(partial)
+        progress.skipped(stage.name)
+        return False
+
+    marker = partial / ".digest"
+    resumed = stage.resumes and _text(marker) == digest
+    if partial.exists() and not resumed:
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True, exist_ok=True)
+    _drop_cut_files(partial)
+    with atomic_path(marker) as path:
+        path.write_text(digest)
+    how = {"resumed": True} if resumed else {}
+    with progress.stage(stage.name, **how) as finish:
+        spent = _measured(partial, work).to_json()
+        _check_unchanged(inputs, workspace, stage.name)
+        record = {
+            "stage": stage.name,
+            "version": stage.version,
+            "digest": digest,
+            "settings": stage.settings,
+            "inputs": inputs,
+            **spent,
+            **how,
+            "processor": processor(),
+            "versions": versions(),
+        }
+        write_json(partial / STAGE_FILE, record)
+        (partial / _SPENT_FILE).unlink(missing_ok=True)
+        marker.unlink()
+        if final.exists():
+            final.rename(replaced)
+        partial.rename(final)
+        if replaced.exists():
+            shutil.rmtree(replaced)
+        finish(**spent, **how)
+    return True
+
+
+def _measured(partial: Path, work: Callable[[Path], object]) -> Spent:
+    """Do a stage's work; return the resources used, including those of an interrupted run."""
+    try:
+        earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # a kill may have come before the first
+        earlier = Spent()
+    meter = Meter()
+
+    def keep(spent: Spent) -> None:
+        with contextlib.suppress(OSError):  # on a full disk the work itself will say so
+            write_json(partial / _SPENT_FILE, spent.after(earlier).to_json())
+
+    with watched(meter, keep):
+        work(partial)
+        return meter.look().after(earlier)
+
+
+def why_stale(workspace: Path, stage: Stage) -> str | None:
+    """Changes since a stage was made, in a few words; None while it is up to date.
+
+    Raises:
+        WorkspaceError: an input does not exist.
+    """
+    record = read_stage(workspace / stage.name)
+    if record is None:
+        return "missing"
+    inputs = digest_inputs(stage.inputs, workspace, record)
+    if record.digest == _digest_stage(stage, inputs):
+        return None
+    if record.version != stage.version:
+        return f"made by version {record.version} of the stage, now {stage.version}"
+    settings = json.loads(json.dumps(stage.settings))
+    changed = list(_different(record.settings, settings))
+    if changed:
+        return f"changed: {_first(changed)}"
+    content = {name: entry[2] for name, entry in record.inputs.items()}
+    return f"changed: {_first(list(_different(content, {n: e[2] for n, e in inputs.items()})))}"
+
+
+def _different(old: object, new: object, name: str = "") -> Iterator[str]:
+    """Dotted names of the values in which two JSON values differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            yield from _different(old.get(key), new.get(key), f"{name}.{key}" if name else str(key))
+    elif old != new:
+        yield name
+
+
+def _first(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def need_stage(workspace: Path, name: str, command: str) -> Path:
+    """The folder of a finished stage.
+
+    Raises:
+        WorkspaceError: it is not there; the message names the command that makes it.
+    """
+    folder = workspace / name
+    if read_stage(folder) is None:
+        raise WorkspaceError(f"{folder} is not there yet; run 'alice-survey {command}' first")
+    return folder
+
+
+def read_stage(folder: Path) -> StageRecord | None:
+    """Contents of a stage's `stage.json`, or None where there is no complete stage."""
+    try:
+        return StageRecord.model_validate_json((folder / STAGE_FILE).read_bytes())
+    except (OSError, ValidationError):
+        return None
+
+
+def digest_inputs(
+    inputs: Sequence[Path], workspace: Path, previous: StageRecord | None
+) -> dict[str, tuple[int, int, str]]:
+    """Digest every file of the inputs, as `{path: (size, mtime_ns, digest)}`.
+
+    A file whose size and modification time match `previous` is not read again.
+
+    Raises:
+        WorkspaceError: an input does not exist.
+    """
+    known = {} if previous is None else previous.inputs
+    digests = {}
+    for path in _files(inputs):
+        name = os.path.relpath(path, workspace)
+        digests[name] = _entry(path, known.get(name))
+    return digests
+
+
+def _check_unchanged(
+    inputs: Mapping[str, tuple[int, int, str]], workspace: Path, stage: str
+) -> None:
+    """Check that files are unchanged since their digests were taken.
+
+    Raises:
+        WorkspaceError: one has changed or is gone.
+    """
+    for name, before in inputs.items():
+        path, what = workspace / name, "has changed"
+        try:
+            same = _entry(path, before)[2] == before[2]
+        except OSError:
+            same, what = False, "has gone"
+        if not same:
+            raise WorkspaceError(
+                f"{path} {what} while {stage} was worked on: what was made of it is not kept; run "
+                "the same command again"
+            )
+
+
+def _entry(path: Path, old: tuple[int, int, str] | None) -> tuple[int, int, str]:
+    """Size, modification time and digest of a file, which is read only if these differ from old."""
+    stat = path.stat()
+    if old is not None and old[:2] == (stat.st_size, stat.st_mtime_ns):
+        return old
+    with path.open("rb") as file:
+        content = hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+    return stat.st_size, stat.st_mtime_ns, content
+
+
+def _files(inputs: Sequence[Path]) -> Iterator[Path]:
+    for path in inputs:
+        if path.is_dir():
+            inside = (p for p in sorted(path.rglob("*")) if p.is_file())
+            yield from (p for p in inside if p.name != STAGE_FILE)
+        elif path.is_file():
+            yield path
+        elif path.exists():
+            raise WorkspaceError(f"{path} is neither a file nor a folder (a pipe?): replace it")
+        else:
+            raise WorkspaceError(f"{path}: no such file or folder")
+
+
+def _digest_stage(stage: Stage, inputs: Mapping[str, tuple[int, int, str]]) -> str:
+    content = {name: entry[2] for name, entry in inputs.items()}
+    text = json.dumps([stage.name, stage.version, stage.settings, content], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text()
+    except OSError:
+        return None
+
+
+def _drop_cut_files(folder: Path) -> None:
+    """Remove what `atomic_path` was writing to when a kill came."""
+    for path in folder.rglob(".*.tmp*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink()
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A path to write to, next to `path`, that replaces it when all went well.
+
+    Threads, processes and machines that write the same file each get a path of their own: the last
+    one that finishes is kept, whole.
+
+    Raises:
+        WorkspaceError: there is a folder of that name.
+    """
+    if path.is_dir():
+        raise WorkspaceError(f"{path} is a folder: give the name of a file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.tmp{os.urandom(6).hex()}{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+_adapter: Callable[[Any], TypeAdapter[Any]] = functools.cache(TypeAdapter)
+
+
+def checked(kind: type[T], data: Any) -> T:
+    """A value of a type from JSON values, which its fields must match.
+
+    Raises:
+        ValueError: names the first value that is wrong or missing.
+    """
+    try:
+        value: T = _adapter(kind).validate_json(json.dumps(data))
+        return value
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the content"
+        given = "" if isinstance(first["input"], dict) else f" = {first['input']!r:.60}"
+        raise ValueError(f"{where}{given}: {first['msg']}") from None
+
+
+def json_values(data: Any) -> Any:
+    """Values, dataclasses and arrays as JSON holds them; NaN and infinity become None."""
+    return to_jsonable_python(data, inf_nan_mode="null", fallback=lambda array: array.tolist())
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write indented JSON atomically, without NaN (which JSON lacks)."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON.
+
+    Raises:
+        WorkspaceError: the file is missing or not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise WorkspaceError(f"{path}: no such file") from None
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise WorkspaceError(f"{path}: not valid JSON: {error}") from None
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file atomically; None and NaN become empty cells."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for row in rows:
+            writer.writerow(["" if cell is None or cell != cell else cell for cell in row])
+
+
+def read_csv(
+    path: Path,
+    required: Iterable[str] = (),
+    *,
+    exact: bool = False,
+    fault: type[AliceError] = NavigationError,
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Read a CSV file with a header.
+
+    Args:
+        path: the file, in UTF-8.
+        required: columns that must be there.
+        exact: keep spaces at the ends of cells, which names of files may have.
+        fault: type of the error.
+
+    Returns:
+        Names of the columns, and rows by column with the number of their line; a cell that a row
+        lacks is empty.
+
+    Raises:
+        AliceError: of type `fault`: the file cannot be read, or lacks a column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, restval="", skipinitialspace=not exact)
+            reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
+            numbered = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise fault(f"{path}: cannot be read: {why(error)}") from None
+    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
+        raise fault(
+            f"{path}: its cells are not apart by commas: save it as CSV with commas between cells "
+            "and points in numbers"
+        )
+    missing = [name for name in required if name not in names]
+    if missing:
+        raise fault(f"{path}: column {missing[0]} is missing; it has {shown(', '.join(names))}")
+    rows = [
+        (line, {name: row[name] if exact else row[name].strip() for name in names})
+        for line, row in numbered
+    ]
+    return names, rows

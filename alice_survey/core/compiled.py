@@ -1,0 +1,218 @@
+"""Compile kernels once for all processes, and again when any code they use changes.
+
+numba keeps a compiled kernel as long as its file stays unchanged, although the kernels
+and constants that were compiled into it may be in other files. Here a kernel is kept as long as
+its call closure stays unchanged: its own code and options, and those of every kernel and constant
+that it reaches. A numba that stores its stamp elsewhere falls back to its own rule, which is
+enough for a package that is installed and not edited.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any, ParamSpec, TypeVar, overload
+
+import numpy as np
+from filelock import Timeout
+from numba import njit
+from numba.core.compiler_lock import global_compiler_lock
+
+from alice_survey.core.errors import note
+from alice_survey.core.run.resources import user_lock
+
+BLOCK = 128
+"""Points at a time: loops over a block that do not branch become vector instructions."""
+_LONGEST_WAIT_S = 120.0
+"""For another process that compiles the same kernel."""
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+_CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)
+
+
+@overload
+def compiled(function: Callable[..., _Result]) -> Callable[..., _Result]: ...
+@overload
+def compiled(**options: Any) -> Callable[[Callable[..., _Result]], Callable[..., _Result]]: ...
+def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function of plain loops, and keep the result on disk.
+
+    Args:
+        function: what to compile; left out when options are given.
+        options: of `numba.njit`, such as `nogil=True` or `error_model="numpy"`.
+
+    Returns:
+        The kernel. numba compiles it again for each combination of types that it is given, so
+        that its annotations do not limit what it takes.
+    """
+
+    def decorated(plain: Callable[..., Any]) -> Any:
+        # A copy of such a kernel in the code of its caller may round in another way than its own
+        # code, and whichever is loaded first is called: results would depend on what was compiled
+        # before. What is inlined is always that of the caller.
+        rounding = {"forceinline": True} if options.get("fastmath") else {}
+        kernel = njit(cache=True, **rounding, **options)(plain)
+        index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+        if hasattr(index, "_source_stamp"):
+            index._source_stamp = _Stamp(kernel)
+            index._load_index = _readable(index._load_index)
+            kernel.compile = _once_a_machine(kernel)
+        return kernel
+
+    return decorated if function is None else decorated(function)
+
+
+def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """The same, where a division by zero gives infinity or NaN as in numpy, without a check."""
+    kernel: Callable[_Arguments, _Result] = compiled(error_model="numpy")(function)
+    return kernel
+
+
+def closure_digest(kernel: Any) -> str:
+    """Digest of all the code in a compiled kernel.
+
+    Args:
+        kernel: a function decorated by `compiled` or `numba.njit`.
+
+    Returns:
+        32 hexadecimal digits, which change with the kernel's code (not with its comments, its
+        docstring or its place in the file), its options, and those of all it calls, as well as
+        with the global constants that any of these reads.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for part in _closure(kernel, set()):
+        digest.update(part.encode(errors="surrogatepass"))
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def note_compiling(kernel: Any, what: str) -> None:
+    """Report, in one line on standard error, that the first call after an installation waits.
+
+    Args:
+        kernel: one that is compiled last, by `compiled`.
+        what: what is compiled, and how long it takes.
+    """
+    stats = kernel.stats
+    kept = Path(stats.cache_path).glob(f"*{kernel.__name__}*.nbi")
+    if not stats.cache_hits and not stats.cache_misses and not any(kept):
+        note(f"compiling {what}")
+
+
+def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]]:
+    """Reader of an index of compiled kernels: empty where its types cannot be found.
+
+    It holds the classes of the arguments by their names, which an older version may have had.
+    """
+
+    def loaded() -> dict[Any, str]:
+        try:
+            return load()
+        except (AttributeError, ImportError):
+            return {}
+
+    return loaded
+
+
+def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
+    """What compiles a kernel for a signature, or loads what is kept.
+
+    It does so while no other process of this machine compiles that kernel, so that of processes
+    that start together one compiles and the others load.
+    """
+    compile_it, cache = kernel.compile, kernel._cache
+    index = cache._cache_file
+    name = hashlib.blake2b(index._index_path.encode(), digest_size=16).hexdigest()
+
+    def compiled_once(signature: Any) -> Any:
+        if cache._index_key(signature, kernel.targetctx.codegen()) in index._load_index():
+            return compile_it(signature)
+        with ExitStack() as held:
+            held.enter_context(global_compiler_lock)  # first: other threads may hold it
+            with suppress(OSError, Timeout):  # then it is compiled once more
+                held.enter_context(user_lock(f"kernel-{name}", _LONGEST_WAIT_S))
+            return compile_it(signature)
+
+    return compiled_once
+
+
+class _Stamp:
+    """A kernel's digest, computed when first compared: all that it calls is defined by then.
+
+    It is stored as plain text, so that a cache can be read without this class.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel
+        self._digest: str | None = None
+
+    def _value(self) -> str:
+        if self._digest is None:
+            self._digest = closure_digest(self._kernel)
+        return self._digest
+
+    def __eq__(self, other: object) -> bool:
+        return self._value() == other
+
+    def __hash__(self) -> int:
+        return hash(self._value())
+
+    def __reduce__(self) -> tuple[type[str], tuple[str]]:
+        return str, (self._value(),)
+
+
+def _closure(kernel: Any, seen: set[int]) -> Iterator[str]:
+    """All code that a kernel uses, itself first; each kernel once."""
+    if id(kernel) in seen:
+        return
+    seen.add(id(kernel))
+    plain = kernel.py_func
+    yield f"{plain.__module__}.{plain.__qualname__}"
+    yield repr(sorted((name, _text(value)) for name, value in kernel.targetoptions.items()))
+    yield repr((plain.__defaults__, plain.__kwdefaults__))
+    yield from _code(plain.__code__, plain.__doc__)
+    for name, value in _referenced(plain):
+        if hasattr(value, "py_func"):
+            yield from _closure(value, seen)
+        elif isinstance(value, _CONSTANTS):
+            yield f"{name}={_text(value)}"
+
+
+def _code(code: CodeType, doc: str | None) -> Iterator[str]:
+    """A function's code without file, line numbers and docstring."""
+    yield code.co_code.hex()
+    yield repr((code.co_names, code.co_varnames, code.co_freevars, code.co_argcount))
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code(constant, None)
+        elif constant is None or constant != doc:
+            yield _text(constant)
+
+
+def _referenced(plain: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
+    """Global and enclosed values that a function names, and those it names within modules."""
+    code, known = plain.__code__, plain.__globals__
+    for name, cell in zip(code.co_freevars, plain.__closure__ or (), strict=True):
+        yield name, cell.cell_contents
+    names = sorted(_names(code))
+    for name in names:
+        value = known.get(name)
+        if isinstance(value, ModuleType):
+            inside = vars(value)
+            yield from ((f"{name}.{other}", inside[other]) for other in names if other in inside)
+        elif name in known:
+            yield name, value
+
+
+def _names(code: CodeType) -> set[str]:
+    inside = (_names(part) for part in code.co_consts if isinstance(part, CodeType))
+    return set(code.co_names).union(*inside)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype.str}{value.shape}{np.ascontiguousarray(value).tobytes().hex()}"
+    if isinstance(value, (set, frozenset)):
+        return repr(sorted(map(repr, value)))
+    return repr(value)

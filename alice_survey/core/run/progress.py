@@ -1,0 +1,346 @@
+"""Progress of a run: what it is doing, how much is done and the remaining time.
+
+Work is reported through three context managers, `part`, `stage` and `step`, wherever it is done.
+Reports become events, records of the package's logger, which the screen, a log and an events file
+take from there.
+"""
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.progress import Task
+
+from alice_survey.core.errors import LOG, is_in_task
+from alice_survey.core.run.display import Console, progress_bars
+from alice_survey.core.run.events import Event
+
+_REPORTED_EVERY_S = 0.5
+"""Time between two progress events of a step."""
+_ALIVE_EVERY_S = 5.0
+"""Time between two such events where nothing changes."""
+_TICK_S = 1.0
+_LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
+
+_QUANTILES = 101
+"""Processor times of a step's tasks that are reported, where it has more."""
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class TaskSpent:
+    """What a task has cost."""
+
+    cpu_s: float
+    sent_bytes: int = 0
+    """Its arguments, where they went to another machine."""
+    received_bytes: int = 0
+    """Its result, from there."""
+
+
+class Step:
+    """A running part of a stage."""
+
+    def __init__(self, run: "Run", label: str, number: int, total: int | None) -> None:
+        self._run = run
+        self.label, self.number, self.total = label, number, total
+        self.done = None if total is None else 0
+        self.task = run.begin_task(label, total)
+        self.reported_s = run.clock()
+        self._spent: list[TaskSpent] = []
+
+    def advance(self, items: int = 1, *, spent: TaskSpent | None = None) -> None:
+        """Count more items as done, one of them a task that has cost something."""
+        if spent is not None:
+            self._spent.append(spent)
+        self.done = (self.done or 0) + items
+        if self.total is not None and self.done > self.total:
+            self.total = self.task.total = None  # more than expected: their number is open
+        self._run.advance(self, items)
+
+    @property
+    def cost(self) -> dict[str, Any]:
+        """What the tasks have cost, as facts of an event; nothing where there were none."""
+        if not self._spent:
+            return {}
+        times = sorted(one.cpu_s for one in self._spent)
+        shown = min(len(times), _QUANTILES)
+        picked = [times[round(n * (len(times) - 1) / max(shown - 1, 1))] for n in range(shown)]
+        return {
+            "tasks": len(times),
+            "cpu_s": round(sum(times), 3),
+            "task_cpu_s": [round(time_s, 4) for time_s in picked],
+            "sent_bytes": sum(one.sent_bytes for one in self._spent) or None,
+            "received_bytes": sum(one.received_bytes for one in self._spent) or None,
+        }
+
+    @property
+    def remaining_s(self) -> float | None:
+        """Remaining time, from the pace of the last minutes; None where it cannot be estimated."""
+        return None if self.total is None else self.task.time_remaining
+
+
+class Run:
+    """State of a run, reported to the handlers of a logger."""
+
+    def __init__(
+        self,
+        console: Console | None = None,
+        files: Sequence[logging.Handler] = (),
+        *,
+        log: logging.Logger = LOG,
+        clock: Clock = lambda: time.monotonic(),
+        ticks: bool = True,
+    ) -> None:
+        """Begin.
+
+        Args:
+            console: what the user sees.
+            files: where events also go.
+            log: the logger of the events.
+            clock: monotonic, s.
+            ticks: whether a thread reports now and then on what takes long.
+        """
+        self.clock = clock
+        self.stages_begun = 0
+        self._console, self._log = console, log
+        self._handlers = [*([console] if console else []), *files]
+        self._bars = progress_bars(clock, shown=console is not None and console.has_bars)
+        self._started_s = clock()
+        self._stages: list[tuple[str, Task]] = []
+        self._steps: list[Step] = []
+        self._steps_begun = 0
+        self._lock = threading.RLock()
+        self._ticks, self._closed = ticks, threading.Event()
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether the user wants to see warnings alone."""
+        return self._console is None or self._console.quiet
+
+    def take(self, log: logging.Logger) -> None:
+        """Route all records of a logger to this run."""
+        log.handlers[:] = self._handlers
+        log.filters[:] = [self._complete]
+
+    def close(self) -> None:
+        """Report nothing more, and restore the terminal."""
+        self._closed.set()
+        with self._lock:
+            if not self._bars.disable:
+                self._bars.stop()
+            for handler in self._handlers:
+                handler.close()
+
+    def report(self, name: str, message: str | None = None, **facts: Any) -> None:
+        """Report something that is neither a stage nor a step."""
+        elapsed_s = self.clock() - self._started_s
+        self._emit(self._event(name, elapsed_s=elapsed_s, message=message, **facts))
+
+    def skip_stage(self, name: str) -> None:
+        """A stage is up to date."""
+        elapsed_s = self.clock() - self._started_s
+        self._emit({**self._event("stage_skipped", elapsed_s=elapsed_s), "stage": name})
+
+    def begin_stage(self, name: str, title: str, facts: Mapping[str, Any]) -> None:
+        """A stage begins; the user sees its title."""
+        with self._lock:
+            self._stages.append((name, self.begin_task(name, None)))
+            self.stages_begun += 1
+            self._emit(self._event("stage_started", elapsed_s=0.0, message=title, **facts))
+
+    def end_stage(self, facts: Mapping[str, Any] | None) -> None:
+        """It ends; without facts it has failed."""
+        with self._lock:
+            for step in list(self._steps):  # of generators that nobody went on with
+                self.end_step(step, complete=False)
+            _, task = self._stages[-1]
+            if facts is not None:
+                self._emit(self._event("stage_finished", elapsed_s=task.elapsed, **facts))
+            self._stages.pop()
+            self._end_task(task)
+
+    def begin_step(self, label: str, total: int | None) -> Step:
+        """A step begins."""
+        with self._lock:
+            self._steps_begun += 1
+            step = Step(self, label, self._steps_begun, total)
+            self._steps.append(step)
+            self._emit_step("step_started", step)
+            return step
+
+    def advance(self, step: Step, items: int) -> None:
+        """Count more items of a step as done; report it now and then."""
+        count = f"{step.done}" if step.total is None else f"{step.done} of {step.total}"
+        with self._lock:
+            if step in self._steps:
+                self._bars.update(step.task.id, advance=items, count=count)
+            if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
+                self._emit_step("step_progress", step)
+
+    def end_step(self, step: Step, *, complete: bool) -> None:
+        """End it, successful or not; a second call has no effect."""
+        with self._lock:
+            if step not in self._steps:
+                return
+            self._emit_step("step_finished", step, complete=complete, **step.cost)
+            self._steps.remove(step)
+            self._end_task(step.task)
+
+    def tick(self) -> None:
+        """Report steps, or a stage without one, that have been silent for a while."""
+        with self._lock:
+            for step in self._steps:
+                if self.clock() - step.reported_s >= _ALIVE_EVERY_S:
+                    self._emit_step("step_progress", step)
+            if self._stages and not self._steps and self._console and not self.is_quiet:
+                event = self._event("stage_runs", elapsed_s=self._stages[-1][1].elapsed)
+                self._console.emit(logging.makeLogRecord({"event": event}))
+
+    def begin_task(self, label: str, total: int | None) -> Task:
+        """Start a clock, and on a terminal a bar."""
+        if self._ticks:  # not before: signals are blocked by now, also in this thread
+            threading.Thread(target=self._tick_often, name="ticks", daemon=True).start()
+            self._ticks = False
+        self._bars.start()
+        self._bars.add_task(label, total=total, count="" if total is None else f"0 of {total}")
+        return self._bars.tasks[-1]
+
+    def _end_task(self, task: Task) -> None:
+        self._bars.remove_task(task.id)
+        if not self._bars.tasks and not self._bars.disable:
+            self._bars.stop()
+
+    def _event(self, name: str, **known: Any) -> Event:
+        utc = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        stage = self._stages[-1][0] if self._stages else None
+        if known.get("elapsed_s") is not None:
+            known["elapsed_s"] = round(known["elapsed_s"], 3)
+        event = {"time_utc": utc, "event": name, "stage": stage, **known}
+        return {key: value for key, value in event.items() if value is not None}
+
+    def _emit_step(self, name: str, step: Step, **facts: Any) -> None:
+        step.reported_s = self.clock()
+        self._emit(
+            self._event(
+                name,
+                step=step.label,
+                step_number=step.number,
+                done=step.done,
+                total=step.total,
+                elapsed_s=step.task.elapsed,
+                remaining_s=step.remaining_s if name == "step_progress" else None,
+                **facts,
+            )
+        )
+
+    def _emit(self, event: Event) -> None:
+        level = _LEVELS.get(event["event"], logging.INFO)
+        with self._lock:
+            self._log.log(level, event.get("message", ""), extra={"event": event})
+
+    def _complete(self, record: logging.LogRecord) -> bool:
+        """Convert a record that is only a message, a note or a warning, to an event."""
+        if "event" not in vars(record):
+            name = "note" if record.levelno < logging.WARNING else "warning"
+            elapsed_s = self.clock() - self._started_s
+            record.event = self._event(name, elapsed_s=elapsed_s, message=record.getMessage())
+        return True
+
+    def _tick_often(self) -> None:
+        while not self._closed.wait(_TICK_S):
+            self.tick()
+
+
+_runs: list[Run] = []
+"""Open runs; events of this process go to the last one."""
+_UNSEEN = Run(log=logging.Logger("unseen", logging.CRITICAL + 1), ticks=False)
+"""Run of tasks, whose own steps are not shown."""
+_part: ContextVar[str] = ContextVar("part", default="")
+
+
+def current() -> Run:
+    """The current run; if none was begun, one that only shows on standard error."""
+    if is_in_task():
+        return _UNSEEN
+    if not _runs:
+        _runs.append(Run(Console()))
+        _runs[0].take(LOG)
+    return _runs[-1]
+
+
+@contextlib.contextmanager
+def reported_to(run: Run) -> Iterator[None]:
+    """Within this block all events, warnings included, go to a run; then it is closed."""
+    before = LOG.handlers[:], LOG.filters[:]
+    _runs.append(run)
+    run.take(LOG)
+    try:
+        yield
+    finally:
+        _runs.remove(run)
+        LOG.handlers[:], LOG.filters[:] = before
+        run.close()
+
+
+@contextlib.contextmanager
+def part(name: str, number: int, of: int) -> Iterator[None]:
+    """Within this block stages are reported as a part of a longer run."""
+    token = _part.set(f"{name} ({number} of {of})" if of > 1 else name)
+    try:
+        yield
+    finally:
+        _part.reset(token)
+
+
+@contextlib.contextmanager
+def stage(name: str, **facts: Any) -> Iterator[Callable[..., None]]:
+    """A stage is worked on; what is yielded takes the facts to report at its end.
+
+    Args:
+        name: name of its folder.
+        facts: to report at its beginning, as JSON values.
+    """
+    whole = _part.get()
+    title = whole if whole.split(" (")[0] == name else f"{whole}: {name}" if whole else name
+    run, last = current(), dict[str, Any]()
+    run.begin_stage(name, title, facts)
+    complete = False
+    try:
+        yield last.update
+        complete = True
+    finally:
+        run.end_stage(last if complete else None)
+
+
+def skipped(name: str) -> None:
+    """A stage is up to date."""
+    current().skip_stage(name)
+
+
+@contextlib.contextmanager
+def step(label: str, total: int | None = None) -> Iterator[Step]:
+    """A step of a stage, or of a command without stages, is worked on; its items are counted on it.
+
+    Args:
+        label: what it does, in a few words.
+        total: how many items are to be done, if they are counted.
+    """
+    run = current()
+    begun = run.begin_step(label, total)
+    complete = False
+    try:
+        yield begun
+        complete = True
+    except GeneratorExit:  # the consumer has enough items
+        complete = True
+        raise
+    finally:
+        run.end_step(begun, complete=complete)

@@ -1,0 +1,1 @@
+"""The closed loop without a vehicle: the vehicle itself, and the sea floor that it photographs."""

@@ -1,0 +1,230 @@
+"""Strobes: light that reaches a surface and the camera, directly and scattered once.
+
+Positions are in the camera's frame, metres; strobes, camera and backscatter move with the vehicle,
+so that the light in the water before a camera is computed once for a survey. Daylight is left out:
+the survey is by night or deep. Three channels: red, green, blue.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.core.compiled import compiled
+from alice_survey.core.config import ImagingConfig
+from alice_survey.core.frames import Array
+from camera_calib.camera import Camera
+from camera_calib.water import WaterOptics, phase_per_sr
+
+LUMENS_PER_WATT = 683.0 * 106.86 / 300.0
+"""White light of an even spectrum from 400 to 700 nm: 683 lm/W times the mean of the CIE photopic
+curve, whose integral is 106.86 nm."""
+
+_EDGE_RAD = math.radians(12.0)
+"""Half the width over which the edge of a beam fades."""
+_GRID = (25, 21)
+_STEPS = 97
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraLight:
+    """The strobes as one camera sees them, and the backscatter of the water."""
+
+    positions_cam: Array
+    """(S, 3) positions of the strobes."""
+    axis_cam: Array
+    """(3,) unit vector along which all strobes point."""
+    beam_rad: float
+    """Half the angle of the cone."""
+    peak_w_per_sr: float
+    """Radiant intensity of one strobe on its axis, in each channel."""
+    attenuation_per_m: Array
+    """(3,)."""
+    reach_m: float
+    """Path along the ray up to which `backscatter` is tabulated."""
+    backscatter: Array
+    """(rows, columns, steps, 3) radiance, W / (m^2 sr), of water up to the path
+    `reach_m * (step / last)^2` along rays of an even grid of pixels over the whole frame."""
+
+
+def camera_light(
+    camera: Camera,
+    body_from_cam: RigidTransform,
+    imaging: ImagingConfig,
+    water: WaterOptics,
+    reach_m: float,
+) -> CameraLight:
+    """Put the strobes into a camera's frame and integrate the backscatter of its rays.
+
+    Args:
+        camera: the camera.
+        body_from_cam: its place on the vehicle.
+        imaging: strobes; they point down in the body's frame.
+        water: optical properties.
+        reach_m: longest path along a ray that will be requested.
+    """
+    positions = body_from_cam.inv().apply(np.asarray(imaging.strobes_body_m, dtype=np.float64))
+    axis = body_from_cam.rotation.inv().apply([0.0, 0.0, 1.0])
+    beam_rad = math.radians(imaging.strobe_beam_deg) / 2.0
+    # A channel is a third of the spectrum.
+    power_w = imaging.strobe_lumens / LUMENS_PER_WATT / 3.0
+    peak = power_w / beam_solid_angle_sr(beam_rad)
+    x = np.linspace(0.0, camera.width_px, _GRID[0])
+    y = np.linspace(0.0, camera.height_px, _GRID[1])
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    origins, directions = camera.unproject(pixels)
+    path = reach_m * (np.arange(_STEPS) / (_STEPS - 1.0)) ** 2
+    table = np.stack([
+        backscatter_along(o, d, path, positions, axis, beam_rad, peak, water)
+        for o, d in zip(origins.reshape(-1, 3), directions.reshape(-1, 3), strict=True)
+    ])  # fmt: skip
+    return CameraLight(
+        positions_cam=positions,
+        axis_cam=axis,
+        beam_rad=beam_rad,
+        peak_w_per_sr=peak,
+        attenuation_per_m=water.attenuation_per_m,
+        reach_m=reach_m,
+        backscatter=table.reshape(_GRID[1], _GRID[0], _STEPS, 3),
+    )
+
+
+def backscatter_along(
+    origin: Array,
+    direction: Array,
+    path_m: Array,
+    strobes: Array | Sequence[Sequence[float]],
+    axis: Array,
+    beam_rad: float,
+    peak_w_per_sr: float,
+    water: WaterOptics,
+) -> Array:
+    """Radiance that water scatters once from strobes into a ray, up to each of some paths.
+
+    Every piece of the ray sends `E(s) b p(angle) exp(-c s) ds`, with `E` the light of each strobe
+    there; a trapezium rule sums them.
+
+    Args:
+        origin: (3,) where the ray leaves the glass.
+        direction: (3,) unit vector.
+        path_m: (P,) rising paths along the ray, from 0.
+        strobes: (S, 3) positions.
+        axis: (3,) unit vector along which they point.
+        beam_rad: half the angle of their cone.
+        peak_w_per_sr: intensity on the axis.
+        water: optical properties.
+
+    Returns:
+        (P, 3) W / (m^2 sr).
+    """
+    points = origin + path_m[:, None] * direction
+    attenuation = water.attenuation_per_m
+    sent = np.zeros((len(path_m), 3))
+    for strobe in np.asarray(strobes, dtype=np.float64):
+        away = points - strobe
+        distance = np.linalg.norm(away, axis=1)
+        cos_beam = away @ axis / distance
+        turned = -(away @ direction) / distance
+        strength = np.array([beam_profile(c, beam_rad) for c in cos_beam]) / distance**2
+        travelled = distance + path_m
+        sent += (strength * phase_per_sr(turned))[:, None] * np.exp(
+            -travelled[:, None] * attenuation
+        )
+    sent *= peak_w_per_sr * water.scattering_per_m
+    pieces = 0.5 * (sent[1:] + sent[:-1]) * np.diff(path_m)[:, None]
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(pieces, axis=0)])
+
+
+def beam_solid_angle_sr(beam_rad: float) -> float:
+    """Power of a strobe over its intensity on the axis: the integral of its profile."""
+    angle = np.linspace(0.0, min(beam_rad + _EDGE_RAD, math.pi / 2.0), 20_001)
+    profile = np.array([beam_profile(math.cos(a), beam_rad) for a in angle])
+    return float(np.trapezoid(2.0 * math.pi * profile * np.sin(angle), angle))
+
+
+@compiled
+def beam_profile(cos_angle: float, beam_rad: float) -> float:
+    """Intensity of a strobe off its axis over that on it: Lambert's cosine within a soft cone."""
+    if cos_angle <= 0.0:
+        return 0.0
+    t = (beam_rad + _EDGE_RAD - math.acos(min(cos_angle, 1.0))) / (2.0 * _EDGE_RAD)
+    t = min(max(t, 0.0), 1.0)
+    return cos_angle * t * t * (3.0 - 2.0 * t)
+
+
+@compiled
+def add_direct(
+    x: float,
+    y: float,
+    z: float,
+    normal: Array,
+    path_m: float,
+    lit: Array,
+    strobes: Array,
+    axis: Array,
+    beam_rad: float,
+    peak: float,
+    attenuation: Array,
+    out: Array,
+) -> None:
+    """Add what strobes send to a place, weakened on the way there and on the way to the camera.
+
+    Irradiance of a surface is `I cos(incidence) / d^2 exp(-c d)`.
+
+    Args:
+        x: place, in the frame of the strobes, metres.
+        y: see x.
+        z: see x.
+        normal: (3,) unit normal of the surface there.
+        path_m: from there to the camera.
+        lit: (S,) how much of each strobe can be seen from there, 0 to 1.
+        strobes: (S, 3) positions.
+        axis: (3,) along which they point.
+        beam_rad: half the angle of their cone.
+        peak: intensity on the axis, W / sr.
+        attenuation: (3,) 1 / m.
+        out: (3,) W / m^2, changed in place.
+    """
+    for k in range(len(strobes)):
+        if lit[k] <= 0.0:
+            continue
+        vx, vy, vz = strobes[k, 0] - x, strobes[k, 1] - y, strobes[k, 2] - z
+        distance2 = vx * vx + vy * vy + vz * vz
+        distance = math.sqrt(distance2)
+        cos_in = (normal[0] * vx + normal[1] * vy + normal[2] * vz) / distance
+        if cos_in <= 0.0:
+            continue
+        cos_beam = -(axis[0] * vx + axis[1] * vy + axis[2] * vz) / distance
+        falls = lit[k] * peak * beam_profile(cos_beam, beam_rad) * cos_in / distance2
+        for channel in range(3):
+            out[channel] += falls * math.exp(-attenuation[channel] * (distance + path_m))
+
+
+@compiled
+def backscatter_at(
+    table: Array, reach_m: float, column: float, row: float, path_m: float, out: Array
+) -> None:
+    """Look up the backscatter of a ray: linear between rays of the grid and between paths.
+
+    Args:
+        table: see `CameraLight.backscatter`.
+        reach_m: see `CameraLight`.
+        column: place in the grid, 0 to columns - 1.
+        row: see column.
+        path_m: along the ray; beyond the table's reach its last value counts.
+        out: (3,) W / (m^2 sr), overwritten.
+    """
+    rows, columns, steps, _ = table.shape
+    step = math.sqrt(min(max(path_m / reach_m, 0.0), 1.0)) * (steps - 1)
+    i, j, k = min(int(row), rows - 2), min(int(column), columns - 2), min(int(step), steps - 2)
+    v, u, w = row - i, column - j, step - k
+    for channel in range(3):
+        total = 0.0
+        for a in range(2):
+            for b in range(2):
+                weight = (v if a else 1.0 - v) * (u if b else 1.0 - u)
+                near, far = table[i + a, j + b, k, channel], table[i + a, j + b, k + 1, channel]
+                total += weight * (near + w * (far - near))
+        out[channel] = total

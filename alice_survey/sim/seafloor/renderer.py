@@ -1,0 +1,480 @@
+"""Render what a flat-port camera sees of a terrain, exactly: ray by ray through glass and water.
+
+Every pixel is a mean over its area (`samples` x `samples` rays) and over the exposure (every ray
+has its own moment, so that motion blurs). Rays come from `Camera.unproject`, hits from
+Open3D's `RaycastingScene` on the part of the terrain in sight, about an origin close by.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import ImageError
+from alice_survey.core.frames import Array
+from alice_survey.sim.seafloor.light import CameraLight, add_direct, backscatter_at
+from alice_survey.sim.seafloor.noise import mix
+from alice_survey.sim.seafloor.terrain import Patch, Terrain
+from alice_survey.sim.seafloor.texture import Texture
+from camera_calib.camera import Camera
+
+Floats = NDArray[np.float32]
+
+_BAND_RAYS = 250_000
+"""Rays worked on at once, about; bounds the memory at any picture size."""
+_SHADOW_BLUR_PX = 3
+_PAD_M = 0.4
+"""Distance beyond the frame from which terrain can cast a shadow into it, about."""
+_LEVEL = 0.05
+"""Descent of a ray, as a share of its length, below which it counts as looking to the horizon."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Objects in front of the camera."""
+
+    terrain: Terrain
+    texture: Texture
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rays:
+    """Rays of a band of rows, in the camera's frame; those of one pixel follow each other."""
+
+    origins: Floats
+    """(N, 3) on the outer glass, metres."""
+    directions: Floats
+    """(N, 3) unit vectors in water."""
+    vignetting: Floats
+    """(N,) cos^4 of the angle between ray and axis in air."""
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    light: CameraLight,
+    ned_from_cam: RigidTransform,
+    samples: int,
+) -> Floats:
+    """Radiance that reaches the pixels of a picture, times the lens's fall-off.
+
+    Args:
+        scene: what is there.
+        camera: who looks.
+        light: the strobes in this camera's frame. Terrain beyond its reach may be left out; a ray
+            that meets none shows the backscatter up to there.
+        ned_from_cam: (T,) poses of the camera at moments spread evenly over the exposure.
+        samples: rays along a side of a pixel.
+
+    Returns:
+        (H, W, 3) red, green and blue, W / (m^2 sr).
+
+    Raises:
+        ImageError: the camera is in the sea floor.
+    """
+    patch = _patch_in_sight(scene.terrain, camera, ned_from_cam, light.reach_m)
+    rotations = ned_from_cam.rotation.as_matrix().reshape(-1, 3, 3)
+    places = ned_from_cam.translation.reshape(-1, 3) - patch.origin_ned
+    picture = np.empty((camera.height_px, camera.width_px, 3), dtype=np.float32)
+    pixel_rad = 1.0 / camera.focal_in_water_px
+    table = (light.attenuation_per_m, light.backscatter, light.reach_m)
+    for first, last in ray_bands(camera, samples):
+        rays = camera_rays(camera, samples, first, last)
+        moments = _moments(last - first, camera.width_px, samples, len(places), first)
+        world = _to_world(rays.origins, rays.directions, moments, rotations, places)
+        path, triangle, uv = _cast(patch, world)
+        shape = (last - first, camera.width_px)
+        lit = _visible_strobes(
+            patch, light, world, path, moments, rotations, places, samples, shape
+        )
+        points, normals, material = _surface(
+            world,
+            path,
+            triangle,
+            uv,
+            patch.vertices,
+            patch.triangles,
+            patch.normals,
+            patch.material,
+        )
+        footprint = _footprints(path, normals, world, np.float32(pixel_rad / samples))
+        if patch.to_rest is not None:
+            points += _between_corners(path, triangle, uv, patch.triangles, patch.to_rest)
+        albedo = scene.texture.albedo(points + patch.origin_ned, material, footprint)
+        _shade(
+            rays.origins, rays.directions, rays.vignetting, path, normals, albedo, lit, moments,
+            rotations, light.positions_cam, light.axis_cam, light.beam_rad, light.peak_w_per_sr,
+            *table, samples, first, camera.height_px, picture[first:last],
+        )  # fmt: skip
+    return picture
+
+
+def range_map(
+    scene: Scene, camera: Camera, ned_from_cam: RigidTransform, reach_m: float = 20.0
+) -> Floats:
+    """Distance to the sea floor along the axis from the entrance pupil, through pixel centres.
+
+    Args:
+        scene: what is there.
+        camera: who looks.
+        ned_from_cam: one pose.
+        reach_m: path along rays to the horizon beyond which terrain may be left out.
+
+    Returns:
+        (H, W) metres; NaN where a ray meets nothing.
+    """
+    pose = RigidTransform.from_matrix(ned_from_cam.as_matrix().reshape(1, 4, 4))
+    patch = _patch_in_sight(scene.terrain, camera, pose, reach_m)
+    places = pose.translation - patch.origin_ned
+    result = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    for first, last in ray_bands(camera, 1):
+        rays = camera_rays(camera, 1, first, last)
+        moments = np.zeros(len(rays.origins), dtype=np.uint8)
+        world = _to_world(rays.origins, rays.directions, moments, pose.rotation.as_matrix(), places)
+        path = _cast(patch, world)[0]
+        z = rays.origins[:, 2] + path * rays.directions[:, 2]
+        result[first:last] = np.where(np.isfinite(path), z, np.nan).reshape(-1, camera.width_px)
+    return result
+
+
+def flat_floor_radiance(
+    camera: Camera, light: CameraLight, range_m: float, albedo: Array, step_px: int
+) -> Floats:
+    """Radiance of every `step_px`-th pixel over a flat, even floor square to the camera's axis.
+
+    Args:
+        camera: who looks.
+        light: the strobes in its frame.
+        range_m: from the entrance pupil to the floor along the axis.
+        albedo: (3,) of the floor.
+        step_px: between pixels.
+
+    Returns:
+        (rows, columns, 3) as `render` gives.
+    """
+    pixels = camera.pixel_centres(step_px)
+    origins, directions = camera.unproject(pixels)
+    path = (range_m - origins[..., 2]) / directions[..., 2]
+    vignetting = _vignetting(camera, pixels)
+    picture = np.zeros((*path.shape, 3), dtype=np.float32)
+    normal, lit = np.array([0.0, 0.0, -1.0]), np.ones(len(light.positions_cam))
+    last = np.array(light.backscatter.shape[1::-1]) - 1
+    for index in np.ndindex(*path.shape):
+        direct, veil = np.zeros(3), np.zeros(3)
+        x, y, z = origins[index] + path[index] * directions[index]
+        add_direct(
+            x, y, z, normal, path[index], lit, light.positions_cam, light.axis_cam, light.beam_rad,
+            light.peak_w_per_sr, light.attenuation_per_m, direct,
+        )  # fmt: skip
+        column, row = pixels[index] / (camera.width_px, camera.height_px) * last
+        backscatter_at(light.backscatter, light.reach_m, column, row, path[index], veil)
+        picture[index] = vignetting[index] * (albedo / math.pi * direct + veil)
+    return picture
+
+
+@lru_cache(maxsize=48)  # about 340 MB; both cameras at a quarter of the full resolution fit
+def camera_rays(camera: Camera, samples: int, first_row: int, last_row: int) -> Rays:
+    """Rays of the pixels of some rows: `samples` x `samples` of each, evenly over its area.
+
+    Raises:
+        ImageError: the lens model has no inverse somewhere in the frame.
+    """
+    # One sample in each of samples^2 cells, and at samples^2 different x and y: an edge along a row
+    # of pixels is placed as finely as one across them (multi-jittered arrangement, unjittered).
+    i, j = np.mgrid[:samples, :samples]
+    inside_x = ((i + (j + 0.5) / samples) / samples).ravel()
+    inside_y = ((j + (i + 0.5) / samples) / samples).ravel()
+    x = np.arange(camera.width_px)[None, :, None] + inside_x
+    y = np.arange(first_row, last_row)[:, None, None] + inside_y
+    pixels = np.stack(np.broadcast_arrays(x, y), axis=-1).reshape(-1, 2)
+    origins, directions = camera.unproject(pixels)
+    if not np.all(np.isfinite(directions)):
+        raise ImageError(
+            "the camera's lens distortion or port has no ray for some pixels of the frame; "
+            "check k1, k2, p1, p2 and the port's normal"
+        )
+    return Rays(
+        origins=origins.astype(np.float32),
+        directions=directions.astype(np.float32),
+        vignetting=_vignetting(camera, pixels).astype(np.float32),
+    )
+
+
+def _vignetting(camera: Camera, pixels: Array) -> Array:
+    """Fall of light off the axis, by a power of the cosine in air, for pixels (..., 2)."""
+    in_air = camera.in_air().unproject(pixels)[1]
+    fall: Array = in_air[..., 2] ** camera.lens.falloff
+    return fall
+
+
+def ray_bands(camera: Camera, samples: int) -> list[tuple[int, int]]:
+    """First and last (not included) rows of bands of a picture that hold about as many rays."""
+    rows = max(_BAND_RAYS // (camera.width_px * samples**2), 1)
+    return [(r, min(r + rows, camera.height_px)) for r in range(0, camera.height_px, rows)]
+
+
+def _patch_in_sight(
+    terrain: Terrain, camera: Camera, poses: RigidTransform, reach_m: float
+) -> Patch:
+    """The part of a terrain that the camera can see from any of the poses, and some around it.
+
+    Rays down end below the deepest floor; where some look level or up, all end at `reach_m`
+    at the latest.
+    """
+    origins, directions = camera.unproject(camera.border(8))
+    deepest = float(terrain.depths.max()) + terrain.offset_ned[2] + _PAD_M
+    level = bool(min(p.rotation.apply(directions)[:, 2].min() for p in poses) < _LEVEL)
+    if level:  # then rays within the frame can end farther out than those of its border
+        inner = camera.pixel_centres(max(camera.width_px // 16, 1)).reshape(-1, 2)
+        origins, directions = camera.unproject(np.concatenate([camera.border(8), inner]))
+    corners = []
+    for pose in poses:
+        from_ned, along = pose.apply(origins), pose.rotation.apply(directions)
+        down = deepest - from_ned[:, 2]
+        if down.min() <= 0.0:
+            raise ImageError(
+                f"the camera at {float(from_ned[:, 2].mean()):.2f} m depth is not above a sea "
+                f"floor of {deepest:.2f} m; check depth and altitude"
+            )
+        path = down / np.maximum(along[:, 2], _LEVEL)
+        path = np.minimum(path, reach_m) if level else path
+        corners += [from_ned[:, :2], (from_ned + path[:, None] * along)[:, :2]]
+    low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+    (south, west), (north, east) = (low - _PAD_M).tolist(), (high + _PAD_M).tolist()
+    return terrain.patch((south, north, west, east))
+
+
+def _cast(patch: Patch, world: Floats) -> tuple[Floats, NDArray[np.uint32], Floats]:
+    """Path to the first hit (inf where there is none), its triangle, its place in the triangle."""
+    import open3d as o3d
+
+    hits: dict[str, Any] = patch.scene.cast_rays(o3d.core.Tensor.from_numpy(world), nthreads=1)
+    return hits["t_hit"].numpy(), hits["primitive_ids"].numpy(), hits["primitive_uvs"].numpy()
+
+
+def _visible_strobes(
+    patch: Patch,
+    light: CameraLight,
+    world: Floats,
+    path: Floats,
+    moments: NDArray[np.uint8],
+    rotations: Array,
+    places: Array,
+    samples: int,
+    shape: tuple[int, int],
+) -> Floats:
+    """How much of each strobe a pixel's place on the ground sees, (pixels, S).
+
+    One ray to each strobe from one sample of each pixel; a small blur stands for the strobe's size.
+    """
+    import cv2
+    import open3d as o3d
+
+    step = samples * samples
+    lit = np.empty((shape[0] * shape[1], len(light.positions_cam)), dtype=np.float32)
+    for k, strobe in enumerate(light.positions_cam):
+        rays = _shadow_rays(world[::step], path[::step], moments[::step], rotations, places, strobe)
+        dark = patch.scene.test_occlusions(
+            o3d.core.Tensor.from_numpy(rays), 0.002, 1.0 - 1e-4, nthreads=1
+        )
+        clear = 1.0 - dark.numpy().astype(np.float32)
+        lit[:, k] = cv2.blur(clear.reshape(shape), (_SHADOW_BLUR_PX, _SHADOW_BLUR_PX)).ravel()
+    return lit
+
+
+@compiled
+def _moments(
+    rows: int, columns: int, samples: int, poses: int, first_row: int
+) -> NDArray[np.uint8]:
+    """Which pose each ray uses: all of a pixel's are spread over the exposure, in random order."""
+    count = samples * samples
+    moments = np.empty(rows * columns * count, np.uint8)
+    for pixel in range(rows * columns):
+        h = mix(np.uint32(pixel + first_row * columns) ^ np.uint32(0x5BD1E995))
+        for k in range(count):
+            part = (k * 7 + h % np.uint32(count)) % count if count % 7 else (k + h) % count
+            h2 = mix(np.uint32(h + np.uint32(k * 977 + 1)))
+            moments[pixel * count + k] = int(
+                (part + (h2 & np.uint32(0xFFFF)) / 65536.0) * poses / count
+            )
+    return moments
+
+
+@compiled
+def _to_world(
+    origins: Array, directions: Array, moments: Array, rotations: Array, places: Array
+) -> Floats:
+    """Rays in Open3D's layout, (N, 6) float32, about the origin that `places` count from."""
+    world = np.empty((len(origins), 6), np.float32)
+    for i in range(len(origins)):
+        rotation, place = rotations[moments[i]], places[moments[i]]
+        for a in range(3):
+            p, d = place[a], 0.0
+            for b in range(3):
+                p += rotation[a, b] * origins[i, b]
+                d += rotation[a, b] * directions[i, b]
+            world[i, a], world[i, 3 + a] = p, d
+    return world
+
+
+@compiled
+def _shadow_rays(
+    world: Array, path: Array, moments: Array, rotations: Array, places: Array, strobe: Array
+) -> Floats:
+    """From each hit to a strobe, with the distance as the unit of length."""
+    rays = np.zeros((len(world), 6), np.float32)
+    for i in range(len(world)):
+        if not path[i] < np.inf:
+            rays[i, 5] = 1.0
+            continue
+        rotation, place = rotations[moments[i]], places[moments[i]]
+        for a in range(3):
+            hit = world[i, a] + path[i] * world[i, 3 + a]
+            aim = place[a]
+            for b in range(3):
+                aim += rotation[a, b] * strobe[b]
+            rays[i, a], rays[i, 3 + a] = hit, aim - hit
+    return rays
+
+
+@compiled
+def _surface(
+    world: Array,
+    path: Array,
+    triangle: Array,
+    uv: Array,
+    vertices: Array,
+    triangles: Array,
+    vertex_normals: Array,
+    vertex_material: Array,
+) -> tuple[Array, Floats, Floats]:
+    """Place, smooth unit normal and material of each hit; a miss keeps zeros."""
+    points = np.zeros((len(world), 3))
+    normals = np.zeros((len(world), 3), np.float32)
+    material = np.zeros(len(world), np.float32)
+    for i in range(len(world)):
+        if not path[i] < np.inf:
+            continue
+        a, b, c = triangles[triangle[i]]
+        u, v = uv[i, 0], uv[i, 1]
+        w = np.float32(1.0) - u - v
+        length = 0.0
+        for axis in range(3):
+            points[i, axis] = world[i, axis] + np.float64(path[i]) * world[i, 3 + axis]
+            n = (
+                w * vertex_normals[a, axis]
+                + u * vertex_normals[b, axis]
+                + v * vertex_normals[c, axis]
+            )
+            normals[i, axis] = n
+            length += n * n
+        length = math.sqrt(length)
+        for axis in range(3):
+            normals[i, axis] /= length
+        material[i] = w * vertex_material[a] + u * vertex_material[b] + v * vertex_material[c]
+    return points, normals, material
+
+
+@compiled
+def _between_corners(
+    path: Array, triangle: Array, uv: Array, triangles: Array, values: Array
+) -> Array:
+    """(N, 3) values of vertices, linear within the triangle of each hit; a miss gets zeros."""
+    found = np.zeros((len(path), 3))
+    for i in range(len(path)):
+        if not path[i] < np.inf:
+            continue
+        a, b, c = triangles[triangle[i]]
+        u, v = uv[i, 0], uv[i, 1]
+        for axis in range(3):
+            found[i, axis] = (
+                (1.0 - u - v) * values[a, axis] + u * values[b, axis] + v * values[c, axis]
+            )
+    return found
+
+
+@compiled
+def _footprints(path: Array, normals: Array, world: Array, sample_rad: float) -> Floats:
+    """Distance between neighbouring samples on the surface, metres."""
+    footprint = np.empty(len(path), np.float32)
+    for i in range(len(path)):
+        if not path[i] < np.inf:
+            footprint[i] = 1.0
+            continue
+        slant = 0.0
+        for axis in range(3):
+            slant -= normals[i, axis] * world[i, 3 + axis]
+        footprint[i] = path[i] * sample_rad / math.sqrt(max(slant, 0.1))
+    return footprint
+
+
+@compiled
+def _shade(
+    origins: Array,
+    directions: Array,
+    vignetting: Array,
+    path: Array,
+    normals: Array,
+    albedo: Array,
+    lit: Array,
+    moments: Array,
+    rotations: Array,
+    strobes: Array,
+    axis: Array,
+    beam_rad: float,
+    peak: float,
+    attenuation: Array,
+    table: Array,
+    reach_m: float,
+    samples: int,
+    first_row: int,
+    frame_rows: int,
+    picture: Array,
+) -> None:
+    """Light of every ray, averaged over each pixel: direct from the strobes, and backscatter."""
+    rows, columns, _ = picture.shape
+    count = samples * samples
+    normal, direct, veil = np.empty(3), np.empty(3), np.empty(3)
+    grid_x, grid_y = (table.shape[1] - 1) / columns, (table.shape[0] - 1) / frame_rows
+    for pixel in range(rows * columns):
+        row, column = pixel // columns, pixel % columns
+        red, green, blue = 0.0, 0.0, 0.0
+        for k in range(count):
+            i = pixel * count + k
+            t = path[i]
+            along = np.float64(t) if t < np.inf else reach_m
+            backscatter_at(
+                table,
+                reach_m,
+                (column + 0.5) * grid_x,
+                (row + first_row + 0.5) * grid_y,
+                along,
+                veil,
+            )
+            direct[:] = 0.0
+            if t < np.inf:
+                rotation = rotations[moments[i]]
+                for a in range(3):
+                    normal[a] = (
+                        rotation[0, a] * normals[i, 0]
+                        + rotation[1, a] * normals[i, 1]
+                        + rotation[2, a] * normals[i, 2]
+                    )
+                add_direct(
+                    origins[i, 0] + along * directions[i, 0],
+                    origins[i, 1] + along * directions[i, 1],
+                    origins[i, 2] + along * directions[i, 2],
+                    normal, along, lit[pixel], strobes, axis, beam_rad, peak, attenuation, direct,
+                )  # fmt: skip
+            weight = vignetting[i] / count
+            red += weight * (albedo[i, 0] / math.pi * direct[0] + veil[0])
+            green += weight * (albedo[i, 1] / math.pi * direct[1] + veil[1])
+            blue += weight * (albedo[i, 2] / math.pi * direct[2] + veil[2])
+        picture[row, column, 0] = red
+        picture[row, column, 1] = green
+        picture[row, column, 2] = blue

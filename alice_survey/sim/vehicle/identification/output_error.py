@@ -1,0 +1,497 @@
+"""The joint fit: parameters whose simulation comes closest to all measurements.
+
+Output-error least squares (L. Ljung, System Identification, 1999): each window is
+simulated from a start of its own, so that a log in one window is single shooting and one cut into
+many is multiple shooting. The starts are eliminated (variable projection, Golub & Pereyra, Inverse
+Problems 19, 2003): for given parameters each window's start is solved for, and the parameters see
+residuals and slopes with the directions of the start taken out. The sensitivities are exact.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.executor import progress
+from alice_survey.core.frames import Array
+from alice_survey.core.run.progress import step as named_step
+from alice_survey.sim.vehicle.identification.covariance import (
+    Stretches,
+    design_effect,
+    in_stretches,
+    jackknife_covariance,
+    stretch_numbers,
+)
+from alice_survey.sim.vehicle.identification.noise import autocovariance, noise_sigma
+from alice_survey.sim.vehicle.identification.parameters import Parameters
+from alice_survey.sim.vehicle.identification.prior import PriorSigmas, StartPrior, prior_of
+from alice_survey.sim.vehicle.identification.sensitivity import (
+    CHANNELS,
+    START,
+    STATES,
+    Physics,
+    scratch_for,
+    simulate,
+    with_given,
+)
+from alice_survey.sim.vehicle.identification.windows import Mask, Window, cut, residual_channels
+from alice_survey.sim.vehicle.log import attitude_of
+
+_SHORT_S = 5.0
+"""First approximation uses windows no longer than this: over a short time a simulation stays
+near the measured motion whatever the parameters, so that the fit is led to the right minimum."""
+_ROUGH_STEP_S = 0.1
+"""Integration steps of the first approximation."""
+_START_SIGMA = np.array([0.5] * 3 + [2.0] * 6)
+"""Distance, rad, m/s and rad/s, of a start from the first measured values that costs one
+sigma: wide, so that it matters only where nothing was measured."""
+_SETTLED = 1e-2
+"""A start has converged when the remaining gain is this small against one sigma squared."""
+_NOTHING = 1e-6
+"""Or this small against the whole sum of squares."""
+_ROUGH_SHARE = 0.1
+"""Share of a channel's spread used as sigma in the first approximation, if above noise."""
+_BLIND = 1e-3
+"""Sigmas by which all residuals together move where a parameter changes by itself, or by 1 if it is
+smaller: a parameter that does less is not seen at all."""
+_NOTICED = 2e-3
+"""Change of the sum of squares, in sigmas squared, that ends a fit: a twentieth of a sigma of one
+parameter."""
+_MOST_EVALUATIONS = 60
+"""Most evaluations of all windows, in each round."""
+_ROUNDS = 4
+"""Most re-estimations of the noise."""
+_SAME = 0.02
+"""Relative change of the noise that counts as zero."""
+_SAME_WEIGHT = 0.1
+"""The same of the prior's weight."""
+_LEAST_SIGMA = np.array([1e-6] * CHANNELS)
+"""Noise cannot be estimated smaller: m/s, rad/s, rad."""
+_SINGULAR = 1e-12
+"""Ratio of the information's least to greatest eigenvalue, in units of its diagonal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """Settings of the simulation of windows."""
+
+    longest_step_s: float = 0.025
+    """Rows farther apart are crossed in several steps."""
+    hold: bool = False
+    """Inputs are held until the next row; else they are linear between rows."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OutputErrorFit:
+    """Fitted parameters with their covariance."""
+
+    parameters: Parameters
+    values: Array
+    """(P,)"""
+    covariance: Array
+    """(P, P) with the residuals' correlation in time and across channels, and that of the prior;
+    zero of parameters at a bound."""
+    prior_covariance: Array
+    """(P, P) the part that comes of the start's own error; zero without a prior."""
+    white_covariance: Array
+    """(P, P) as if the residuals were white: from the Gauss-Newton Hessian alone."""
+    at_bound: Mask
+    """(P,) bool: held by a bound, so without sigma."""
+    channel_sigma: Array
+    """(9,) sigmas of the residuals, NaN where nothing was measured."""
+    correlation_s: Array
+    """(9,) correlation time of the residuals: zero if white."""
+    windows: Sequence[Window]
+    starts: Sequence[Array]
+    """(10,) state each window begins with, nu relative to the water."""
+    samples: int
+    prior: PriorSigmas | None = None
+    """As it was given."""
+
+    @property
+    def sigma(self) -> Array:
+        """(P,) sigmas; NaN of parameters at a bound."""
+        sigma: Array = np.sqrt(np.diag(self.covariance))
+        return np.where(self.at_bound, np.nan, sigma)
+
+    @property
+    def correlation(self) -> Array:
+        """(P, P) correlations; NaN of parameters at a bound."""
+        sigma = self.sigma
+        matrix: Array = self.covariance / np.outer(sigma, sigma)
+        return matrix
+
+
+@named_step("fit to the logs")
+def fit_output_error(
+    windows: Sequence[Window],
+    parameters: Parameters,
+    *,
+    simulation: Simulation | None = None,
+    prior: PriorSigmas | None = None,
+) -> OutputErrorFit:
+    """Fit parameters to windows.
+
+    Args:
+        windows: all with the thrusters of the parameters' vehicle, or all without.
+        parameters: what is free, and where it starts.
+        simulation: steps and inputs.
+        prior: how near the values are to those they start from; nothing is known if not given.
+
+    Raises:
+        VehicleError: the simulation does not stay finite at the start, the fit does not settle, or
+            the logs do not determine the parameters.
+    """
+    how = simulation or Simulation()
+    lower, upper = parameters.bounds
+    short = [part for window in windows for part in cut(window, _SHORT_S)]
+    rough = replace(how, longest_step_s=max(how.longest_step_s, _ROUGH_STEP_S))
+    known = prior_of(parameters, windows, prior)
+    approach = _FitProblem(short, parameters, rough, _first_sigma(windows), known, settled=1.0)
+    approach.begin(parameters.start)
+    result = least_squares(
+        approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
+        bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
+    )  # fmt: skip
+    values = result.x
+    approach.estimate_sigma(values)
+    problem = _FitProblem(windows, parameters, how, approach.sigma, known)
+    rounds = (1e2,) * _ROUNDS + (1.0,)
+    settled = False
+    for looseness in progress(rounds, "fit", len(rounds)):
+        if settled and looseness > 1.0:
+            continue
+        problem.begin(values)
+        result = least_squares(
+            problem.residuals, np.clip(values, lower, upper), problem.jacobian,
+            bounds=(lower, upper), x_scale="jac", ftol=looseness * _NOTICED / problem.samples,
+            xtol=1e-10, gtol=None, max_nfev=_MOST_EVALUATIONS,
+        )  # fmt: skip
+        if result.status == 0:
+            raise VehicleError(
+                f"the fit has not settled after {_MOST_EVALUATIONS} evaluations: free fewer "
+                "parameters, or start from coefficients that are closer"
+            )
+        values = result.x
+        if looseness > 1.0:
+            settled = problem.estimate_sigma(values) < _SAME
+            settled &= problem.weigh_prior(values) < _SAME_WEIGHT
+    held = result.active_mask
+    values = np.where(held < 0, lower, np.where(held > 0, upper, values))
+    return replace(problem.result(values, held != 0), prior=prior)
+
+
+class _FitProblem:
+    """Residuals of all windows with their starts solved for."""
+
+    def __init__(
+        self,
+        windows: Sequence[Window],
+        parameters: Parameters,
+        how: Simulation,
+        sigma: Array,
+        prior: StartPrior | None,
+        settled: float = _SETTLED,
+    ) -> None:
+        self.windows, self.parameters, self.how, self.settled = windows, parameters, how, settled
+        self.prior, self.prior_weight = prior, 1.0
+        self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _LEAST_SIGMA)
+        self.count = len(parameters.names)
+        self.measured = [
+            np.isfinite(residual_channels(w, _blank(w))) & np.ones(CHANNELS, bool) for w in windows
+        ]
+        # Starts of the parameters whose slopes were last requested: a trial nearby begins there, so
+        # that it comes back to the same residuals as its step goes to nothing.
+        self.samples = sum(int(mask.sum()) for mask in self.measured)
+        self.starts = [window.start.copy() for window in windows]
+        self.gains = [np.zeros((START, self.count)) for _ in windows]
+        self.at = parameters.start.copy()
+        self.trial: tuple[Array, list[Array], list[Array], Array] | None = None
+        columns = self.count + START
+        self.scratch = scratch_for(columns, windows[0].record.rps.shape[1])
+        self.sensitivity = np.zeros((STATES, columns))
+
+    def begin(self, values: Array) -> None:
+        """Check that the simulation works where the fit starts."""
+        if not np.all(np.isfinite(self.residuals(values))):
+            raise VehicleError(
+                "the simulation does not stay finite with the coefficients the fit starts from: "
+                "check signs and units of log and vehicle, or use shorter windows"
+            )
+        rows = self.samples + START * len(self.windows)
+        reach = np.linalg.norm(self.jacobian(values)[:rows], axis=0) * np.maximum(
+            np.abs(values), 1.0
+        )
+        names = [n for n, r in zip(self.parameters.names, reach, strict=True) if r < _BLIND]
+        if names:
+            raise VehicleError(f"the logs do not determine {', '.join(names)}: do not free them")
+
+    def residuals(self, values: Array) -> Array:
+        """All residuals in sigmas, minus what the starts explain; infinite where there are none."""
+        solved = self._solve(values)
+        if solved is None:
+            size = self.samples + START * len(self.windows)
+            size += 0 if self.prior is None else self.count
+            return np.full(size, np.inf)
+        residuals, slopes, starts, gains = [], [], [], []
+        for start, residual, slope in solved:
+            by_start = slope[:, self.count :]
+            basis, triangle = np.linalg.qr(by_start)
+            by_parameters = slope[:, : self.count]
+            inner = basis.T @ by_parameters
+            residuals.append(residual - basis @ (basis.T @ residual))
+            slopes.append(by_parameters - basis @ inner)
+            starts.append(start)
+            gains.append(np.linalg.solve(triangle, inner))
+        if self.prior is not None:
+            share = np.sqrt(self.prior_weight)
+            residuals.append(share * self.prior.residuals(values))
+            slopes.append(np.diag(share * self.prior.slopes(values)))
+        self.trial = (values.copy(), starts, gains, np.concatenate(slopes))
+        return np.concatenate(residuals)
+
+    def jacobian(self, values: Array) -> Array:
+        """Slopes of the residuals; trials begin from here afterwards."""
+        if self.trial is None or not np.array_equal(values, self.trial[0]):
+            self.residuals(values)
+        if self.trial is None:
+            raise VehicleError("the simulation does not stay finite")
+        self.at, self.starts, self.gains, slopes = self.trial
+        return slopes
+
+    def estimate_sigma(self, values: Array) -> float:
+        """Estimate the noise from the residuals; return its relative change."""
+        sigma = self._channel_sigma(self._by_channel(self.residuals(values)))
+        known = np.isfinite(sigma)
+        new = np.maximum(np.where(known, sigma * self.sigma, 1.0), _LEAST_SIGMA)
+        changed = float(np.max(np.abs(new / self.sigma - 1.0)[known]))
+        self.sigma = new
+        return changed
+
+    def result(self, values: Array, at_bound: Mask) -> OutputErrorFit:
+        """The fit at the values it settled on."""
+        residuals, table = self.residuals(values), self.jacobian(values)
+        free = np.flatnonzero(~at_bound)
+        information = table[:, free].T @ table[:, free]
+        inverse = _inverse(information, [self.parameters.names[k] for k in free])
+        runs, times = self._by_channel(residuals), np.full(CHANNELS, np.nan)
+        for channel, series in enumerate(runs):
+            if any(len(run) for run in series):
+                lags = autocovariance(series)
+                times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / lags[0]
+        held = self._prior_information(values)[np.ix_(free, free)]
+        scattered = jackknife_covariance(self._stretches(residuals, table[:, free]), held)
+        # By chance it may come out below that of white noise: this is not used.
+        from_logs = inverse @ (information - held) @ inverse
+        if scattered is not None:
+            least = np.sqrt(np.maximum(np.diag(from_logs) / np.diag(scattered), 1.0))
+            from_logs = scattered * np.outer(least, least)
+        # The start is off by its own sigma: a score of weight times that of the prior alone.
+        from_prior = self.prior_weight * inverse @ held @ inverse
+        tables = [np.zeros((self.count, self.count)) for _ in range(3)]
+        for whole, part in zip(tables, (from_logs, from_prior, inverse), strict=True):
+            whole[np.ix_(free, free)] = part
+        return OutputErrorFit(
+            parameters=self.parameters, values=values, covariance=tables[0] + tables[1],
+            prior_covariance=tables[1], white_covariance=tables[2], at_bound=at_bound,
+            channel_sigma=self._channel_sigma(runs) * self.sigma, correlation_s=times,
+            windows=self.windows, starts=list(self.starts), samples=self.samples,
+        )  # fmt: skip
+
+    def weigh_prior(self, values: Array) -> float:
+        """Let the prior count as the logs' residuals are correlated; return its relative change."""
+        if self.prior is None:
+            return 0.0
+        stretches = self._stretches(self.residuals(values), self.jacobian(values))
+        new = design_effect(stretches, self._prior_information(values))
+        changed = abs(new / self.prior_weight - 1.0)
+        self.prior_weight = new
+        return changed
+
+    def _prior_information(self, values: Array) -> Array:
+        """(P, P) information of the prior as it counts."""
+        if self.prior is None:
+            return np.zeros((self.count, self.count))
+        return np.diag(self.prior_weight * self.prior.slopes(values) ** 2)
+
+    def _stretches(self, residuals: Array, table: Array) -> Stretches:
+        """Residuals and slopes by stretches of the logs; priors of starts with their window."""
+        numbers = stretch_numbers([window.record.time_s for window in self.windows])
+        rows = [
+            np.concatenate([number[np.nonzero(mask)[0]], np.full(START, number[0])])
+            for number, mask in zip(numbers, self.measured, strict=True)
+        ]
+        number = np.concatenate(rows)
+        return in_stretches(residuals[: len(number)], table[: len(number)], number)
+
+    def _solve(self, values: Array) -> list[tuple[Array, Array, Array]] | None:
+        """Starts, residuals in sigmas and slopes, by window; None where there are none."""
+        try:
+            physics = with_given(self.parameters.physics(values), self.windows[0].given)
+        except VehicleError:
+            return None  # an inertia that is none: the step was too long
+        solved = []
+        for i, window in enumerate(self.windows):
+            start = _moved(self.starts[i], -self.gains[i] @ (values - self.at))
+            found = self._start(window, i, physics, start)
+            if found is None:
+                found = self._start(window, i, physics, window.start)
+            if found is None:
+                return None
+            solved.append(found)
+        return solved
+
+    def _start(
+        self, window: Window, i: int, physics: Physics, start: Array
+    ) -> tuple[Array, Array, Array] | None:
+        """Gauss-Newton on the start of a window: it, residuals and slopes there."""
+        found = self._simulate(window, i, physics, start)
+        if found is None:
+            return None
+        for _ in range(12):
+            residual, slope = found
+            basis, triangle = np.linalg.qr(slope[:, self.count :])
+            along = basis.T @ residual
+            if along @ along < self.settled + _NOTHING * (residual @ residual):
+                break
+            step, share = -np.linalg.solve(triangle, along), 1.0
+            while share > 1e-3:
+                trial = _moved(start, share * step)
+                better = self._simulate(window, i, physics, trial)
+                if better is not None and better[0] @ better[0] < residual @ residual:
+                    start, found = trial, better
+                    break
+                share *= 0.3
+            else:
+                break
+        return (start, *found)
+
+    def _simulate(
+        self, window: Window, i: int, physics: Physics, start: Array
+    ) -> tuple[Array, Array] | None:
+        rows = len(window.record.time_s)
+        states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
+        slopes = np.empty((rows, CHANNELS, self.count + START))
+        simulate(
+            physics, self.parameters.terms, window.record, start, self.how.longest_step_s,
+            self.how.hold, self.scratch, self.sensitivity, states, observed, slopes,
+        )  # fmt: skip
+        mask = self.measured[i]
+        residual = (residual_channels(window, observed) / self.sigma)[mask]
+        if not np.all(np.isfinite(residual)):
+            return None
+        slope = (slopes / self.sigma[:, None])[mask]
+        prior = np.zeros((START, self.count + START))
+        prior[:, self.count :] = np.diag(1.0 / _START_SIGMA)
+        away = _between(window.start, start) / _START_SIGMA
+        return np.concatenate([residual, away]), np.concatenate([slope, prior])
+
+    def _by_channel(self, table: Array) -> list[list[Array]]:
+        """Rows of residuals or slopes, by channel and window, without those of the priors."""
+        channels: list[list[Array]] = [[] for _ in range(CHANNELS)]
+        begin = 0
+        for mask in self.measured:
+            size = int(mask.sum())
+            part, place = table[begin : begin + size], np.nonzero(mask)[1]
+            for channel in range(CHANNELS):
+                channels[channel].append(part[place == channel])
+            begin += size + START
+        return channels
+
+    def _freedom(self, runs: list[list[Array]]) -> float:
+        """Samples over degrees of freedom: parameters and starts fit some of the noise."""
+        samples = sum(len(run) for channel in runs for run in channel)
+        left = samples - self.count - START * len(self.windows)
+        if left < 0.1 * samples:
+            raise VehicleError(
+                f"{samples} samples for {self.count} parameters and {len(self.windows)} windows "
+                "are too few: use longer windows or free fewer parameters"
+            )
+        return samples / left
+
+    def _channel_sigma(self, runs: list[list[Array]]) -> Array:
+        spread = self._freedom(runs)
+        sigma = np.full(CHANNELS, np.nan)
+        for channel, series in enumerate(runs):
+            values = np.concatenate(series)
+            if len(values):
+                sigma[channel] = np.sqrt(spread * float(values @ values) / len(values))
+        return sigma
+
+    def _step_s(self, channel: int) -> float:
+        """Median time between samples of a channel."""
+        steps = [
+            np.diff(w.record.time_s[m[:, channel]])
+            for w, m in zip(self.windows, self.measured, strict=True)
+        ]
+        together = np.concatenate(steps)
+        return float(np.median(together)) if len(together) else 0.0
+
+
+def _first_sigma(windows: Sequence[Window]) -> Array:
+    """First sigma of each channel, (9,): the noise, or a share of the spread if larger."""
+    sigma = np.full(CHANNELS, np.nan)
+    attitude = [np.unwrap(_known(attitude_of(w.record.attitude)), axis=0) for w in windows]
+    for channel in range(CHANNELS):
+        table = (
+            [w.measured[:, channel] for w in windows]
+            if channel < 6
+            else [a[:, channel - 6] for a in attitude]
+        )
+        table = [series[np.isfinite(series)] for series in table]
+        found = [noise_sigma(series) for series in table if len(series) >= 5]
+        if found:
+            spread = float(np.std(np.concatenate(table)))
+            sigma[channel] = max(float(np.median(found)), _ROUGH_SHARE * spread)
+    return sigma
+
+
+def _known(angles: Array) -> Array:
+    return angles[np.all(np.isfinite(angles), axis=1)]
+
+
+def _blank(window: Window) -> Array:
+    """Observations that are unknown only where the attitude is, (T, 9)."""
+    blank = np.zeros((len(window.measured), CHANNELS))
+    blank[:, 6:] = np.where(np.isfinite(window.record.attitude).all(axis=1), 0.0, np.nan)[:, None]
+    return blank
+
+
+def _moved(start: Array, step: Array) -> Array:
+    """A start (10,) turned about the body's axes and with nu changed by a step (9,)."""
+    moved = start.copy()
+    turned = Rotation.from_quat(start[:4]) * Rotation.from_rotvec(step[:3])
+    quaternion = turned.as_quat()
+    moved[:4] = quaternion if quaternion @ start[:4] >= 0 else -quaternion
+    moved[4:] += step[3:]
+    return moved
+
+
+def _between(first: Array, second: Array) -> Array:
+    """The step (9,) from one start to another."""
+    turn = Rotation.from_quat(first[:4]).inv() * Rotation.from_quat(second[:4])
+    return np.concatenate([turn.as_rotvec(), second[4:] - first[4:]])
+
+
+def _inverse(information: Array, names: Sequence[str]) -> Array:
+    """Inverse of the information.
+
+    Raises:
+        VehicleError: it has none: the parameters that cannot be separated are named.
+    """
+    scale = np.sqrt(np.diag(information))
+    blind = [name for name, value in zip(names, scale, strict=True) if value == 0]
+    if blind:
+        raise VehicleError(f"the logs do not determine {', '.join(blind)}: do not free them")
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if len(values) and values[0] < _SINGULAR * values[-1]:
+        weight = np.abs(vectors[:, 0])
+        mixed = [name for name, w in zip(names, weight, strict=True) if w > 0.3 * weight.max()]
+        raise VehicleError(
+            f"the logs cannot separate {', '.join(mixed)}: free fewer of them, or add manoeuvres"
+        )
+    inverse: Array = (vectors / values) @ vectors.T / np.outer(scale, scale)
+    return inverse

@@ -1,0 +1,551 @@
+"""The motion over a window of a log, and its derivatives by start and parameters.
+
+With x' = f(x, parameters), the sensitivities S = dx/d(columns) follow
+S' = (df/dx) S + df/d(columns) (forward sensitivities; e.g. Hairer, Norsett & Wanner, Solving
+Ordinary Differential Equations I, I.14). Both are carried through the same Runge-Kutta steps, so
+that S is the derivative of the numerical solution itself. Columns are the parameters, then the
+start: three small turns about the body's axes and the six of nu.
+
+A constant current moves the water that nu is relative to: it enters the measured velocity over
+ground only.
+
+The state x is the attitude quaternion ned_from_body, xyzw (4), and nu relative to the water (6);
+position does not act back on either. The equations are those of
+`alice_survey.sim.vehicle.dynamics`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
+from alice_survey.sim.vehicle.propulsion import Propulsion, add_thrust
+from alice_survey.sim.vehicle.rotations import matrix_rows
+
+(
+    LINEAR, QUADRATIC, LIFT, ADDED_MASS, CURRENT, BUOYANCY, TRIM, BIAS, GAIN, QUADRATIC_POS,
+    QUADRATIC_NEG,
+) = range(11)  # fmt: skip
+"""Kinds of parameters."""
+STATES = 10
+"""Length of the state."""
+_TILT = 1e-6
+"""Step, m/s and rad/s, of the slope of thrust by velocity: thrust is given as a program."""
+
+
+class Terms(NamedTuple):
+    """Kind of each parameter, (P,), and its places in the matrices."""
+
+    kind: NDArray[np.int64]
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+
+
+class Physics(NamedTuple):
+    """A vehicle with given values of the parameters."""
+
+    body: Body
+    propulsion: Propulsion
+    lag_s: Array
+    """(n,) time constants of the thrusters."""
+    current_ne: Array
+    """(2,) current, m/s."""
+    bias: Array
+    """(6,) biases added to the velocity and rate readings."""
+    gain: Array
+    """(6,) by which a given wrench is multiplied."""
+    given: Array
+    """(6,) 1 of a motion of nu that follows the log, 0 of one that follows the forces."""
+
+
+class SlopeScratch(NamedTuple):
+    """Work arrays for intermediate results."""
+
+    force: Array
+    """(3, 6): force, tilted force, rates of nu."""
+    by_nu: Array
+    """(6, 6) slope of the force."""
+    by_state: Array
+    """(10, 10) slope of the state's rate."""
+    by_column: Array
+    """(10, C) slope of the state's rate by the columns."""
+    stage: Array
+    """(3, 10): rate, sum of rates, trial state."""
+    stages: Array
+    """(3, 10, C): the same of the sensitivities."""
+    rps: Array
+    """(n,)"""
+    load: Array
+    """(6,)"""
+    acceleration: Array
+    """(6,)"""
+
+
+def scratch_for(columns: int, thrusters: int) -> SlopeScratch:
+    """Work arrays for a number of columns and thrusters."""
+    return SlopeScratch(
+        np.zeros((3, 6)), np.zeros((6, 6)), np.zeros((STATES, STATES)), np.zeros((STATES, columns)),
+        np.zeros((3, STATES)), np.zeros((3, STATES, columns)), np.zeros(thrusters), np.zeros(6),
+        np.zeros(6),
+    )  # fmt: skip
+
+
+def with_given(physics: Physics, given: Sequence[int]) -> Physics:
+    """The same with motions of nu, by their places, that follow the log."""
+    flags = np.zeros(6)
+    flags[list(given)] = 1.0
+    free = np.flatnonzero(flags == 0.0)
+    inverse = np.zeros((6, 6))
+    inverse[np.ix_(free, free)] = np.linalg.inv(physics.body.mass[np.ix_(free, free)])
+    return physics._replace(body=physics.body._replace(mass_inverse=inverse), given=flags)
+
+
+@kernel
+def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Array) -> None:
+    """Write the force and moment, (6,), on the body: all but M nu'."""
+    body, nu = physics.body, state[4:10]
+    x, y, z, s = state[0], state[1], state[2], state[3]
+    r20, r21, r22 = matrix_rows(x, y, z, s)[2]
+    for i in range(6):
+        force[i] = physics.gain[i] * load[i]
+    add_thrust(physics.propulsion, rps, nu, force)
+    add_damping(body, nu, force)
+    add_coriolis(body, nu, force)
+    add_weight(body, r20, r21, r22, force)
+
+
+@kernel
+def rate_of(
+    physics: Physics,
+    state: Array,
+    rps: Array,
+    load: Array,
+    acceleration: Array,
+    force: Array,
+    out: Array,
+) -> None:
+    """Write the rate of change, (10,), of a state.
+
+    Given motions have the acceleration (6,) that they are given; the others feel it through the
+    inertia that couples them, and answer with the rest of the mass matrix alone. `force` is room.
+    """
+    x, y, z, s = state[0], state[1], state[2], state[3]
+    p, q, r = state[7], state[8], state[9]
+    out[0] = 0.5 * (s * p + y * r - z * q)
+    out[1] = 0.5 * (s * q + z * p - x * r)
+    out[2] = 0.5 * (s * r + x * q - y * p)
+    out[3] = -0.5 * (x * p + y * q + z * r)
+    force_on(physics, state, rps, load, force)
+    for j in range(6):
+        if physics.given[j] != 0.0:
+            for i in range(6):
+                force[i] -= physics.body.mass[i, j] * acceleration[j]
+    for i in range(6):
+        total = physics.given[i] * acceleration[i]
+        for j in range(6):
+            total += physics.body.mass_inverse[i, j] * force[j]
+        out[4 + i] = total
+
+
+@kernel
+def slope_by_state(
+    physics: Physics, state: Array, rps: Array, load: Array, scratch: SlopeScratch
+) -> None:
+    """Write df/dx into `by_state`."""
+    body, nu, by_nu, out = physics.body, state[4:10], scratch.by_nu, scratch.by_state
+    x, y, z, s = state[0], state[1], state[2], state[3]
+    p, q, r = nu[3], nu[4], nu[5]
+    u, v, w = nu[0], nu[1], nu[2]
+    out[:, :] = 0.0
+    # Attitude: q' = q * (omega, 0) / 2, linear in both.
+    out[0, 1], out[0, 2], out[0, 3] = 0.5 * r, -0.5 * q, 0.5 * p
+    out[1, 0], out[1, 2], out[1, 3] = -0.5 * r, 0.5 * p, 0.5 * q
+    out[2, 0], out[2, 1], out[2, 3] = 0.5 * q, -0.5 * p, 0.5 * r
+    out[3, 0], out[3, 1], out[3, 2] = -0.5 * p, -0.5 * q, -0.5 * r
+    out[0, 7], out[0, 8], out[0, 9] = 0.5 * s, -0.5 * z, 0.5 * y
+    out[1, 7], out[1, 8], out[1, 9] = 0.5 * z, 0.5 * s, -0.5 * x
+    out[2, 7], out[2, 8], out[2, 9] = -0.5 * y, 0.5 * x, 0.5 * s
+    out[3, 7], out[3, 8], out[3, 9] = -0.5 * x, -0.5 * y, -0.5 * z
+    # Force by velocity: damping and lift,
+    for i in range(6):
+        for j in range(6):
+            square = body.quadratic[i, j] if nu[j] > 0.0 else body.quadratic_back[i, j]
+            by_nu[i, j] = body.linear[i, j] + 2.0 * square * abs(nu[j])
+    sign = 1.0 if u > 0.0 else (-1.0 if u < 0.0 else 0.0)
+    by_nu[1, 0] += body.lift[0] * sign * v
+    by_nu[1, 1] += body.lift[0] * abs(u)
+    by_nu[2, 0] += body.lift[1] * sign * w
+    by_nu[2, 2] += body.lift[1] * abs(u)
+    by_nu[4, 0] += body.lift[2] * w
+    by_nu[4, 2] += body.lift[2] * u
+    by_nu[5, 0] += body.lift[3] * v
+    by_nu[5, 1] += body.lift[3] * u
+    # Coriolis: -omega x A, and -v x A - omega x B, with the momenta A and B linear in nu,
+    m = body.mass
+    ax = ay = az = bx = by = bz = 0.0
+    for j in range(6):
+        n = nu[j]
+        ax += m[0, j] * n
+        ay += m[1, j] * n
+        az += m[2, j] * n
+        bx += m[3, j] * n
+        by += m[4, j] * n
+        bz += m[5, j] * n
+        by_nu[0, j] -= q * m[2, j] - r * m[1, j]
+        by_nu[1, j] -= r * m[0, j] - p * m[2, j]
+        by_nu[2, j] -= p * m[1, j] - q * m[0, j]
+        by_nu[3, j] -= v * m[2, j] - w * m[1, j] + q * m[5, j] - r * m[4, j]
+        by_nu[4, j] -= w * m[0, j] - u * m[2, j] + r * m[3, j] - p * m[5, j]
+        by_nu[5, j] -= u * m[1, j] - v * m[0, j] + p * m[4, j] - q * m[3, j]
+    by_nu[0, 4] -= az
+    by_nu[0, 5] += ay
+    by_nu[1, 5] -= ax
+    by_nu[1, 3] += az
+    by_nu[2, 3] -= ay
+    by_nu[2, 4] += ax
+    by_nu[3, 1] -= az
+    by_nu[3, 2] += ay
+    by_nu[3, 4] -= bz
+    by_nu[3, 5] += by
+    by_nu[4, 2] -= ax
+    by_nu[4, 0] += az
+    by_nu[4, 5] -= bx
+    by_nu[4, 3] += bz
+    by_nu[5, 0] -= ay
+    by_nu[5, 1] += ax
+    by_nu[5, 3] -= by
+    by_nu[5, 4] += bx
+    # and thrust, by differences.
+    if rps.shape[0] > 0:
+        base, tilted = scratch.force[0], scratch.force[1]
+        base[:] = 0.0
+        add_thrust(physics.propulsion, rps, nu, base)
+        for j in range(6):
+            kept = nu[j]
+            nu[j] = kept + _TILT
+            tilted[:] = 0.0
+            add_thrust(physics.propulsion, rps, nu, tilted)
+            nu[j] = kept
+            for i in range(6):
+                by_nu[i, j] += (tilted[i] - base[i]) / _TILT
+    inverse = body.mass_inverse
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for k in range(6):
+                total += inverse[i, k] * by_nu[k, j]
+            out[4 + i, 4 + j] = total
+    # Weight and buoyancy along the body's down: force by (r20, r21, r22), and these by q.
+    net, weight = body.weight_n - body.buoyancy_n, body.weight_n
+    gx, gy, gz = weight * body.cg[0], weight * body.cg[1], weight * body.cg[2]
+    for i in range(6):
+        d0 = inverse[i, 0] * net + inverse[i, 4] * gz - inverse[i, 5] * gy
+        d1 = inverse[i, 1] * net - inverse[i, 3] * gz + inverse[i, 5] * gx
+        d2 = inverse[i, 2] * net + inverse[i, 3] * gy - inverse[i, 4] * gx
+        out[4 + i, 0] = 2 * z * d0 + 2 * s * d1 - 4 * x * d2
+        out[4 + i, 1] = -2 * s * d0 + 2 * z * d1 - 4 * y * d2
+        out[4 + i, 2] = 2 * x * d0 + 2 * y * d1
+        out[4 + i, 3] = -2 * y * d0 + 2 * x * d1
+
+
+@kernel
+def slope_by_parameters(
+    physics: Physics, terms: Terms, state: Array, rates: Array, scratch: SlopeScratch
+) -> None:
+    """Write df/d(parameters) into `by_column`; `rates` is nu' (6,)."""
+    body, nu, force, out = physics.body, state[4:10], scratch.force[2], scratch.by_column
+    x, y, z, s = state[0], state[1], state[2], state[3]
+    r20, r21, r22 = matrix_rows(x, y, z, s)[2]
+    u, v, w, p, q, r = nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]
+    weight = body.weight_n
+    for k in range(terms.kind.shape[0]):
+        kind, i, j = terms.kind[k], terms.row[k], terms.column[k]
+        if kind in (CURRENT, BIAS):
+            continue
+        force[:] = 0.0
+        if kind == LINEAR:
+            force[i] = nu[j]
+        elif kind == QUADRATIC:
+            force[i] = nu[j] * abs(nu[j])
+        elif kind == QUADRATIC_POS:
+            force[i] = max(nu[j], 0.0) * abs(nu[j])
+        elif kind == QUADRATIC_NEG:
+            force[i] = min(nu[j], 0.0) * abs(nu[j])
+        elif kind == LIFT:
+            if i == 1:
+                force[1] = abs(u) * v
+            elif i == 2:
+                force[2] = abs(u) * w
+            elif i == 4:
+                force[4] = u * w
+            else:
+                force[5] = u * v
+        elif kind == ADDED_MASS:
+            # The inertia loses the coefficient in (i, j) and (j, i): momentum d, and -dM nu'.
+            d0 = d1 = d2 = d3 = d4 = d5 = 0.0
+            for side in range(2):
+                a, b = (i, j) if side == 0 else (j, i)
+                if side == 1 and i == j:
+                    break
+                force[a] += rates[b]
+                d0 -= nu[b] if a == 0 else 0.0
+                d1 -= nu[b] if a == 1 else 0.0
+                d2 -= nu[b] if a == 2 else 0.0
+                d3 -= nu[b] if a == 3 else 0.0
+                d4 -= nu[b] if a == 4 else 0.0
+                d5 -= nu[b] if a == 5 else 0.0
+            force[0] -= q * d2 - r * d1
+            force[1] -= r * d0 - p * d2
+            force[2] -= p * d1 - q * d0
+            force[3] -= v * d2 - w * d1 + q * d5 - r * d4
+            force[4] -= w * d0 - u * d2 + r * d3 - p * d5
+            force[5] -= u * d1 - v * d0 + p * d4 - q * d3
+        elif kind == GAIN:
+            force[i] = scratch.load[i]
+        elif kind == BUOYANCY:
+            force[0], force[1], force[2] = -r20, -r21, -r22
+        elif i == 0:
+            force[4], force[5] = -weight * r22, weight * r21
+        elif i == 1:
+            force[3], force[5] = weight * r22, -weight * r20
+        else:
+            force[3], force[4] = -weight * r21, weight * r20
+        for a in range(6):
+            total = 0.0
+            for b in range(6):
+                total += body.mass_inverse[a, b] * force[b]
+            out[4 + a, k] = total
+
+
+CHANNELS, START = 9, 9
+"""Lengths of an observation (velocity over ground, rates, attitude error) and of the free start."""
+
+
+class Record(NamedTuple):
+    """A window of a log."""
+
+    time_s: Array
+    """(T,)"""
+    rps: Array
+    """(T, n) speeds of the thrusters; n is 0 where the wrench is given."""
+    wrench: Array
+    """(T, 6) given wrench, besides that of the thrusters."""
+    attitude: Array
+    """(T, 4) measured quaternions, NaN where there is none."""
+    acceleration: Array
+    """(T, 6) accelerations of given motions, from each row to the next."""
+
+
+@kernel
+def _stage(
+    physics: Physics, terms: Terms, state: Array, sensitivity: Array, scratch: SlopeScratch
+) -> None:
+    """Write the rates of a state and of its sensitivities into the first of the stages."""
+    rate, slopes = scratch.stage[0], scratch.stages[0]
+    rate_of(physics, state, scratch.rps, scratch.load, scratch.acceleration, scratch.force[0], rate)
+    slope_by_state(physics, state, scratch.rps, scratch.load, scratch)
+    slope_by_parameters(physics, terms, state, rate[4:10], scratch)
+    a, b = scratch.by_state, scratch.by_column
+    columns = sensitivity.shape[1]
+    for i in range(STATES):
+        for c in range(columns):
+            slopes[i, c] = b[i, c]
+        for k in range(STATES):
+            factor = a[i, k]
+            if factor != 0.0:
+                for c in range(columns):
+                    slopes[i, c] += factor * sensitivity[k, c]
+
+
+@kernel
+def _step(
+    physics: Physics,
+    terms: Terms,
+    record: Record,
+    row: int,
+    begin: float,
+    step_s: float,
+    hold: bool,
+    state: Array,
+    sensitivity: Array,
+    scratch: SlopeScratch,
+) -> None:
+    """Advance a state and its sensitivities by one classical Runge-Kutta step.
+
+    Between two rows a wrench is linear, and a thruster's speed as a first-order lag with its
+    time constant does under a constant command: straight if slow, and exact for a thruster that is
+    commanded with each row. Held inputs stay at the first row's.
+    """
+    span = record.time_s[row + 1] - record.time_s[row]
+    total, trial = scratch.stage[1], scratch.stage[2]
+    totals, trials = scratch.stages[1], scratch.stages[2]
+    columns, lags = sensitivity.shape[1], physics.lag_s
+    for j in range(6):
+        scratch.acceleration[j] = record.acceleration[row, j]
+    for k in range(4):
+        at = begin + step_s * (0.0 if k == 0 else (1.0 if k == 3 else 0.5))
+        share = 0.0 if hold else at / span
+        for j in range(scratch.rps.shape[0]):
+            lag, part = lags[j], share
+            if not hold and lag > 0.0:
+                part = math.expm1(-at / lag) / math.expm1(-span / lag)
+            scratch.rps[j] = (1 - part) * record.rps[row, j] + part * record.rps[row + 1, j]
+        for j in range(6):
+            scratch.load[j] = (1 - share) * record.wrench[row, j] + share * record.wrench[
+                row + 1, j
+            ]
+        if k == 0:
+            _stage(physics, terms, state, sensitivity, scratch)
+        else:
+            _stage(physics, terms, trial, trials, scratch)
+        weight = step_s / 6.0 if k == 0 or k == 3 else step_s / 3.0
+        ahead = step_s if k == 2 else 0.5 * step_s
+        rate, slopes = scratch.stage[0], scratch.stages[0]
+        for i in range(STATES):
+            total[i] = (total[i] if k else 0.0) + weight * rate[i]
+            trial[i] = state[i] + ahead * rate[i]
+            for c in range(columns):
+                totals[i, c] = (totals[i, c] if k else 0.0) + weight * slopes[i, c]
+                trials[i, c] = sensitivity[i, c] + ahead * slopes[i, c]
+    for i in range(STATES):
+        state[i] += total[i]
+        for c in range(columns):
+            sensitivity[i, c] += totals[i, c]
+
+
+@kernel
+def observe(
+    physics: Physics,
+    terms: Terms,
+    state: Array,
+    sensitivity: Array,
+    attitude: Array,
+    out: Array,
+    slopes: Array,
+) -> None:
+    """Write the predicted sensor readings, (9,), and their slopes, (9, C).
+
+    Velocity over ground and rates in the body frame with their biases, and twice the vector part of
+    the turn from the measured attitude to the state's: for small turns the angles about the axes.
+    """
+    x, y, z, s = state[0], state[1], state[2], state[3]
+    cn, ce = physics.current_ne[0], physics.current_ne[1]
+    columns, parameters = sensitivity.shape[1], terms.kind.shape[0]
+    (r00, r01, r02), (r10, r11, r12), _ = matrix_rows(x, y, z, s)
+    out[0] = state[4] + r00 * cn + r10 * ce
+    out[1] = state[5] + r01 * cn + r11 * ce
+    out[2] = state[6] + r02 * cn + r12 * ce
+    for i in range(3):
+        out[3 + i] = state[7 + i]
+    for i in range(6):
+        out[i] += physics.bias[i]
+    mx, my, mz, ms = attitude[0], attitude[1], attitude[2], attitude[3]
+    turn = 2.0 if mx * x + my * y + mz * z + ms * s >= 0.0 else -2.0
+    out[6] = turn * (ms * x - mx * s - my * z + mz * y)
+    out[7] = turn * (ms * y - my * s - mz * x + mx * z)
+    out[8] = turn * (ms * z - mz * s - mx * y + my * x)
+    for c in range(columns):
+        dx, dy, dz, ds = (
+            sensitivity[0, c], sensitivity[1, c], sensitivity[2, c], sensitivity[3, c],
+        )  # fmt: skip
+        slopes[0, c] = (
+            sensitivity[4, c]
+            - 4 * cn * (y * dy + z * dz)
+            + 2 * ce * (y * dx + x * dy + s * dz + z * ds)
+        )
+        slopes[1, c] = (
+            sensitivity[5, c]
+            + 2 * cn * (y * dx + x * dy - s * dz - z * ds)
+            - 4 * ce * (x * dx + z * dz)
+        )
+        slopes[2, c] = (
+            sensitivity[6, c]
+            + 2 * cn * (z * dx + s * dy + x * dz + y * ds)
+            + 2 * ce * (-s * dx + z * dy + y * dz - x * ds)
+        )
+        for i in range(3):
+            slopes[3 + i, c] = sensitivity[7 + i, c]
+        slopes[6, c] = turn * (ms * dx - mx * ds - my * dz + mz * dy)
+        slopes[7, c] = turn * (ms * dy - my * ds - mz * dx + mx * dz)
+        slopes[8, c] = turn * (ms * dz - mz * ds - mx * dy + my * dx)
+    for k in range(parameters):
+        if terms.kind[k] == CURRENT and terms.row[k] == 0:
+            slopes[0, k] += r00
+            slopes[1, k] += r01
+            slopes[2, k] += r02
+        elif terms.kind[k] == CURRENT:
+            slopes[0, k] += r10
+            slopes[1, k] += r11
+            slopes[2, k] += r12
+        elif terms.kind[k] == BIAS:
+            slopes[terms.row[k], k] += 1.0
+
+
+@kernel
+def simulate(
+    physics: Physics,
+    terms: Terms,
+    record: Record,
+    start: Array,
+    longest_step_s: float,
+    hold: bool,
+    scratch: SlopeScratch,
+    sensitivity: Array,
+    states: Array,
+    observed: Array,
+    slopes: Array,
+) -> None:
+    """Simulate a window.
+
+    Args:
+        physics: the vehicle, with values of the parameters.
+        terms: P parameters.
+        record: T rows.
+        start: (10,) state at the first row.
+        longest_step_s: rows farther apart are crossed in equal steps no longer than this.
+        hold: the input stays what it was in a row until the next.
+        scratch: for C = P + 9 columns; or for none, with no terms.
+        sensitivity: (10, C) room.
+        states: (T, 10) is written.
+        observed: (T, 9) is written, see `observe`.
+        slopes: (T, 9, C) is written.
+    """
+    columns, parameters = sensitivity.shape[1], terms.kind.shape[0]
+    sensitivity[:, :] = 0.0
+    scratch.by_column[:, :] = 0.0
+    for i in range(STATES):
+        states[0, i] = start[i]
+    if columns > parameters:
+        # A small turn d about the body's axes changes q by q * (d, 0) / 2.
+        x, y, z, s = start[0], start[1], start[2], start[3]
+        c = parameters
+        sensitivity[0, c], sensitivity[0, c + 1], sensitivity[0, c + 2] = 0.5 * s, -0.5 * z, 0.5 * y
+        sensitivity[1, c], sensitivity[1, c + 1], sensitivity[1, c + 2] = 0.5 * z, 0.5 * s, -0.5 * x
+        sensitivity[2, c], sensitivity[2, c + 1], sensitivity[2, c + 2] = -0.5 * y, 0.5 * x, 0.5 * s
+        sensitivity[3, c], sensitivity[3, c + 1], sensitivity[3, c + 2] = (
+            -0.5 * x, -0.5 * y, -0.5 * z,
+        )  # fmt: skip
+        for i in range(6):
+            sensitivity[4 + i, c + 3 + i] = 1.0 - physics.given[i]
+    for row in range(record.time_s.shape[0]):
+        observe(
+            physics, terms, states[row], sensitivity, record.attitude[row], observed[row],
+            slopes[row],
+        )  # fmt: skip
+        if row + 1 == record.time_s.shape[0]:
+            break
+        for i in range(STATES):
+            states[row + 1, i] = states[row, i]
+        span = record.time_s[row + 1] - record.time_s[row]
+        # Slightly over a step is still one step: times are written with rounding.
+        count = max(int(np.ceil(span / longest_step_s - 1e-6)), 1)
+        for i in range(count):
+            _step(
+                physics, terms, record, row, i * span / count, span / count, hold, states[row + 1],
+                sensitivity, scratch,
+            )  # fmt: skip

@@ -1,0 +1,249 @@
+"""The paper's calibration: damping from velocities and added mass from accelerations, in turn.
+
+After the bollard pull has settled the thrust, surge, heave and turns are taken one after the other
+(paper, the section on model calibration). Measured velocities go into the equations of motion,
+averaged over a second so that the rates are those of straight lines through the velocities. Rows
+with little acceleration give the damping of a motion, those with much its added mass. The paper
+adjusted one coefficient after the other by hand until the curves met; here each is a least-squares
+regression, and all are repeated until they agree.
+
+It needs no simulation and no start, but it takes measured velocities as true, so noise biases the
+coefficients towards zero, and it cannot find a current. The joint fit has neither limit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import fftconvolve, savgol_filter
+from scipy.spatial.transform import Rotation
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import Array
+from alice_survey.core.run.progress import step as named_step
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.identification.noise import autocovariance, correlated_information
+from alice_survey.sim.vehicle.identification.parameters import OTHERS, Parameters
+from alice_survey.sim.vehicle.identification.sensitivity import (
+    ADDED_MASS,
+    LIFT,
+    LINEAR,
+    STATES,
+    Physics,
+    force_on,
+)
+from alice_survey.sim.vehicle.identification.windows import Mask, Window
+
+STEPS = (("surge", "X"), ("heave", "ZM"), ("turns", "NYK"))
+"""Coefficients calibrated in turn, and the equations that determine them."""
+_SMOOTH_S = 1.0
+"""Time over which the equations are averaged."""
+_PASSES, _AGREED = 60, 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TwoStep:
+    """Coefficients by the paper's calibration."""
+
+    values: Array
+    """(P,)"""
+    sigma: Array
+    """(P,) sigmas of the regressions."""
+    step: tuple[str, ...]
+    """(P,) step in which each was calibrated."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rows:
+    """Motion at equal steps, rows of all windows."""
+
+    states: Array
+    """(T, 10) as measured."""
+    accelerations: Array
+    """(T, 6) slopes of straight lines over `_SMOOTH_S`."""
+    inner: Mask
+    """(T,) rows at least half of `_SMOOTH_S` from either end of their window."""
+    weights: tuple[Array, ...]
+    """By window: the slope of a straight line is the mean of the derivative with these weights."""
+    rps: Array
+    wrench: Array
+    runs: tuple[int, ...]
+    """Number of rows of each window."""
+
+
+@named_step("fit in two steps")
+def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
+    """Calibrate coefficients in turn.
+
+    Args:
+        windows: windows of manoeuvres, with velocities and rates.
+        parameters: coefficients to free.
+
+    Raises:
+        VehicleError: a free parameter is not a coefficient, or the rows do not determine one.
+    """
+    strange = [name for name in parameters.names if name in OTHERS]
+    if strange:
+        raise VehicleError(
+            f"the two-step calibration knows coefficients only, not {', '.join(strange)}: use "
+            "--method joint"
+        )
+    rows = _smoothed(windows, parameters)
+    values, sigma = parameters.start.copy(), np.full(len(parameters.names), np.nan)
+    steps = [""] * len(parameters.names)
+    for _ in range(_PASSES):
+        before = values.copy()
+        for step, forces in STEPS:
+            for force in forces:
+                places = [k for k, name in enumerate(parameters.names) if name[0] == force]
+                for k in places:
+                    steps[k] = step
+                inertial = [k for k in places if parameters.terms.kind[k] == ADDED_MASS]
+                damping = [k for k in places if k not in inertial]
+                for group, much in ((damping, False), (inertial, True)):
+                    if group:
+                        _regress(rows, parameters, values, sigma, group, much)
+        scale = np.maximum(np.abs(values), 1e-12)
+        if np.max(np.abs(values - before) / scale) < _AGREED:
+            break
+    else:
+        raise VehicleError(
+            f"added mass and damping do not agree after {_PASSES} passes: free fewer of them, or "
+            "add manoeuvres"
+        )
+    return TwoStep(values=values, sigma=sigma, step=tuple(steps))
+
+
+def _regress(
+    rows: _Rows, parameters: Parameters, values: Array, sigma: Array, group: list[int], much: bool
+) -> None:
+    """Write the coefficients of a group, all of one force, from rows of much or little change."""
+    terms = parameters.terms
+    force = int(terms.row[group[0]])
+    now = values.copy()
+    if not much:
+        now[group] = 0.0
+    physics = parameters.physics(now)
+    forces = np.empty((len(rows.states), 6))
+    _forces(physics, rows.states, rows.rps, rows.wrench, forces)
+    known = physics.body.mass[force] @ rows.accelerations.T
+    known -= _averaged(rows, forces[:, force : force + 1])[:, 0]
+    if much:
+        # Inertia was kept for the Coriolis forces; its part of this row is the unknown.
+        for k in group:
+            known += values[k] * rows.accelerations[:, terms.column[k]]
+    regressors = [_regressor(rows, int(terms.kind[k]), force, int(terms.column[k])) for k in group]
+    table = np.stack(regressors, axis=1)
+    if not much:
+        table = _averaged(rows, table)
+    change = np.abs(rows.accelerations[:, force])
+    usual = float(np.median(change[rows.inner]))
+    chosen = rows.inner & ((change > usual) if much else (change <= usual))
+    x, y = table[chosen], known[chosen]
+    information = x.T @ x
+    names = [parameters.names[k] for k in group]
+    scale = np.sqrt(np.diag(information))
+    if np.any(scale == 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e10:
+        raise VehicleError(f"the logs do not determine {', '.join(names)}: do not free all of them")
+    values[group] = np.linalg.solve(information, x.T @ y)
+    rest, ends = y - x @ values[group], np.cumsum(rows.runs)
+    starts = np.concatenate([[0], ends[:-1]])
+    parts = [chosen[a:b] for a, b in zip(starts, ends, strict=True)]
+    cuts = np.cumsum([int(part.sum()) for part in parts])[:-1]
+    lags = autocovariance(np.split(rest, cuts))
+    inverse = np.linalg.inv(information)
+    covariance = inverse @ correlated_information(np.split(x, cuts), lags) @ inverse
+    sigma[group] = np.sqrt(np.diag(covariance))
+
+
+def _averaged(rows: _Rows, table: Array) -> Array:
+    """Weighted means, (T, K), over sliding stretches of columns (T, K)."""
+    cuts = np.cumsum(rows.runs)[:-1]
+    runs = zip(np.split(table, cuts), rows.weights, strict=True)
+    return np.concatenate([
+        fftconvolve(run, weights[:, None], mode="same", axes=0) for run, weights in runs
+    ])  # fmt: skip
+
+
+def _regressor(rows: _Rows, kind: int, force: int, motion: int) -> Array:
+    """Factor of a coefficient, (T,): its force moved to the side of the inertia."""
+    nu = rows.states[:, 4:]
+    if kind == ADDED_MASS:
+        return rows.accelerations[:, motion]
+    if kind == LINEAR:
+        return nu[:, motion]
+    if kind == LIFT:
+        first = np.abs(nu[:, 0]) if force < 3 else nu[:, 0]
+        product: Array = first * nu[:, motion]
+        return product
+    square: Array = nu[:, motion] * np.abs(nu[:, motion])
+    return square
+
+
+@kernel
+def _forces(physics: Physics, states: Array, rps: Array, wrench: Array, out: Array) -> None:
+    """Write the forces, (T, 6), on a vehicle in states (T, 10)."""
+    for row in range(states.shape[0]):
+        force_on(physics, states[row], rps[row], wrench[row], out[row])
+
+
+def _smoothed(windows: Sequence[Window], parameters: Parameters) -> _Rows:
+    """Motion relative to the water and its rates, by sliding straight lines."""
+    physics = parameters.physics(parameters.start)
+    pieces = []
+    for window in windows:
+        time_s = window.record.time_s
+        step = float(np.median(np.diff(time_s)))
+        length = max(2 * round(0.5 * _SMOOTH_S / step) + 1, 5)
+        if len(time_s) < length:
+            continue
+        even = np.arange(time_s[0], time_s[-1] + 0.5 * step, step)
+        motion, rates = np.empty((len(even), 6)), np.empty((len(even), 6))
+        attitude = _attitude(window, even)
+        for k in range(6):
+            known = np.isfinite(window.measured[:, k])
+            if known.sum() < 2:
+                raise VehicleError(
+                    f"{window.source}: the two-step calibration needs u, v, w, p, q and r; "
+                    f"{'uvwpqr'[k]} was not measured"
+                )
+            series = np.interp(even, time_s[known], window.measured[known, k]) - physics.bias[k]
+            motion[:, k] = series
+        drift = np.array([*physics.current_ne, 0.0])
+        motion[:, :3] -= attitude.inv().apply(drift)
+        for k in range(6):
+            rates[:, k] = savgol_filter(motion[:, k], length, 1, deriv=1, delta=step)
+        state = np.empty((len(even), STATES))
+        state[:, :4], state[:, 4:] = attitude.as_quat(), motion
+        inputs = [
+            np.stack([np.interp(even, time_s, column) for column in table.T], axis=1)
+            if table.shape[1]
+            else np.zeros((len(even), 0))
+            for table in (window.record.rps, window.record.wrench)
+        ]
+        away = np.arange(length) - length // 2
+        # Summed by parts, the slope sum(t u) / sum(t^2) weighs the derivative by a parabola.
+        parabola = (length // 2 + 1.0) ** 2 - away**2
+        place = np.arange(len(even))
+        inner = (place >= length // 2) & (place < len(even) - length // 2)
+        pieces.append((state, rates, *inputs, inner, parabola / parabola.sum()))
+    if not pieces:
+        raise VehicleError(f"no stretch of the logs is {_SMOOTH_S:g} s long")
+    *tables, weights = zip(*pieces, strict=True)
+    states, accelerations, rps, wrench, inside = (np.concatenate(table) for table in tables)
+    return _Rows(
+        states=states, accelerations=accelerations, inner=inside, weights=weights, rps=rps,
+        wrench=wrench, runs=tuple(len(state) for state in tables[0]),
+    )  # fmt: skip
+
+
+def _attitude(window: Window, at_s: Array) -> Rotation:
+    """Attitudes at times, interpolated between the measured ones; the nearest before and after."""
+    from scipy.spatial.transform import Slerp
+
+    known = np.all(np.isfinite(window.record.attitude), axis=1)
+    time_s = window.record.time_s[known]
+    rotations = Rotation.from_quat(window.record.attitude[known])
+    if len(time_s) == 1:
+        return Rotation.from_quat(np.tile(window.record.attitude[known], (len(at_s), 1)))
+    return Slerp(time_s, rotations)(np.clip(at_s, time_s[0], time_s[-1]))

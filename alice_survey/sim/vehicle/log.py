@@ -1,0 +1,336 @@
+"""The vehicle log, one CSV: motion of a vehicle and its thrusters.
+
+docs/vehicle-logs.md describes each column. Every field but the time may be missing, in whole or in
+single rows: NaN means not measured.
+"""
+
+import csv
+import difflib
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from alice_survey.core.artefacts import write_csv
+from alice_survey.core.contents import shown
+from alice_survey.core.errors import VehicleError, warn
+from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
+
+TIME = "time_s"
+POSITION = ("north_m", "east_m", "depth_m")
+ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
+QUATERNION = ("quat_x", "quat_y", "quat_z", "quat_w")
+VELOCITY = ("u_mps", "v_mps", "w_mps")
+RATES = ("p_rad_s", "q_rad_s", "r_rad_s")
+ALTITUDE = "altitude_m"
+WRENCH = ("X_n", "Y_n", "Z_n", "K_nm", "M_nm", "N_nm")
+_KNOWN = (TIME, *POSITION, *ANGLES, *QUATERNION, *VELOCITY, *RATES, ALTITUDE, *WRENCH)
+_UNIT = 0.05
+"""Tolerance of a quaternion's length: more is not rounding of a written attitude."""
+_GAP_STEPS = 10
+"""A gap is longer than this many median steps."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VehicleLog:
+    """Motion and input of a vehicle at times."""
+
+    source: str
+    """Source, for messages."""
+    time_s: Array
+    """(T,) strictly increasing."""
+    position_ned: Array
+    """(T, 3) position of the body's origin, metres."""
+    quaternion_xyzw: Array
+    """(T, 4) quaternions of ned_from_body, of unit length."""
+    velocity_body: Array
+    """(T, 3) velocity over ground, m/s."""
+    rates_body: Array
+    """(T, 3) body rates, rad/s."""
+    altitude_m: Array
+    """(T,) height above the sea floor."""
+    rpm: Mapping[str, Array]
+    """By thruster: (T,) speed in revolutions per minute, positive pushes along its direction."""
+    thrust_n: Mapping[str, Array]
+    """By thruster: (T,) net force on the vehicle along its direction."""
+    wrench: Array
+    """(T, 6) force, N, and moment about the body's origin, N m, of all thrusters."""
+    others: Mapping[str, Array] = field(default_factory=dict)
+    """Columns that have no meaning here, carried along: (T,) each."""
+
+    def __post_init__(self) -> None:
+        count = len(self.time_s)
+        for name, value, width in (
+            ("position_ned", self.position_ned, 3), ("quaternion_xyzw", self.quaternion_xyzw, 4),
+            ("velocity_body", self.velocity_body, 3), ("rates_body", self.rates_body, 3),
+            ("wrench", self.wrench, 6),
+        ):  # fmt: skip
+            if value.shape != (count, width):
+                raise ValueError(f"{name} has the shape {value.shape} at {count} times")
+        for series in (self.altitude_m, *self.rpm.values(), *self.thrust_n.values()):
+            if series.shape != (count,):
+                raise ValueError(f"a series of shape {series.shape} at {count} times")
+        if not np.all(np.diff(self.time_s) > 0):
+            raise ValueError("time_s must increase strictly")
+
+    @property
+    def attitude_rad(self) -> Array:
+        """(T, 3) roll, pitch, heading in (-pi, pi]; NaN rows where it was not measured."""
+        return attitude_of(self.quaternion_xyzw)
+
+
+def vehicle_log(
+    time_s: Array,
+    *,
+    source: str = "log",
+    position_ned: Array | None = None,
+    quaternion_xyzw: Array | None = None,
+    velocity_body: Array | None = None,
+    rates_body: Array | None = None,
+    altitude_m: Array | None = None,
+    rpm: Mapping[str, Array] | None = None,
+    thrust_n: Mapping[str, Array] | None = None,
+    wrench: Array | None = None,
+) -> VehicleLog:
+    """A log of what is known; the rest is NaN. Fields as in `VehicleLog`."""
+
+    def filled(value: Array | None, *shape: int) -> Array:
+        return np.full((len(time_s), *shape), np.nan) if value is None else np.asarray(value, float)
+
+    return VehicleLog(
+        source=source, time_s=np.asarray(time_s, float), position_ned=filled(position_ned, 3),
+        quaternion_xyzw=filled(quaternion_xyzw, 4), velocity_body=filled(velocity_body, 3),
+        rates_body=filled(rates_body, 3), altitude_m=filled(altitude_m), rpm=dict(rpm or {}),
+        thrust_n=dict(thrust_n or {}), wrench=filled(wrench, 6),
+    )  # fmt: skip
+
+
+def attitude_of(quaternion_xyzw: Array) -> Array:
+    """Roll, pitch and heading, (T, 3) rad, of quaternions (T, 4) of ned_from_body; NaN stays."""
+    known = np.all(np.isfinite(quaternion_xyzw), axis=1)
+    angles = np.full((len(quaternion_xyzw), 3), np.nan)
+    if known.any():
+        angles[known] = attitude_from_rotation(Rotation.from_quat(quaternion_xyzw[known]))
+    return angles
+
+
+def write_vehicle_log(path: Path, log: VehicleLog) -> None:
+    """Write a log as CSV, to 9 decimals; columns that hold nothing are left out."""
+    columns: dict[str, Array] = {TIME: log.time_s}
+    for names, table in (
+        (POSITION, log.position_ned), (ANGLES, np.rad2deg(log.attitude_rad)),
+        (VELOCITY, log.velocity_body), (RATES, log.rates_body),
+        ((ALTITUDE,), log.altitude_m[:, None]), (WRENCH, log.wrench),
+    ):  # fmt: skip
+        if np.any(np.isfinite(table)):
+            columns |= dict(zip(names, table.T, strict=True))
+    columns |= {f"rpm_{name}": value for name, value in log.rpm.items()}
+    columns |= {f"thrust_{name}_n": value for name, value in log.thrust_n.items()}
+    columns |= log.others
+    table = np.column_stack(list(columns.values()))
+    rows = (["" if math.isnan(value) else f"{value:.9f}" for value in row] for row in table)
+    write_csv(path, tuple(columns), rows)
+
+
+def read_vehicle_log(path: Path) -> VehicleLog:
+    """Read a log; warn of values that were fixed or left out.
+
+    Rows of one time are merged: the later value is kept where both rows have one.
+
+    Raises:
+        VehicleError: the file cannot be read, has no rows or no time column, holds a value that is
+            not a number, a time that is missing or goes back, an attitude given twice or in part,
+            or an invalid quaternion.
+    """
+    return log_of_columns(read_number_columns(path), str(path))
+
+
+def log_of_columns(columns: Mapping[str, Array], source: str) -> VehicleLog:
+    """A log of named columns, (T,) each, as in the CSV; see `read_vehicle_log`."""
+    if TIME not in columns:
+        raise VehicleError(f"{source}: column {TIME} is missing{_near(TIME, columns)}")
+    merged = _in_time(dict(columns), source)
+    count = len(merged[TIME])
+
+    def table(names: Sequence[str]) -> Array:
+        nothing = np.full(count, np.nan)
+        return np.stack([merged.get(name, nothing) for name in names], axis=1)
+
+    rpm = {name[4:]: value for name, value in merged.items() if _is_rpm(name)}
+    thrust = {name[7:-2]: value for name, value in merged.items() if _is_thrust(name)}
+    others = {
+        name: value
+        for name, value in merged.items()
+        if name not in _KNOWN and not _is_rpm(name) and not _is_thrust(name)
+    }
+    for name in others:
+        near = difflib.get_close_matches(name, set(_KNOWN) - set(merged), n=1, cutoff=0.8)
+        if near:
+            warn(f"{source}: column {name} is not used; is it {near[0]}?")
+    return VehicleLog(
+        source=source, time_s=merged[TIME], position_ned=table(POSITION),
+        quaternion_xyzw=_quaternions(merged, source), velocity_body=table(VELOCITY),
+        rates_body=table(RATES), altitude_m=table((ALTITUDE,))[:, 0], rpm=rpm, thrust_n=thrust,
+        wrench=table(WRENCH), others=others,
+    )  # fmt: skip
+
+
+def longest_step_s(time_s: Array) -> float:
+    """The longest step between times, (T,), that is not a gap; 0 of one time."""
+    steps = np.diff(time_s)
+    return _GAP_STEPS * float(np.median(steps)) if len(steps) else 0.0
+
+
+def segments(log: VehicleLog) -> list[slice]:
+    """Cut a log where its times have gaps; together the stretches hold every row."""
+    gaps = np.flatnonzero(np.diff(log.time_s) > longest_step_s(log.time_s))
+    cuts = [0, *(gaps + 1).tolist(), len(log.time_s)]
+    return [slice(a, b) for a, b in itertools.pairwise(cuts)]
+
+
+def read_number_columns(path: Path) -> dict[str, Array]:
+    """Read a CSV file of numbers; empty fields and `nan` are NaN, columns of text are left out.
+
+    Raises:
+        VehicleError: the file cannot be read, is not a table, has no rows, or a column of numbers
+            holds something else in a line.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            names = [name.strip() for name in next(reader, [])]
+            rows = [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise VehicleError(f"{path}: cannot be read: {error}") from None
+    if not rows:
+        raise VehicleError(f"{path}: has no rows")
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise VehicleError(f"{path}: two columns are named {twice!r:.60}")
+    for line, row in rows:
+        if len(row) != len(names):
+            raise VehicleError(f"{path} line {line}: {len(row)} fields under {len(names)} names")
+    columns, text = {}, []
+    for i, name in enumerate(names):
+        values = [_value(row[i]) for _, row in rows]
+        bad = next((j for j, value in enumerate(values) if value is None), None)
+        if bad is None:
+            columns[name] = np.array(values, dtype=np.float64)
+        elif _is_used(name) or any(v is not None and math.isfinite(v) for v in values):
+            line, row = rows[bad]
+            raise VehicleError(
+                f"{path} line {line}: {shown(name)} is {row[i]!r:.60}, not a finite number"
+            )
+        else:
+            text.append(name)
+    if not columns:
+        raise VehicleError(f"{path}: holds no column of numbers")
+    if text:
+        warn(f"{path}: columns of text are left out: {shown(', '.join(text))}")
+    return columns
+
+
+def _value(text: str) -> float | None:
+    """A number, NaN for an empty field, None for anything else."""
+    stripped = text.strip()
+    if not stripped:
+        return math.nan
+    try:
+        value = float(stripped)
+    except ValueError:
+        return None
+    return None if math.isinf(value) else value
+
+
+def _is_rpm(name: str) -> bool:
+    return name.startswith("rpm_") and len(name) > 4
+
+
+def _is_thrust(name: str) -> bool:
+    return name.startswith("thrust_") and name.endswith("_n") and len(name) > 9
+
+
+def _is_used(name: str) -> bool:
+    return name in _KNOWN or _is_rpm(name) or _is_thrust(name)
+
+
+def _near(name: str, columns: Mapping[str, Array]) -> str:
+    near = difflib.get_close_matches(name, columns, n=1, cutoff=0.5)
+    return f"; is {near[0]!r} meant?" if near else ""
+
+
+def _in_time(columns: dict[str, Array], source: str) -> dict[str, Array]:
+    """The columns with one row a time."""
+    time_s = columns[TIME]
+    unknown = np.flatnonzero(~np.isfinite(time_s))
+    if len(unknown):
+        raise VehicleError(f"{source} row {unknown[0] + 1}: {TIME} is missing")
+    steps = np.diff(time_s)
+    back = np.flatnonzero(steps < 0)
+    if len(back):
+        i = back[0]
+        raise VehicleError(
+            f"{source} row {i + 2}: {TIME} goes back from {time_s[i]:g} to {time_s[i + 1]:g}: sort "
+            "the rows, or cut the file where the clock was set"
+        )
+    again = np.flatnonzero(steps == 0)
+    if not len(again):
+        return columns
+    warn(
+        f"{source}: {len(again)} rows repeat a time, the first is row {again[0] + 2}: merged, a "
+        "later value stands where both hold one"
+    )
+    first = np.concatenate([[0], np.flatnonzero(steps > 0) + 1])
+    last = np.concatenate([first[1:], [len(time_s)]])
+    merged = {}
+    for name, values in columns.items():
+        column = values[last - 1].copy()
+        for i in np.flatnonzero(np.isnan(column)):
+            known = values[first[i] : last[i]]
+            known = known[np.isfinite(known)]
+            if len(known):
+                column[i] = known[-1]
+        merged[name] = column
+    return merged
+
+
+def _quaternions(columns: Mapping[str, Array], source: str) -> Array:
+    """Attitudes, (T, 4), from angles or quaternions; NaN where not every part is known."""
+    given = [n for n in (ANGLES, QUATERNION) if any(name in columns for name in n)]
+    quaternions = np.full((len(columns[TIME]), 4), np.nan)
+    if not given:
+        return quaternions
+    if len(given) == 2:
+        raise VehicleError(f"{source}: attitude is given twice, as angles and as quaternions")
+    missing = next((name for name in given[0] if name not in columns), None)
+    if missing is not None:
+        raise VehicleError(f"{source}: attitude lacks the column {missing}")
+    values = np.stack([columns[name] for name in given[0]], axis=1)
+    known = np.all(np.isfinite(values), axis=1)
+    if not known.any():
+        return quaternions
+    if given[0] is ANGLES:
+        quaternions[known] = rotation_from_attitude(*np.deg2rad(values[known].T)).as_quat()
+        return quaternions
+    quaternions[known] = (values / unit_lengths(values, source)[:, None])[known]
+    return quaternions
+
+
+def unit_lengths(quaternions: Array, source: str) -> Array:
+    """Lengths, (T,), of quaternions (T, 4), 1 but for rounding; NaN where one is not known.
+
+    Raises:
+        VehicleError: a length is farther from 1 than rounding.
+    """
+    length: Array = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1) > _UNIT)
+    if len(wrong):
+        raise VehicleError(
+            f"{source} row {wrong[0] + 1}: the quaternion has the length {length[wrong[0]]:.4g}, "
+            "not 1"
+        )
+    return length

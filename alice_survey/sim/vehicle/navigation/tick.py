@@ -1,0 +1,659 @@
+"""The navigation's tick: measure, predict, weigh, and report to the controller and the log.
+
+The closed loop calls the tick. Instruments measure the true state at that time, which the filter
+sees in no other way.
+
+The truth is a vector (13,): position NED, quaternion ned_from_body xyzw, velocity of the body's
+origin over ground in NED, body rates. Kernels named `measure_...` write the readings of it into
+`NavigationState.readings`.
+"""
+
+import math
+
+import numpy as np
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.dynamics import GRAVITY
+from alice_survey.sim.vehicle.floor import FloorGrid, floor_range
+from alice_survey.sim.vehicle.navigation.filter import (
+    ACCELEROMETER_BIAS,
+    ALTITUDE_NOW,
+    ALTITUDE_PING,
+    ALTITUDE_SIGMA,
+    ALTITUDE_TIME,
+    ALTITUDE_VARIANCE,
+    ATTITUDE,
+    BEAM,
+    BELIEVED,
+    CLEARANCE_NOW,
+    CLEARANCE_PING,
+    DEPTH,
+    DEPTH_BIAS,
+    DEPTH_TIME,
+    DVL_ANGLE,
+    DVL_BIAS,
+    DVL_SCALE,
+    DVL_TIME,
+    DVL_VELOCITY,
+    FOLLOWED_DEPTH,
+    GPS_BIAS,
+    GPS_FIX,
+    GPS_TIME,
+    GPS_USE,
+    GYRO_BIAS,
+    HEADING,
+    HEADING_BIAS,
+    HEADING_TIME,
+    HEADING_TURNS,
+    IMU_PLACE,
+    LATEST,
+    MEAN_SLOPE_EAST,
+    MEAN_SLOPE_NORTH,
+    MOVED_EAST,
+    MOVED_NORTH,
+    PUSH,
+    QUATERNION,
+    RANGE,
+    RATES,
+    REJECTED,
+    RELIEF_PINGS,
+    RELIEF_VARIANCE,
+    SLOPE_EAST,
+    SLOPE_NORTH,
+    SLOPE_VARIANCE,
+    TRUTH_BEFORE,
+    TRUTH_NOW,
+    TURN,
+    USBL_FIX,
+    USBL_TIME,
+    USBL_USE,
+    USED,
+    VELOCITY,
+    WATER_BEAM,
+    WATER_TIME,
+    WATER_VELOCITY,
+    NavigationState,
+    correct,
+    correlated_states,
+    lever_row,
+    predict,
+    use_beams,
+    use_depth,
+    use_fix,
+    use_heading,
+)
+from alice_survey.sim.vehicle.navigation.sensors import (
+    BEAMS,
+    DVL,
+    FOLLOWED,
+    GPS,
+    IMU,
+    PRESSURE,
+    USBL,
+    Sensors,
+)
+from alice_survey.sim.vehicle.rotations import (
+    applied,
+    applied_inverse,
+    matrix_of,
+    turn_between,
+    wrapped,
+)
+
+LOG_COLUMNS = (
+    "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",
+    "u_mps", "v_mps", "w_mps", "p_radps", "q_radps", "r_radps", "altitude_m",
+    "sigma_north_m", "sigma_east_m", "sigma_depth_m",
+    "sigma_roll_rad", "sigma_pitch_rad", "sigma_heading_rad", "sigma_altitude_m",
+    "range_1_m", "range_2_m", "range_3_m", "range_4_m",
+    "used_compass", "used_depth", "used_dvl", "used_water", "used_gps", "used_usbl",
+    "rejected_compass", "rejected_depth", "rejected_dvl", "rejected_water", "rejected_gps",
+    "rejected_usbl", "clearance_m",
+)  # fmt: skip
+"""Columns of `log_row`: the estimate in the order of `estimate_vector`, sigmas, the latest ping's
+ranges, how many measurements of each instrument were used and rejected so far, the clearance."""
+LOG_ROW = len(LOG_COLUMNS)
+LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
+"""Offsets of sigmas, ranges, counts and clearance in a row."""
+_LEAST_SPREAD = 0.01
+"""Least determinant of the scatter of the ends over its squared trace: 1/4 for a square, 0.19 for
+three corners."""
+
+
+@kernel
+def navigation_tick(
+    time_s: float,
+    tick: int,
+    dt_s: float,
+    before: Array,
+    now: Array,
+    water_velocity_ned: Array,
+    floor: FloorGrid,
+    suite: Sensors,
+    nav: NavigationState,
+    rng: np.random.Generator,
+    estimate: Array,
+) -> None:
+    """Advance the navigation from the previous tick to now.
+
+    Args:
+        time_s: now, for drop-outs and ages.
+        tick: counted from 0, when nothing is predicted and `before` is not looked at.
+        dt_s: since the tick before, and at tick 0 the time to the next.
+        before: (13,) truth then: position NED, quaternion ned_from_body, velocity of the body's
+            origin over ground in NED, body rates.
+        now: (13,) truth now.
+        water_velocity_ned: north and east of the current now come first; the rest is not read.
+        floor: the sea floor that the DVL measures.
+        suite: the instruments.
+        nav: filter and instruments, overwritten.
+        rng: source of noise.
+        estimate: (14,) is written as `estimate_vector` has it; altitude and clearance are NaN
+            without bottom lock.
+    """
+    for i in range(nav.innovations.shape[0]):
+        nav.innovations[i] = math.nan
+    matrix_of(now[3:7], nav.turns[TRUTH_NOW])
+    if tick > 0:
+        measure_imu(dt_s, before, now, suite, nav, rng)
+        predict(dt_s, suite, nav)
+        drift(dt_s, suite, nav, rng)
+    else:
+        measure_rates(dt_s, now, suite, nav, rng)
+        matrix_of(nav.nominal[QUATERNION : QUATERNION + 4], nav.turns[BELIEVED])
+    pinged, used = False, False
+    bottom = 0
+    if suite.compass_every > 0 and tick % suite.compass_every == 0:
+        measure_heading(time_s, suite, nav, rng)
+        used |= use_heading(nav, suite)
+    if suite.pressure_every > 0 and tick % suite.pressure_every == 0:
+        measure_depth(time_s, now, suite, nav, rng)
+        used |= use_depth(nav, suite)
+    due = suite.gps_every > 0 and tick % suite.gps_every == 0
+    if due and measure_gps(time_s, now, suite, nav, rng):
+        noise = suite.gps.noise_m * suite.gps.noise_m
+        used |= use_fix(nav, suite, GPS_USE, GPS, GPS_FIX, noise, GPS_BIAS)
+    due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
+    if due and measure_usbl(time_s, now, suite, nav, rng):
+        used |= _use_usbl(nav, suite)
+    if suite.dvl_every > 0 and tick % suite.dvl_every == 0:
+        pinged = True
+        ping = tick // suite.dvl_every
+        measure_dvl(time_s, ping, now, water_velocity_ned, floor, suite, nav, rng)
+        bottom = use_beams(nav, suite, False)
+        used |= bottom != 0
+        used |= use_beams(nav, suite, True) != 0
+    if used:
+        correct(nav)
+    _write_estimate(nav, suite, estimate)
+    if pinged and bottom != 0:
+        _hear_floor(time_s, bottom, nav, suite)
+    _carry_altitude(time_s, nav, suite)
+    estimate[vector.ALTITUDE] = nav.memory[ALTITUDE_NOW]
+    estimate[vector.CLEARANCE] = nav.memory[CLEARANCE_NOW]
+    for i in range(vector.ESTIMATE):
+        nav.memory[LATEST + i] = estimate[i]
+
+
+@kernel
+def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
+    """Weigh the fix of the transponder, with the sigma of its estimated distance."""
+    north = lever_row(nav, suite, USBL, 0)
+    east = lever_row(nav, suite, USBL, 1)
+    sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
+    return use_fix(nav, suite, USBL_USE, USBL, USBL_FIX, sigma * sigma, -1)
+
+
+@kernel
+def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
+    """Write the estimate of the body's origin, except for the altitude."""
+    x, turned, memory = nav.nominal, nav.turns[BELIEVED], nav.memory
+    a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
+    for i in range(3):
+        estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
+        estimate[vector.P + i] = nav.readings[RATES + i] - x[GYRO_BIAS + 1 + i]
+    p, q, r = estimate[vector.P], estimate[vector.P + 1], estimate[vector.P + 2]
+    estimate[vector.U] = x[VELOCITY] - q * c + r * b
+    estimate[vector.U + 1] = x[VELOCITY + 1] - r * a + p * c
+    estimate[vector.U + 2] = x[VELOCITY + 2] - p * b + q * a
+    estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
+    estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
+    heading = math.atan2(turned[1, 0], turned[0, 0])
+    memory[HEADING_TURNS] += wrapped(heading - memory[HEADING_TURNS])
+    estimate[vector.HEADING] = memory[HEADING_TURNS]
+
+
+@kernel
+def _followed_depth(nav: NavigationState, suite: Sensors) -> float:
+    """Believed depth of the followed point, metres."""
+    turned, total = nav.turns[BELIEVED], nav.nominal[2]
+    for i in range(3):
+        total += turned[2, i] * (suite.place[FOLLOWED, i] - suite.place[IMU, i])
+    return float(total)
+
+
+@kernel
+def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) -> None:
+    """Altitude of the followed point and clearance of the hull from a ping: a plane by the beams.
+
+    The beams meet the sea floor about the DVL; the followed point is elsewhere. A plane is fitted
+    (least squares) to their ends by the estimated attitude, and read below the point. How far
+    relief departs from a plane is not seen by one ping, whose four ends leave a single degree of
+    freedom: the ends' deviation from their mean slope of the last seconds shows it.
+    A beam whose velocity was an outlier did not measure the sea floor. Fewer than three
+    beams, or three with ends nearly in line, give no plane.
+    """
+    turned, memory, place = nav.turns[BELIEVED], nav.memory, suite.place
+    count = 0
+    noise = sn = se = sd = snn = sne = see = snd = sed = sdd = 0.0
+    highest = math.inf
+    for i in range(BEAMS):
+        if used >> i & 1 == 0:
+            continue
+        reach = nav.readings[RANGE + i]
+        a = reach * suite.beams[i, 0] + place[DVL, 0] - place[FOLLOWED, 0]
+        b = reach * suite.beams[i, 1] + place[DVL, 1] - place[FOLLOWED, 1]
+        c = reach * suite.beams[i, 2] + place[DVL, 2] - place[FOLLOWED, 2]
+        # Where the beam ends, from the followed point.
+        n, e, d = applied(turned, a, b, c)
+        count += 1
+        sn, se, sd = sn + n, se + e, sd + d
+        snn, sne, see = snn + n * n, sne + n * e, see + e * e
+        snd, sed, sdd = snd + n * d, sed + e * d, sdd + d * d
+        highest = min(highest, d)
+        down = turned[2, 0] * suite.beams[i, 0] + turned[2, 1] * suite.beams[i, 1]
+        down += turned[2, 2] * suite.beams[i, 2]
+        growth = suite.dvl.range_noise_fraction * reach
+        noise += (suite.dvl.range_noise_m * suite.dvl.range_noise_m + growth * growth) * down * down
+    if count < 3:
+        return
+    noise /= count
+    n, e, d = sn / count, se / count, sd / count
+    cnn, cne, cee = snn - n * sn, sne - n * se, see - e * se
+    cnd, ced, cdd = snd - n * sd, sed - e * sd, sdd - d * sd
+    determinant = cnn * cee - cne * cne
+    if determinant < _LEAST_SPREAD * (cnn + cee) * (cnn + cee):
+        return
+    north, east = (cee * cnd - cne * ced) / determinant, (cnn * ced - cne * cnd) / determinant
+    altitude = d - north * n - east * e
+    # Of the plane's depth below the point, by that of a beam's end.
+    leverage = 1.0 / count + (cee * n * n - 2.0 * cne * n * e + cnn * e * e) / determinant
+
+    share = suite.dvl_every * suite.tick_s / suite.relief_memory_s
+    share = max(1.0 / (memory[RELIEF_PINGS] + 1.0), share)
+    freedom = count - 3.0 + 2.0 * (1.0 - share) * (1.0 - share)
+    if freedom > 0.0:
+        memory[RELIEF_PINGS] += 1.0
+        memory[MEAN_SLOPE_NORTH] += share * (north - memory[MEAN_SLOPE_NORTH])
+        memory[MEAN_SLOPE_EAST] += share * (east - memory[MEAN_SLOPE_EAST])
+        gn, ge = memory[MEAN_SLOPE_NORTH], memory[MEAN_SLOPE_EAST]
+        square = cdd - 2.0 * (gn * cnd + ge * ced)
+        square += gn * gn * cnn + 2.0 * gn * ge * cne + ge * ge * cee
+        memory[RELIEF_VARIANCE] += share * (square / freedom - memory[RELIEF_VARIANCE])
+    relief = memory[RELIEF_VARIANCE]
+    # The spread holds the ranges' noise, of which the plane keeps a part only.
+    spread = max((1.0 + leverage) * relief - noise, leverage * noise)
+    # A tilt turns the ends about the point: over a level floor that moves them sideways only.
+    tilt = _variance(nav, ATTITUDE, altitude * east, -altitude * north, 0.0)
+    memory[ALTITUDE_PING], memory[ALTITUDE_VARIANCE] = altitude, spread + tilt
+    memory[SLOPE_NORTH], memory[SLOPE_EAST] = north, east
+    memory[SLOPE_VARIANCE] = max(relief, noise) * (cnn + cee) / determinant
+    memory[MOVED_NORTH] = memory[MOVED_EAST] = 0.0
+    memory[ALTITUDE_TIME] = time_s
+    memory[FOLLOWED_DEPTH] = _followed_depth(nav, suite)
+
+    clearance, lowest = altitude, 0.0
+    points = suite.hull.shape[0]
+    for i in range(points + 1):
+        if i < points:
+            a, b, c = suite.hull[i, 0], suite.hull[i, 1], suite.hull[i, 2]
+        else:
+            a, b, c = place[DVL, 0], place[DVL, 1], place[DVL, 2]
+        a, b, c = a - place[FOLLOWED, 0], b - place[FOLLOWED, 1], c - place[FOLLOWED, 2]
+        n, e, d = applied(turned, a, b, c)
+        clearance = min(clearance, altitude + north * n + east * e - d)
+        lowest = max(lowest, d)
+    memory[CLEARANCE_PING] = min(clearance, highest - lowest)
+
+
+@kernel
+def _variance(nav: NavigationState, t: int, a: float, b: float, c: float) -> float:
+    """Variance of g . e for g = (a, b, c) and the three errors e that begin at t."""
+    p = nav.covariance
+    return float(
+        a * a * p[t, t]
+        + b * b * p[t + 1, t + 1]
+        + c * c * p[t + 2, t + 2]
+        + 2.0 * (a * b * p[t, t + 1] + a * c * p[t, t + 2] + b * c * p[t + 1, t + 2])
+    )
+
+
+@kernel
+def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None:
+    """Altitude and clearance now, by the last ping's plane; NaN when that is too long ago.
+
+    The depth gained since and the rise of the plane below the way gone since are taken off.
+    """
+    memory, x, turned = nav.memory, nav.nominal, nav.turns[BELIEVED]
+    age = time_s - memory[ALTITUDE_TIME]
+    # Not a number before the first ping: then this is false too.
+    if age <= suite.altitude_age_s + 1e-9:
+        if age > 0.0:
+            # Summed speeds, not places: a fix would move the vehicle along the slope.
+            u, v, w = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
+            step = suite.tick_s
+            memory[MOVED_NORTH] += step * (turned[0, 0] * u + turned[0, 1] * v + turned[0, 2] * w)
+            memory[MOVED_EAST] += step * (turned[1, 0] * u + turned[1, 1] * v + turned[1, 2] * w)
+        n, e = memory[MOVED_NORTH], memory[MOVED_EAST]
+        gained = _followed_depth(nav, suite) - memory[FOLLOWED_DEPTH]
+        sinks = memory[SLOPE_NORTH] * n + memory[SLOPE_EAST] * e
+        drifted = age * age * _variance(nav, VELOCITY, turned[2, 0], turned[2, 1], turned[2, 2])
+        drifted += memory[SLOPE_VARIANCE] * (n * n + e * e)
+        memory[ALTITUDE_NOW] = memory[ALTITUDE_PING] - gained + sinks
+        memory[ALTITUDE_SIGMA] = math.sqrt(memory[ALTITUDE_VARIANCE] + drifted)
+        clearance = memory[CLEARANCE_PING] - gained + min(sinks, 0.0)
+        memory[CLEARANCE_NOW] = clearance - memory[ALTITUDE_SIGMA]
+    else:
+        memory[ALTITUDE_NOW] = memory[ALTITUDE_SIGMA] = memory[CLEARANCE_NOW] = math.nan
+
+
+@kernel
+def log_row(nav: NavigationState, out: Array) -> None:
+    """Write a row of the log, (LOG_ROW,), as `LOG_COLUMNS` names it, of the latest tick.
+
+    Sigmas are of the body's origin, whose position error includes attitude, and of Euler angles.
+    """
+    p, turned = nav.covariance, nav.turns[BELIEVED]
+    latest = nav.memory[LATEST : LATEST + vector.ESTIMATE]
+    for i in range(LOG_SIGMA):
+        out[i] = latest[i]
+    out[LOG_CLEARANCE] = latest[vector.CLEARANCE]
+    a, b, c = nav.memory[IMU_PLACE], nav.memory[IMU_PLACE + 1], nav.memory[IMU_PLACE + 2]
+    n, e, d = applied(turned, a, b, c)
+    t = ATTITUDE
+    # The origin lies at minus the lever l from the IMU: the error f moves it by -f x l.
+    for i, g0, g1, g2 in ((0, 0.0, -d, e), (1, d, 0.0, -n), (2, -e, n, 0.0)):
+        both = g0 * p[i, t] + g1 * p[i, t + 1] + g2 * p[i, t + 2]
+        variance = p[i, i] + 2.0 * both + _variance(nav, ATTITUDE, g0, g1, g2)
+        out[LOG_SIGMA + i] = math.sqrt(max(variance, 0.0))
+    # Of the bow (n, e, d): pitch turns about the level axis across it, roll about itself.
+    n, e, d = turned[0, 0], turned[1, 0], turned[2, 0]
+    level2 = n * n + e * e
+    level = math.sqrt(level2)
+    out[LOG_SIGMA + 3] = math.sqrt(_variance(nav, ATTITUDE, n / level2, e / level2, 0.0))
+    out[LOG_SIGMA + 4] = math.sqrt(_variance(nav, ATTITUDE, -e / level, n / level, 0.0))
+    out[LOG_SIGMA + 5] = math.sqrt(_variance(nav, ATTITUDE, -d * n / level2, -d * e / level2, 1.0))
+    out[LOG_SIGMA + 6] = nav.memory[ALTITUDE_SIGMA]
+    for i in range(BEAMS):
+        out[LOG_RANGE + i] = nav.readings[RANGE + i]
+    for i in range(6):
+        out[LOG_USED + i] = nav.counts[i, USED]
+        out[LOG_REJECTED + i] = nav.counts[i, REJECTED]
+
+
+@kernel
+def drift(dt_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator) -> None:
+    """Advance the instruments' biases by a tick: random walks and Gauss-Markov processes."""
+    hidden, root, imu = nav.hidden, math.sqrt(dt_s), sensors.imu
+    for i in range(3):
+        hidden[i] += imu.gyro_bias_walk_radps_per_sqrt_s * root * rng.standard_normal()
+    for i in range(ACCELEROMETER_BIAS - GYRO_BIAS, ACCELEROMETER_BIAS - GYRO_BIAS + 3):
+        hidden[i] += imu.accelerometer_bias_walk_mps2_per_sqrt_s * root * rng.standard_normal()
+    for i, correlation_s, sigma in correlated_states(sensors)[:-2]:  # the water is no instrument
+        kept = math.exp(-dt_s / correlation_s)
+        draw = sigma * math.sqrt(1.0 - kept * kept) * rng.standard_normal()
+        hidden[i - GYRO_BIAS] = kept * hidden[i - GYRO_BIAS] + draw
+
+
+@kernel
+def measure_imu(
+    dt_s: float,
+    before: Array,
+    now: Array,
+    sensors: Sensors,
+    nav: NavigationState,
+    rng: np.random.Generator,
+) -> None:
+    """Increments of angle and of velocity over a tick, and the rates at its end.
+
+    Exact between the two truths: the turn is log(R_k^T R_k+1), and the velocity that the specific
+    force adds in the frame at the tick's start is R_k^T (v_k+1 - v_k - g dt) at the IMU's place.
+    The white noise of the turn is that of the rates too: one gyroscope.
+    """
+    readings, hidden = nav.readings, nav.hidden
+    a, b = nav.turns[TRUTH_BEFORE], nav.turns[TRUTH_NOW]
+    matrix_of(before[3:7], a)
+    turn_between(before[3:7], now[3:7], readings[TURN : TURN + 3])
+    x, y, z = sensors.place[IMU, 0], sensors.place[IMU, 1], sensors.place[IMU, 2]
+    p, q, r = before[10], before[11], before[12]
+    a0, a1, a2 = q * z - r * y, r * x - p * z, p * y - q * x
+    p, q, r = now[10], now[11], now[12]
+    b0, b1, b2 = q * z - r * y, r * x - p * z, p * y - q * x
+    a0, a1, a2 = applied(a, a0, a1, a2)
+    b0, b1, b2 = applied(b, b0, b1, b2)
+    d0 = now[7] - before[7] + b0 - a0
+    d1 = now[8] - before[8] + b1 - a1
+    d2 = now[9] - before[9] + b2 - a2 - GRAVITY * dt_s
+    d0, d1, d2 = applied_inverse(a, d0, d1, d2)
+    root = math.sqrt(dt_s)
+    for i in range(3):
+        noise = sensors.imu.gyro_noise_rad_per_sqrt_s * root * rng.standard_normal()
+        readings[TURN + i] += hidden[i] * dt_s + noise
+        readings[RATES + i] = now[10 + i] + hidden[i] + noise / dt_s
+        readings[PUSH + i] = (
+            (d0, d1, d2)[i]
+            + hidden[3 + i] * dt_s
+            + sensors.imu.accelerometer_noise_mps_per_sqrt_s * root * rng.standard_normal()
+        )
+
+
+@kernel
+def measure_rates(
+    dt_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> None:
+    """The rates alone: the first tick has no increment."""
+    noise = sensors.imu.gyro_noise_rad_per_sqrt_s / math.sqrt(dt_s)
+    for i in range(3):
+        nav.readings[RATES + i] = now[10 + i] + nav.hidden[i] + noise * rng.standard_normal()
+
+
+@kernel
+def measure_heading(
+    time_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> None:
+    """Heading of the compass, radians."""
+    turn = nav.turns[TRUTH_NOW]
+    nav.readings[HEADING] = (
+        math.atan2(turn[1, 0], turn[0, 0])
+        + nav.hidden[HEADING_BIAS - GYRO_BIAS]
+        + sensors.compass.noise_rad * rng.standard_normal()
+    )
+    nav.readings[HEADING_TIME] = time_s
+
+
+@kernel
+def measure_depth(
+    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> None:
+    """Depth of the pressure sensor, metres."""
+    place = sensors.place[PRESSURE]
+    nav.readings[DEPTH] = (
+        now[2]
+        + applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])[2]
+        + nav.hidden[DEPTH_BIAS - GYRO_BIAS]
+        + sensors.pressure.noise_m * rng.standard_normal()
+    )
+    nav.readings[DEPTH_TIME] = time_s
+
+
+@kernel
+def measure_gps(
+    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> bool:
+    """North and east of the antenna, if it is out of the water; whether it was."""
+    if now[2] > sensors.gps.most_depth_m:
+        return False
+    place = sensors.place[GPS]
+    arm = applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])
+    for i in range(2):
+        nav.readings[GPS_FIX + i] = (
+            now[i]
+            + arm[i]
+            + nav.hidden[GPS_BIAS - GYRO_BIAS + i]
+            + sensors.gps.noise_m * rng.standard_normal()
+        )
+    nav.readings[GPS_TIME] = time_s
+    return True
+
+
+@kernel
+def usbl_sigma(sensors: Sensors, north_m: float, east_m: float, depth_m: float) -> float:
+    """Standard deviation of north and of east of a transponder's fix, by its slant range."""
+    a, b = north_m - sensors.usbl.boat_ned_m[0], east_m - sensors.usbl.boat_ned_m[1]
+    c = depth_m - sensors.usbl.boat_ned_m[2]
+    noise, slope = sensors.usbl.noise_m, sensors.usbl.noise_fraction
+    return math.sqrt(noise * noise + slope * slope * (a * a + b * b + c * c))
+
+
+@kernel
+def measure_usbl(
+    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> bool:
+    """North and east of the transponder; whether there was an answer."""
+    place, turn = sensors.place[USBL], nav.turns[TRUTH_NOW]
+    north, east, depth = applied(turn, place[0], place[1], place[2])
+    north, east, depth = now[0] + north, now[1] + east, now[2] + depth
+    a, b = north - sensors.usbl.boat_ned_m[0], east - sensors.usbl.boat_ned_m[1]
+    c = depth - sensors.usbl.boat_ned_m[2]
+    # A transponder that breaks the surface is not received.
+    if depth <= 0.0 or math.sqrt(a * a + b * b + c * c) > sensors.usbl.most_range_m:
+        return False
+    sigma = usbl_sigma(sensors, north, east, depth)
+    wrong = rng.random() < sensors.usbl.outlier_probability
+    for i in range(2):
+        value = (north if i == 0 else east) + sigma * rng.standard_normal()
+        if wrong:
+            value += sensors.usbl.outlier_m * (2.0 * rng.random() - 1.0)
+        nav.readings[USBL_FIX + i] = value
+    nav.readings[USBL_TIME] = time_s
+    return True
+
+
+@kernel
+def measure_dvl(
+    time_s: float,
+    ping: int,
+    now: Array,
+    water_ned: Array,
+    floor: FloorGrid,
+    sensors: Sensors,
+    nav: NavigationState,
+    rng: np.random.Generator,
+) -> None:
+    """One ping: ranges and velocities along the beams, and at intervals through the water.
+
+    A velocity along a beam b is b . ((1 + s) Rz(a)^T v + bias), of the velocity v of the instrument
+    in the body frame, its scale error s and its misalignment a about the vertical.
+    """
+    readings, turn, dvl = nav.readings, nav.turns[TRUTH_NOW], sensors.dvl
+    for i in range(RANGE, WATER_VELOCITY + 3):
+        readings[i] = math.nan
+    readings[DVL_TIME] = time_s
+    for i in range(sensors.dropouts_s.shape[0]):
+        if sensors.dropouts_s[i, 0] <= time_s < sensors.dropouts_s[i, 1]:
+            return
+    if turn[2, 2] < sensors.least_cos_tilt or rng.random() < dvl.ping_loss:
+        return
+    x, y, z = sensors.place[DVL, 0], sensors.place[DVL, 1], sensors.place[DVL, 2]
+    p, q, r = now[10], now[11], now[12]
+    spin0, spin1, spin2 = q * z - r * y, r * x - p * z, p * y - q * x
+    north, east, depth = applied(turn, x, y, z)
+    north, east, depth = now[0] + north, now[1] + east, now[2] + depth
+    u, v, w = applied_inverse(turn, now[7], now[8], now[9])
+    u, v, w = u + spin0, v + spin1, w + spin2
+    speed = math.sqrt(u * u + v * v + w * w)
+    sigma = dvl.beam_noise_mps + dvl.beam_noise_per_speed * speed
+    heard, clearance, bottom = 0, math.inf, True
+    for i in range(sensors.bottom_dropouts_s.shape[0]):
+        silent = sensors.bottom_dropouts_s[i]
+        bottom &= not (silent[0] <= time_s < silent[1])
+    for i in range(BEAMS if bottom else 0):
+        b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
+        beam_n, beam_e, down = applied(turn, b0, b1, b2)
+        reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.most_range_m)
+        if not math.isfinite(reach):
+            continue
+        clearance = min(clearance, reach * down)
+        if reach < dvl.least_range_m or rng.random() < dvl.beam_loss:
+            continue
+        heard += 1
+        slope = dvl.range_noise_fraction * reach
+        noise = math.sqrt(dvl.range_noise_m * dvl.range_noise_m + slope * slope)
+        readings[RANGE + i] = reach + noise * rng.standard_normal()
+        readings[BEAM + i] = (
+            _along_beam(sensors, nav.hidden, i, u, v, w) + sigma * rng.standard_normal()
+        )
+        if rng.random() < dvl.outlier_probability:
+            readings[BEAM + i] = dvl.outlier_mps * (2.0 * rng.random() - 1.0)
+            readings[RANGE + i] *= rng.random()
+    solve_beams(sensors.beams, readings[BEAM : BEAM + 4], readings[DVL_VELOCITY : DVL_VELOCITY + 3])
+    if dvl.water_every == 0 or (heard > 0 and ping % dvl.water_every != 0):
+        return
+    if clearance < dvl.water_least_altitude_m:
+        return
+    # Relative to the water: its velocity is taken off in NED before it is turned.
+    n, e = now[7] - water_ned[0], now[8] - water_ned[1]
+    u, v, w = applied_inverse(turn, n, e, now[9])
+    u, v, w = u + spin0, v + spin1, w + spin2
+    for i in range(BEAMS):
+        readings[WATER_BEAM + i] = (
+            _along_beam(sensors, nav.hidden, i, u, v, w)
+            + dvl.water_noise_mps * rng.standard_normal()
+        )
+    solve_beams(
+        sensors.beams,
+        readings[WATER_BEAM : WATER_BEAM + 4],
+        readings[WATER_VELOCITY : WATER_VELOCITY + 3],
+    )
+    readings[WATER_TIME] = time_s
+
+
+@kernel
+def _along_beam(sensors: Sensors, hidden: Array, i: int, u: float, v: float, w: float) -> float:
+    """Velocity along a beam with the instrument's constant errors."""
+    angle = hidden[DVL_ANGLE - GYRO_BIAS]
+    scale = 1.0 + hidden[DVL_SCALE - GYRO_BIAS]
+    c, s = math.cos(angle), math.sin(angle)
+    b = sensors.beams
+    return float(
+        b[i, 0] * (scale * (c * u + s * v) + hidden[DVL_BIAS - GYRO_BIAS])
+        + b[i, 1] * (scale * (c * v - s * u) + hidden[DVL_BIAS - GYRO_BIAS + 1])
+        + b[i, 2] * scale * w
+    )
+
+
+@kernel
+def solve_beams(beams: Array, along: Array, out: Array) -> None:
+    """Velocity, (3,), that four beams give by least squares, or three; NaN from fewer.
+
+    Opposite beams of a Janus arrangement add up to the same as the other two, which gives back a
+    beam that is missing.
+    """
+    missing, which = 0, 0
+    for i in range(BEAMS):
+        if not math.isfinite(along[i]):
+            missing, which = missing + 1, i
+    if missing > 1:
+        out[0] = out[1] = out[2] = math.nan
+        return
+    given = along[which]
+    if missing == 1:
+        given = along[(which + 1) % 4] + along[(which + 3) % 4] - along[(which + 2) % 4]
+    for axis in range(3):
+        total = square = 0.0
+        for i in range(BEAMS):
+            total += beams[i, axis] * (given if i == which else along[i])
+            square += beams[i, axis] * beams[i, axis]
+        out[axis] = total / square

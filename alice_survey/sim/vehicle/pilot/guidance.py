@@ -1,0 +1,339 @@
+"""Guidance: heading, speed and sway, tick by tick.
+
+Two ways of following a path (paper, section VII). `los`, of the original vehicle, heads for a point
+a look-ahead distance further on the path's tangent; a cross current holds it off the path
+(docs/vehicle-comparison.md). `sway` keeps the heading along the path and asks the lateral thrusters
+for a sway speed that takes the cross-track error away; far off the path it turns to `los` until it
+is near. Position, cross-track error and altitude are those of the followed point, by default the
+left port's glass, for which plans are made.
+
+A mission in the form of another vehicle's software is flown by its law instead (mission.py).
+
+A mission's phases (memory.py): DIVE to the altitude, as near to the start as the thrusters can
+stay; APPROACH to the start of a straight way in, however far the current has carried the vehicle;
+FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an ascent with a reason
+(safety.py). Close to the sea floor the vehicle slows down and climbs. Without bottom lock it stops
+and holds its depth, rising as the floor last did, until the lock is lost for too long. A vehicle
+that fins steer goes on at the survey's speed in all of these, on a circle where it would wait.
+"""
+
+import math
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot.following import (
+    follow,
+    go_to,
+)
+from alice_survey.sim.vehicle.pilot.gains import HEAVE, LEAST, STEADY_SHARE, Gains
+from alice_survey.sim.vehicle.pilot.memory import (
+    ABORT,
+    APPROACH,
+    ASCEND,
+    DIVE,
+    DONE,
+    FOLLOW,
+    PilotState,
+)
+from alice_survey.sim.vehicle.pilot.mission import (
+    COLA2,
+    NO_LAW,
+    PilotMission,
+    fly_mission,
+    mission_progress_m,
+)
+from alice_survey.sim.vehicle.pilot.path import Path, advance, place_at
+from alice_survey.sim.vehicle.pilot.safety import (
+    LOST_PATH,
+    NO_NAVIGATION,
+    NONE,
+    mind_floor,
+    navigates,
+    restart_watch,
+    watch,
+)
+from alice_survey.sim.vehicle.pilot.settings import Guidance
+from alice_survey.sim.vehicle.pilot.standing import (
+    brake,
+    leave_stop,
+    must_brake,
+    stand,
+    stands,
+    start_standing,
+)
+from alice_survey.sim.vehicle.pilot.steering import (
+    DEPTH_KEPT_M,
+    HEADING_KEPT_RAD,
+    clamped,
+    head_for,
+    hear_floor,
+    hold_level,
+    sink_to,
+    surge_at,
+    write_point,
+    write_wrench,
+)
+from alice_survey.sim.vehicle.rotations import wrapped
+
+_DEPTH_SPEED_KEPT_MPS = 0.05
+_CAUTION_M = 0.5
+"""A dive without bottom lock stops at least this far above the greatest depth."""
+_MEAN_S = 12.0
+"""Swings are averaged over about this time, and must be about the goal for as long: longer than the
+period of a long swell."""
+_SWING = 3.0
+"""The path is entered from within so many times the distance that counts as near."""
+_SETTLE_S = 2.0
+_QUICKEST = 2.0
+"""Greatest progress along the path over the wanted speed: a projection may not jump."""
+
+
+@kernel
+def steer(
+    time_s: float,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    mission: PilotMission,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+    wrench: Array,
+) -> None:
+    """Guide and control the vehicle for a tick.
+
+    Args:
+        time_s: since the start of the mission.
+        dt_s: the tick.
+        estimate: (14,) of the navigation, see estimate_vector.py.
+        path: to follow, unless there is a mission.
+        mission: steps to fly by the law of another vehicle's software; `NO_MISSION` for none.
+        guidance: settings.
+        gains: gains of the inner loops.
+        pilot: memory and report, written.
+        wrench: (6,) N and N m, is written: forces and moments commanded of the thrusters.
+    """
+    report, demand = pilot.report, pilot.demand
+    for i in range(slot.FULL_SURGE):
+        demand[i] = 0.0
+    for i in range(6):
+        wrench[i] = 0.0
+    report[slot.WANTED_SWAY] = report[slot.WANTED_SURGE] = 0.0
+    if report[slot.PHASE] == DONE:
+        return
+    if not navigates(estimate):
+        report[slot.REASON] = NO_NAVIGATION
+        _enter(pilot, ABORT)
+    if report[slot.REASON] == NO_NAVIGATION:
+        # Without an estimate of its motion the vehicle can only push itself up.
+        wrench[2] = STEADY_SHARE * gains.axes[HEAVE, LEAST]
+        return
+
+    write_point(estimate, guidance, pilot)
+    hear_floor(estimate, dt_s, guidance, pilot)
+    if mission.law == NO_LAW:
+        progress = _progress_m(estimate, path, guidance, pilot)
+    else:
+        progress = mission_progress_m(estimate, mission, pilot)
+    reason = watch(time_s, dt_s, estimate, progress, guidance.limits, pilot)
+    if reason != NONE:
+        _abort(reason, estimate, pilot)
+
+    phase = report[slot.PHASE]
+    if mission.law != NO_LAW and (phase == FOLLOW or phase == DIVE):  # noqa: SIM109  as below
+        if fly_mission(dt_s, estimate, path, mission, guidance, gains, pilot):
+            _enter(pilot, ASCEND)
+    elif phase == FOLLOW:
+        _on_path(dt_s, estimate, path, guidance, gains, pilot)
+    elif phase == DIVE or phase == APPROACH:  # noqa: SIM109  a tuple is slower here
+        _on_the_way(dt_s, estimate, path, guidance, gains, pilot)
+    else:
+        sink_to(0.0, 0.0, dt_s, estimate, path, guidance, gains, pilot)
+        turning, speed = 0.0, 0.0
+        if guidance.under_way.circle_m > 0.0:
+            speed = path.speed_mps
+            turning = guidance.under_way.side * speed / guidance.under_way.circle_m
+        heading = report[slot.WANTED_HEADING] + turning * dt_s
+        if turning != 0.0:  # no farther ahead of the vehicle than it keeps up with
+            behind = wrapped(heading - estimate[vector.HEADING])
+            heading = estimate[vector.HEADING] + clamped(behind, HEADING_KEPT_RAD)
+        head_for(heading, turning, 0.0, estimate, dt_s, gains, pilot)
+        surge_at(speed, dt_s, guidance, gains, pilot)
+        report[slot.LINE], report[slot.BY_SWAY] = -1.0, 0.0
+        if estimate[vector.DEPTH] < guidance.surface_m:
+            report[slot.AT_SURFACE] = 1.0
+            if phase == ASCEND:
+                report[slot.PHASE] = DONE
+    write_wrench(gains, pilot, wrench)
+    hold_level(estimate, dt_s, gains, pilot, wrench)
+    if guidance.sway == 0.0 or (mission.law == COLA2 and pilot.memory[slot.KEEPS] == 0.0):
+        wrench[1] = 0.0
+
+
+@kernel
+def _enter(pilot: PilotState, phase: int) -> None:
+    pilot.report[slot.PHASE] = phase
+    pilot.memory[slot.SETTLED_S] = 0.0
+    restart_watch(pilot)
+
+
+@kernel
+def _abort(reason: int, estimate: Array, pilot: PilotState) -> None:
+    pilot.report[slot.REASON] = reason
+    pilot.report[slot.WANTED_HEADING] = estimate[vector.HEADING]
+    _enter(pilot, ABORT)
+
+
+@kernel
+def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
+    """Wanted depth of the origin: as deep as allowed without bottom lock until there is one.
+
+    The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
+    """
+    if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
+        limits = guidance.limits
+        return float(min(limits.blind_depth_m, limits.most_depth_m - _CAUTION_M))
+    return float(pilot.memory[slot.FLOOR] - path.altitude_m)
+
+
+@kernel
+def _minded_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
+    """Wanted depth of the origin, clear of the sea floor; the pace is slowed where one can."""
+    target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
+    if guidance.under_way.circle_m > 0.0:
+        pilot.memory[slot.PACE] = 1.0
+    return float(target)
+
+
+@kernel
+def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, float, float]:
+    """North, east and heading at the start of the approach to the path."""
+    leg, along = int(pilot.report[slot.LEG]), pilot.report[slot.ALONG]
+    if stands(path, leg):
+        # Here the vehicle goes to the place itself, with the heading it has there.
+        turned = math.copysign(pilot.memory[slot.REF], path.turn_rad[leg])
+        n, e, heading, _ = place_at(path, leg, along)
+        return n, e, heading + (turned if path.turn_rad[leg] != 0.0 else path.side_rad[leg])
+    n, e, heading, _ = place_at(path, leg, along)
+    back = guidance.way_in_m
+    return n - back * math.cos(heading), e - back * math.sin(heading), heading
+
+
+@kernel
+def _progress_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
+    """Quantity that should grow in the present phase."""
+    phase = pilot.report[slot.PHASE]
+    if phase == DIVE:
+        return float(-abs(_target_m(path, guidance, pilot) - estimate[vector.DEPTH]))
+    if phase == APPROACH:
+        n, e, _ = _goal(path, guidance, pilot)
+        point = pilot.point
+        return float(-math.hypot(n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]))
+    leg = int(pilot.report[slot.LEG])
+    progress = path.begins_m[leg] + pilot.report[slot.ALONG]
+    if path.turn_rad[leg] != 0.0:
+        # A radian of a turn on the spot counts as a metre.
+        progress += pilot.memory[slot.REF]
+    return float(progress)
+
+
+@kernel
+def _on_the_way(
+    dt_s: float, estimate: Array, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
+) -> None:
+    """Dive or approach for a tick."""
+    memory, report, point = pilot.memory, pilot.report, pilot.point
+    phase = report[slot.PHASE]
+    target = _minded_m(estimate, path, guidance, pilot)
+    sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
+    n, e, heading = _goal(path, guidance, pilot)
+    distance, error = go_to(n, e, heading, dt_s, estimate, path, guidance, gains, pilot)
+    dn, de = point[slot.POINT_NORTH] - n, point[slot.POINT_EAST] - e
+    report[slot.CROSS] = de * math.cos(heading) - dn * math.sin(heading)
+    report[slot.PATH_HEADING], report[slot.LINE] = heading, -1.0
+
+    swings = False
+    if phase == DIVE:
+        settled = (
+            memory[slot.FLOOR_KNOWN] > 0.0
+            and abs(target - estimate[vector.DEPTH]) < DEPTH_KEPT_M
+            and abs(point[slot.SINK_SPEED]) < _DEPTH_SPEED_KEPT_MPS
+        )
+    else:
+        hovers = guidance.under_way.circle_m == 0.0
+        heads = (hovers and guidance.sway == 0.0) or abs(error) < HEADING_KEPT_RAD
+        settled = distance < guidance.capture_m and heads
+        swings = _is_near_on_the_mean(dn, de, dt_s, guidance.capture_m, pilot) and heads
+    memory[slot.SETTLED_S] = memory[slot.SETTLED_S] + dt_s if settled else 0.0
+    if phase == DIVE and memory[slot.SETTLED_S] > _SETTLE_S:
+        _enter(pilot, APPROACH)
+    elif phase == APPROACH and (
+        swings or memory[slot.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0)
+    ):
+        memory[slot.STANDING] = 0.0
+        if not stands(path, int(report[slot.LEG])):
+            report[slot.ALONG] -= guidance.way_in_m
+        _enter(pilot, FOLLOW)
+
+
+@kernel
+def _is_near_on_the_mean(
+    dn: float, de: float, dt_s: float, near_m: float, pilot: PilotState
+) -> bool:
+    """Whether the followed point swings about its goal: in swell it never stays there.
+
+    Args:
+        dn: how far it is north of the goal, m.
+        de: how far east.
+        dt_s: the tick.
+        near_m: how far it may be off on the mean.
+        pilot: its memory is written.
+    """
+    memory, share = pilot.memory, dt_s / _MEAN_S
+    memory[slot.MEAN_N] += share * (dn - memory[slot.MEAN_N])
+    memory[slot.MEAN_E] += share * (de - memory[slot.MEAN_E])
+    near = math.hypot(memory[slot.MEAN_N], memory[slot.MEAN_E]) < near_m
+    memory[slot.NEAR_S] = memory[slot.NEAR_S] + dt_s if near else 0.0
+    return bool(memory[slot.NEAR_S] > _MEAN_S and math.hypot(dn, de) < _SWING * near_m)
+
+
+@kernel
+def _on_path(
+    dt_s: float, estimate: Array, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
+) -> None:
+    """Follow the path for a tick."""
+    memory, report, point = pilot.memory, pilot.report, pilot.point
+    leg, along, over = int(report[slot.LEG]), report[slot.ALONG], False
+    if memory[slot.STANDING] == 0.0 and stands(path, leg):
+        start_standing(memory[slot.REF], 0.0, pilot)
+    elif memory[slot.STANDING] == 0.0:
+        leg, along, over = advance(
+            path,
+            leg,
+            along,
+            point[slot.POINT_NORTH],
+            point[slot.POINT_EAST],
+            _QUICKEST * path.speed_mps * dt_s,
+        )
+        if must_brake(path, guidance, gains, pilot, leg, along):
+            speed = max(point[slot.SURGE_SPEED], 0.0)
+            brake(speed, along, estimate[vector.HEADING], gains, pilot)
+    target = _minded_m(estimate, path, guidance, pilot)
+    sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
+    if memory[slot.STANDING] == 0.0:
+        follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
+    elif stand(leg, dt_s, estimate, path, guidance, gains, pilot):
+        over = leave_stop(path, estimate[vector.HEADING], pilot)
+    if over:
+        _enter(pilot, ASCEND)
+    elif abs(report[slot.CROSS]) > guidance.lost_m:
+        memory[slot.RETURNS] += 1.0
+        if memory[slot.RETURNS] > guidance.limits.most_returns:
+            _abort(LOST_PATH, estimate, pilot)
+            return
+        # Back to where the path was left; of an arc, to its start, since the way in is straight.
+        if path.curvature_per_m[leg] != 0.0:
+            report[slot.ALONG] = 0.0
+        _enter(pilot, APPROACH)

@@ -1,0 +1,339 @@
+"""Settings of the guidance, and their derivation from the vehicle and the path."""
+
+import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.limits import SPOT_RAD_S, STEP_MPS
+from alice_survey.sim.vehicle.pilot.diving import HOVERS, UnderWay, dive_loop
+from alice_survey.sim.vehicle.pilot.gains import (
+    BANDWIDTH,
+    FASTEST,
+    LAG,
+    LEAST,
+    MASS,
+    MOST,
+    PITCH,
+    PLACE,
+    RATE,
+    STEADY_SHARE,
+    SURGE,
+    SWAY,
+    YAW,
+    Gains,
+)
+from alice_survey.sim.vehicle.pilot.linear import (
+    coupled_pair,
+    damping_ratio,
+)
+from alice_survey.sim.vehicle.pilot.path import Path
+from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
+
+LEFT_PORT_BODY_M = (0.55, -0.05, 0.08)
+"""The left port's outer glass, as the default rig has it."""
+CONTROL_LENGTH_M = 1.6
+"""The unit of the pilot's distances: the hull of SPARUS II, which the paper (section II) states for
+ALICE too; ALICE's is longer (`Vehicle.hull`)."""
+LOS_DAMPING_RATIO = 0.5
+"""Least damping of the path loop of `los` (inferred: one overshoot of a sixth)."""
+_STRAIGHT_PER_M = 1e-9
+_TERRAIN_SMOOTHING_M = 1.5
+"""Relief shorter than this is not followed."""
+_LOOK_AHEADS_M = np.geomspace(CONTROL_LENGTH_M, 100.0, 400)
+_DEPTH_OFF_M = 0.2
+"""Offset in depth for which fins do not have to be at their limits."""
+_RAMP_PERIODS = 2.0
+"""A reference gains its speed in this many times 1 / bandwidth of the loop that follows it: a
+critically damped pair has then done most of what it does (inferred)."""
+SWAY_LOOK_AHEAD_M = 2.5 * CONTROL_LENGTH_M
+"""Look-ahead of `sway`, used only far off its path, where none is damped well: the longest
+that Fossen (2011, section 10.3.2) gives."""
+
+
+class Guidance(NamedTuple):
+    """Settings of the guidance; `pilot_guidance` derives those that follow from the vehicle."""
+
+    sway: float
+    """1: the path is held by sway; 0: by heading alone."""
+    point_body_m: Array
+    """(3,) the followed point."""
+    look_ahead_m: float
+    far_m: float
+    """Cross-track error beyond which sway gives way to heading ..."""
+    near_m: float
+    """... until it is below this."""
+    lost_m: float
+    """Cross-track error beyond which the vehicle goes back to where it left the path."""
+    capture_m: float
+    """The way in begins when its start is this near."""
+    way_in_m: float
+    """Straight way before the path's start."""
+    smooth_m: float
+    """The path's heading is averaged this far back and ahead, so that turns begin gently: as far as
+    the vehicle goes, in the tightest turn, while its heading loop settles."""
+    brake_mps2: float
+    """Deceleration before turns that need a lower speed."""
+    floor_rate_rad_s: float
+    """Bandwidth at which the altitude follows the terrain."""
+    surface_m: float
+    """Depth of the origin at which the vehicle is at the surface."""
+    stop_mps2: float
+    """Deceleration into a stop."""
+    spot_rad_s: float
+    """Rate of a turn on the spot."""
+    spot_rad_s2: float
+    """Angular acceleration of that turn."""
+    step_mps: float
+    """Speed of a sway step."""
+    step_mps2: float
+    """Acceleration of that step."""
+    limits: SafetyLimits
+    under_way: UnderWay = HOVERS
+    """How a vehicle that cannot hover flies."""
+
+
+def pilot_guidance(
+    gains: Gains,
+    path: Path,
+    controller: Literal["sway", "los"],
+    *,
+    most_depth_m: float,
+    point_body_m: tuple[float, float, float] = LEFT_PORT_BODY_M,
+    look_ahead_m: float | None = None,
+    spot_rad_s: float = SPOT_RAD_S,
+    limits: SafetyLimits | None = None,
+) -> Guidance:
+    """Settings for a vehicle and a path.
+
+    Sway gives way to heading half a hull length off the path, where turning towards it begins to
+    cost less than pushing the hull sideways, and takes over again at half of that (inferred).
+
+    Args:
+        gains: gains of the vehicle.
+        path: its speed and altitude count.
+        controller: `sway` or `los`.
+        most_depth_m: no deeper than this.
+        point_body_m: the followed point.
+        look_ahead_m: when heading for the path; `shortest_look_ahead_m` when left out, and for
+            `sway`, where there is none, SWAY_LOOK_AHEAD_M.
+        spot_rad_s: greatest rate of turns on the spot; a vehicle that can do less turns slower.
+        limits: for safety; half the path's altitude is the least when left out.
+
+    Raises:
+        VehicleError: the vehicle has no thrusters for sway, `los` is to fly sway steps, or no
+            look-ahead will do for `los`.
+    """
+    axes, speed = gains.axes, path.speed_mps
+    by_sway = controller == "sway"
+    if by_sway and axes[SWAY, FASTEST] == 0.0:
+        raise VehicleError(
+            "the vehicle has no lateral thrusters: fly it with the controller los, not sway"
+        )
+    steps = int(np.count_nonzero(path.side_rad))
+    if steps and not by_sway:
+        raise VehicleError(
+            f"the route has {steps} sway step{'s' if steps > 1 else ''}, which the controller los "
+            "cannot fly: plan with turns = 'spot' or 'arcs', or fly alice with the controller sway"
+        )
+    if look_ahead_m is None:
+        look_ahead_m = shortest_look_ahead_m(gains, speed, point_body_m[0])
+    if gains.dives_by_pitch:
+        look_ahead_m = max(look_ahead_m, _gentle_m(gains, YAW, speed, 0.5 * CONTROL_LENGTH_M))
+    if math.isnan(look_ahead_m) and not by_sway:
+        raise VehicleError(
+            f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
+            f"weaving at {speed:g} m/s: lower the speed, or check the vehicle's coefficients"
+        )
+    weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
+    tightest = float(np.abs(path.curvature_per_m).max())
+    under_way = HOVERS
+    if gains.dives_by_pitch:
+        under_way = _under_way(gains, path, tightest)
+    turning = turning_speed_mps(gains, tightest, abs(point_body_m[0]) if by_sway else 0.0)
+    spot_rad_s, step_mps = stop_speeds(gains, point_body_m[0], by_sway, spot_rad_s)
+    return Guidance(
+        sway=float(by_sway),
+        point_body_m=np.array(point_body_m, np.float64),
+        look_ahead_m=SWAY_LOOK_AHEAD_M if math.isnan(look_ahead_m) else look_ahead_m,
+        far_m=0.5 * CONTROL_LENGTH_M,
+        near_m=0.25 * CONTROL_LENGTH_M,
+        lost_m=5.0 * CONTROL_LENGTH_M,
+        capture_m=0.2 if by_sway else 1.0,
+        way_in_m=CONTROL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
+        smooth_m=min(speed, turning) / float(axes[YAW, BANDWIDTH]),
+        brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
+        floor_rate_rad_s=2.0 * speed / _TERRAIN_SMOOTHING_M,
+        surface_m=0.3,
+        stop_mps2=speed * float(axes[SURGE, BANDWIDTH]) / _RAMP_PERIODS,
+        spot_rad_s=spot_rad_s,
+        spot_rad_s2=spot_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
+        step_mps=step_mps,
+        step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
+        limits=limits or SafetyLimits(0.5 * path.altitude_m, most_depth_m),
+        under_way=under_way,
+    )
+
+
+def _gentle_m(gains: Gains, axis: int, speed_mps: float, off_m: float) -> float:
+    """The look-ahead with which an offset asks for no tighter a turn than fins hold.
+
+    A path that closes as exp(-x / look-ahead) has a curvature of off / look-ahead^2.
+    """
+    return math.sqrt(off_m * speed_mps / float(gains.axes[axis, FASTEST]))
+
+
+def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
+    """How a vehicle that fins steer flies a path; it waits on a circle as wide as the path's turns.
+
+    Raises:
+        VehicleError: it cannot.
+    """
+    speed, fastest = path.speed_mps, float(gains.axes[YAW, FASTEST])
+    if np.any(path.stop > 0.0):
+        raise VehicleError(
+            "the route has turns on the spot or sway steps, and a vehicle that fins steer cannot "
+            "stop: plan it with turns = 'arcs', and with the room for them (area.turn_margin_m)"
+        )
+    if tightest_per_m * speed > fastest:
+        raise VehicleError(
+            f"the route has turns of {1 / tightest_per_m:.2f} m radius, and the fins hold "
+            f"{speed / fastest:.2f} m at {speed:g} m/s: raise plan.turn_radius_m"
+        )
+    look_ahead_m = _shortest_m(lambda ahead_m: damping_ratio(dive_loop(gains, speed, ahead_m)))
+    if math.isnan(look_ahead_m):
+        raise VehicleError(
+            f"no look-ahead up to {_LOOK_AHEADS_M[-1]:g} m keeps the vehicle from weaving about "
+            f"its depth at {speed:g} m/s: change the speed, or check fins and coefficients"
+        )
+    radius_m = 1.0 / tightest_per_m if tightest_per_m > _STRAIGHT_PER_M else 2.0 * speed / fastest
+    return UnderWay(
+        circle_m=radius_m,
+        side=1.0,
+        dive_ahead_m=max(look_ahead_m, _gentle_m(gains, PITCH, speed, _DEPTH_OFF_M)),
+        level_rad=gains.level_rad,
+    )
+
+
+def stop_speeds(
+    gains: Gains,
+    lever_m: float,
+    by_sway: bool,
+    spot_rad_s: float = SPOT_RAD_S,
+) -> tuple[float, float]:
+    """Rate of turns on the spot and speed of sway steps that a vehicle can do.
+
+    While it turns about the followed point, the origin sways at the rate times the lever.
+
+    Args:
+        gains: gains of the vehicle.
+        lever_m: how far the followed point is ahead of the origin.
+        by_sway: whether sway is controlled.
+        spot_rad_s: rate that is wanted.
+
+    Returns:
+        The rate, no greater than wanted, and the speed, at most `STEP_MPS`, 0 without sway.
+    """
+    rate = min(spot_rad_s, float(gains.axes[YAW, FASTEST]))
+    if not by_sway:
+        return rate, 0.0
+    fastest = float(gains.axes[SWAY, FASTEST])
+    if lever_m != 0.0:
+        rate = min(rate, fastest / abs(lever_m))
+    return rate, min(STEP_MPS, fastest)
+
+
+@kernel
+def turning_speed_mps(gains: Gains, curvature_per_m: float, lever_m: float) -> float:
+    """Greatest speed at which a curvature needs no more yaw and sway than available.
+
+    While the followed point goes round an arc with its heading along it, the origin, behind it,
+    sways outwards by curvature times speed times the lever.
+
+    Args:
+        gains: gains of the vehicle.
+        curvature_per_m: curvature of the path, not negative.
+        lever_m: how far the followed point is ahead of the origin; 0 where sway is not controlled.
+
+    Returns:
+        Infinite on a straight.
+    """
+    if curvature_per_m < _STRAIGHT_PER_M:
+        return math.inf
+    speed = gains.axes[YAW, FASTEST] / curvature_per_m
+    if lever_m > 0.0:
+        speed = min(speed, gains.axes[SWAY, FASTEST] / (curvature_per_m * lever_m))
+    return float(speed)
+
+
+def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float) -> Array:
+    """State matrix of `los` about a straight path without drift.
+
+    States: offset of the followed point, m; heading minus the path's; sway, m/s; yaw rate; yaw
+    acceleration that the lagging thrusters give. Sway and yaw are those of the hull, coupled.
+
+    Args:
+        gains: gains of the vehicle.
+        speed_mps: surge.
+        lever_m: how far the followed point is ahead of the origin.
+        look_ahead_m: look-ahead of the guidance.
+
+    Returns:
+        (5, 5)
+    """
+    pair, by_moment = coupled_pair(gains.body, speed_mps, gains.fins)
+    row = gains.axes[YAW]
+    loop = np.zeros((5, 5))
+    loop[0, 1:4] = speed_mps, 1.0, lever_m
+    loop[1, 3] = 1.0
+    loop[2:4, 2:4] = pair
+    loop[2:4, 4] = by_moment * row[MASS]
+    # Wanted heading -offset / look-ahead, and its rate.
+    asked = -row[RATE] / look_ahead_m * loop[0]
+    asked[[0, 1, 3]] -= row[PLACE] / look_ahead_m, row[PLACE], row[RATE]
+    loop[4] = asked / row[LAG]
+    loop[4, 4] -= 1.0 / row[LAG]
+    return loop
+
+
+def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float:
+    """The shortest look-ahead with which `los` is damped well enough on a straight path.
+
+    The longer it is, the further does a current hold the vehicle off the path; the shorter, the
+    more does it weave, since a slender hull slips through its turns and takes long to go where it
+    points. Not below the length of the hull: the linear loop's prediction there assumes thrusters
+    that are never at their limits.
+
+    It depends on the coefficients, by the Munk moment: for SPARUS II at 0.2 m/s, origin followed,
+    it is 2.87 m with `calibrated`, 1.79 with `estimated`, 1.97 with `cfd` and 1.74 with `computed`;
+    with the left port followed 2.23 m and, for the others, the hull's length, 1.6 m. Fossen (2011,
+    section 10.3.2) gives 1.5 to 2.5 lengths; COLA2's 5.5 m is too long for lines 1 m apart.
+
+    Args:
+        gains: gains of the vehicle.
+        speed_mps: surge.
+        lever_m: how far the followed point is ahead of the origin.
+
+    Returns:
+        NaN where no look-ahead up to 100 m gives that damping.
+    """
+    return _shortest_m(lambda ahead_m: damping_ratio(los_loop(gains, speed_mps, lever_m, ahead_m)))
+
+
+def _shortest_m(damping: Callable[[float], float]) -> float:
+    """The shortest look-ahead with LOS_DAMPING_RATIO; NaN where there is none."""
+    ratios = np.array([damping(float(each)) for each in _LOOK_AHEADS_M])
+    if not np.any(ratios >= LOS_DAMPING_RATIO):
+        return math.nan
+    first = int(np.argmax(ratios >= LOS_DAMPING_RATIO))
+    if first == 0:
+        return CONTROL_LENGTH_M
+    low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if damping(middle) >= LOS_DAMPING_RATIO else (middle, high)
+    return high

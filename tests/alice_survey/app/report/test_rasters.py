@@ -1,0 +1,116 @@
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+
+from alice_survey.app.report.colours import read_shrunk
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.rasters import mosaic_layer, picture_layers
+from alice_survey.app.studio.layers import Layers
+from alice_survey.app.studio.paths import Workspace
+from alice_survey.kit.document import PictureLayer
+from reconstruct.measure.surface import values_at
+from tests.alice_survey.app.report.tiny import COLUMNS, ROWS, tiny_workspace
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_workspace(tmp_path_factory.mktemp("tiny"))
+
+
+def put_together(layer: PictureLayer, level: int) -> np.ndarray:
+    halvings = layer.levels - 1 - level
+    width, height = layer.width_px, layer.height_px
+    for _ in range(halvings):
+        width, height = (width + 1) // 2, (height + 1) // 2
+    sheet = np.zeros((height, width, 4), np.uint8)
+    for name, data in layer.tiles.items():
+        k, x, y = (int(part) for part in name.split("/"))
+        if k == level:
+            tile = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if tile.shape[2] == 3:
+                tile = np.dstack([tile, np.full(tile.shape[:2], 255, np.uint8)])
+            top, left = y * layer.tile_px, x * layer.tile_px
+            sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+    return sheet
+
+
+def test_the_mosaics_tiles_make_the_mosaic(workspace: Path) -> None:
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif")
+    assert (layer.width_px, layer.height_px, layer.levels) == (400, 600, 2)
+    assert (layer.west_m, layer.north_m, layer.pixel_m) == (0.0, pytest.approx(1.2), 0.002)
+    sheet = put_together(layer, 1)
+    rows, columns = np.mgrid[:600, :400]
+    clear = (rows >= 500) & (columns < 100)
+    assert np.array_equal(sheet[..., 3] < 128, clear)
+    smooth = ~clear & (rows % 256 > 8) & (rows % 256 < 248) & (columns % 256 > 8)
+    smooth &= (columns % 256 < 248) & ((rows < 492) | (columns > 108))
+    assert np.abs(sheet[..., 2].astype(int) - rows % 256)[smooth].max() < 12  # red, BGRA
+    assert np.abs(sheet[..., 1].astype(int) - columns % 256)[smooth].max() < 12
+
+
+def test_a_coarser_level_is_the_mean_of_the_finer(workspace: Path) -> None:
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif")
+    fine, coarse = put_together(layer, 1).astype(float), put_together(layer, 0).astype(float)
+    mean = fine.reshape(300, 2, 200, 2, 4).mean(axis=(1, 3))
+    inner = mean[..., 3] == 255
+    assert np.abs(mean - coarse)[inner][:, :3].mean() < 3.0
+    assert coarse.shape[:2] == (300, 200)
+
+
+def test_a_mosaic_too_large_is_shrunk_and_says_so(workspace: Path) -> None:
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif", most_px=60_000)
+    assert layer.width_px * layer.height_px <= 61_000
+    assert layer.pixel_m * layer.width_px == pytest.approx(0.8)
+    assert "2.0 times" in layer.about
+
+
+@pytest.mark.parametrize("width", [3, 1000, 2719])
+def test_a_raster_that_fits_keeps_its_own_grid(width: int, tmp_path: Path) -> None:
+    grid = Affine(0.0018, 0.0, -2.3, 0.0, -0.0018, 4.1)
+    with rasterio.open(
+        tmp_path / "a.tif", "w", driver="GTiff", width=width, height=2, count=1, dtype="uint8",
+        transform=grid,
+    ) as raster:  # fmt: skip
+        raster.write(np.ones((1, 2, width), np.uint8))
+    assert read_shrunk(tmp_path / "a.tif", [1], 1e6)[2] == grid
+
+
+@pytest.mark.parametrize("columns", [COLUMNS, COLUMNS + 3])
+def test_errors_of_an_earlier_surface_are_no_layer(columns: int, tmp_path: Path) -> None:
+    """Nor a value under the cursor: they may have been evaluated over another plane."""
+    workspace = tiny_workspace(tmp_path)
+    shutil.copytree(workspace / "dense", workspace / "evaluation")
+    with rasterio.open(workspace / "dense" / "dem.tif") as dem:
+        profile = dem.profile | {"width": columns}
+    errors = np.full((1, ROWS, columns), 0.001, np.float32)
+    with rasterio.open(workspace / "evaluation" / "error.tif", "w", **profile) as raster:
+        raster.write(errors)
+    is_current = columns == COLUMNS
+    for layers in (
+        picture_layers(Held.of(workspace)),
+        Layers(Workspace(workspace)).picture_layers(),
+    ):
+        assert ("error" in {layer.name for layer in layers}) == is_current
+    found = values_at(workspace, (0.4, 1.0))
+    assert ("evaluation/error.tif" in found) == is_current and "dense/dem.tif" in found
+
+
+def test_numbers_are_coloured_between_limits_of_the_legend(workspace: Path) -> None:
+    layers = {layer.name: layer for layer in picture_layers(Held.of(workspace))}
+    assert list(layers) == ["mosaic", "height", "sigma", "slope", "stations"]
+    assert [name for name, layer in layers.items() if layer.shown] == ["mosaic"]
+    scale = layers["sigma"].scale
+    assert scale is not None
+    assert scale.label == "sigma, mm"
+    assert (scale.low, scale.high) == (0.0, pytest.approx(0.5))
+    assert all(len(colour) == 7 for colour in scale.colours)
+    height = layers["height"].scale
+    assert height is not None
+    assert -10.0 <= height.low < height.high <= -10.0 + 0.25 * 0.8
+    hole = put_together(layers["height"], 0)[105:, :15]
+    assert (hole[..., 3] == 0).all()

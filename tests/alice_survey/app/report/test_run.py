@@ -1,0 +1,155 @@
+import json
+import re
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pypdf import PdfReader
+
+from alice_survey.core.artefacts import write_json
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.executor import SERIAL
+from alice_survey.core.stages import spec
+from camera_calib.approximation.pinhole_warp import best_warp
+from camera_calib.mount import with_mount
+from camera_calib.rig import design_rig, write_rig
+from tests.alice_survey.app.report.tiny import plane_of, tiny_workspace
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    workspace = tiny_workspace(tmp_path_factory.mktemp("tiny"))
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    return workspace
+
+
+def words(text: str) -> str:
+    return re.sub(r"[\s\u00ad\u200b]+", "", text)
+
+
+def test_page_and_pdf_say_the_same(workspace: Path) -> None:
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    said = json.loads((workspace / "report" / "report.json").read_text())
+    reader = PdfReader(workspace / "report" / "report.pdf")
+    printed = words("".join(sheet.extract_text() for sheet in reader.pages))
+    shown = words(unescape(re.sub(r"<[^>]*>", " ", page)))
+    sentences = [*said["summary"].values(), *(verdict["text"] for verdict in said["verdicts"])]
+    assert len(sentences) > 6
+    for sentence in sentences:
+        assert words(sentence) in shown, sentence
+        assert words(sentence) in printed, sentence
+    cells = re.findall(r"<(?:td|th|h2|h3)[^>]*>(.*?)</(?:td|th|h2|h3)>", page, re.DOTALL)
+    texts = {words(unescape(re.sub(r"<[^>]*>", "", cell))) for cell in cells}
+    assert len(texts) > 60
+    missing = {cell for cell in texts if cell not in printed}
+    assert missing <= {"Contents", "Verdicts", "Keyfigures"}, missing
+
+
+def test_the_same_workspace_gives_the_same_bytes(workspace: Path) -> None:
+    folder = workspace / "report"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (folder / "stage.json").unlink()
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    for name in ("report.html", "report.pdf", "report.json"):
+        assert (folder / name).read_bytes() == before[name], name
+
+
+def test_a_report_is_made_again_only_when_something_has_changed(workspace: Path) -> None:
+    assert not spec("report").make(workspace, SurveyConfig(), SERIAL)
+    path = workspace / "sparse" / "registration.json"
+    text = path.read_text()
+    path.write_text(text.replace('"total": 4', '"total": 5'))
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    assert "4 of 5" in (workspace / "report" / "report.html").read_text()
+    path.write_text(text)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+
+
+@pytest.mark.parametrize(("scaled", "unit"), [(False, "unit"), (True, "m")])
+def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit: str) -> None:
+    workspace = tiny_workspace(tmp_path, scaled=scaled, placed=False)
+    (workspace / "plan" / "stage.json").unlink()
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    data = json.loads((workspace / "report" / "report.json").read_text())
+    assert data["unit"] == unit
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert f"0.25 {unit}²" in page
+    shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
+    cameras = next(layer for layer in shown["layers"] if layer["name"] == "cameras")
+    # As in its rasters, a model's own y goes to the right and its x up.
+    assert cameras["shapes"][0] == [[0.4, 0.3]]
+    assert shown["axes"] == ["y", "x"]
+
+
+def test_every_plane_is_shown_by_its_name(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    for name, painted in (("wall", True), ("hull", False)):
+        for stage, picture in (("dense", "dem"), ("mosaic", "mosaic")):
+            folder = workspace / stage / "planes" / name
+            if stage == "dense" or painted:
+                write_json(folder / "plane.json", plane_of(name, "12"))
+                see_through = np.zeros((30, 40, 4), np.uint8)
+                see_through[10:, :, 1::2] = 255
+                cv2.imwrite(str(folder / f"{picture}.png"), see_through)
+    about = {"pixel": 0.01, "width_px": 400, "height_px": 250}
+    write_json(workspace / "mosaic" / "planes" / "wall" / "mosaic.json", about)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)  # for there are planes now
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert "Plane wall" in page
+    assert "4.00 m wide and 2.50 m high" in page
+    assert "Surface over the plane: facing 180 deg, tilt 12 deg." in page
+    assert page.count("Plane hull") == 1
+
+
+def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    write_json(workspace / "dense" / "plane.json", plane_of("wall", "0"))
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
+    assert {layer["name"] for layer in shown["layers"]}.isdisjoint(
+        {"cameras", "footprints", "plan"}
+    )
+    assert shown["axes"] == ["right", "up"]
+    assert (
+        json.loads((workspace / "report" / "report.json").read_text())["surface"]["covered"] is None
+    )
+
+
+@pytest.mark.parametrize("mount", ["nadir-bow-up", "forward+30", None])
+def test_a_known_mount_is_drawn_and_an_unknown_one_is_not(
+    tmp_path: Path, mount: str | None
+) -> None:
+    workspace = tiny_workspace(tmp_path)
+    config = SurveyConfig()
+    rig = replace(design_rig(config.camera, config.water), body_from_rig=None)
+    if mount is not None:
+        rig = with_mount(rig, mount, (0.5, 0.0, 0.1))
+    warp = best_warp(rig.cameras["left"], 1.8, 2.4).to_json()
+    write_json(workspace / "sparse" / "cameras.json", {"cameras": {"left": warp}, "images": {}})
+    write_rig(workspace / "sparse" / "rig.json", rig)
+    assert spec("report").make(workspace, config, SERIAL)
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert f"The rig is as imported with the pictures: {rig.source}." in page
+    assert ("How the cameras are mounted" in page) == (mount is not None)
+    if mount is not None:
+        assert f"0.0 deg from {mount}" in page
+
+
+def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    for stage in ("images", "mapping", "sparse", "dense", "mosaic"):
+        (workspace / stage / "stage.json").unlink()
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
+    said = json.loads((workspace / "report" / "report.json").read_text())["summary"]
+    assert "1 line" in said["What was mapped"]
+
+
+def test_an_empty_folder_says_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="alice-survey plan"):
+        spec("report").make(tmp_path, SurveyConfig(), SERIAL)

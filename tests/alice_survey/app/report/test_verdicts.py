@@ -1,0 +1,131 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from alice_survey.app.report.figures import Figures
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.verdicts import facts, summary, verdicts
+from alice_survey.core.artefacts import write_json
+from alice_survey.kit.document import Verdict
+from tests.alice_survey.app.report.tiny import tiny_workspace
+
+
+def judged(workspace: Path) -> tuple[Figures, list[Verdict]]:
+    figures = Figures(held=Held.of(workspace))
+    return figures, verdicts(figures)
+
+
+def level_of(found: list[Verdict], word: str) -> str:
+    levels = [verdict.level for verdict in found if word in verdict.text]
+    assert len(levels) == 1, (word, [verdict.text for verdict in found])
+    return levels[0]
+
+
+def test_a_hole_in_the_planned_area_is_seen_and_named(tmp_path: Path) -> None:
+    figures, found = judged(tiny_workspace(tmp_path))
+    assert level_of(found, "95.8 % of the planned area") == "look"
+    assert "plan check" in summary(figures, found)["What to do next"]
+
+
+@pytest.mark.parametrize(("registered", "level"), [(4, "good"), (3, "bad")])
+def test_lost_pictures_are_judged(tmp_path: Path, registered: int, level: str) -> None:
+    _, found = judged(tiny_workspace(tmp_path, sparse={"registered": registered}))
+    assert level_of(found, f"{registered} of 4") == level
+
+
+def test_parts_that_navigation_alone_joins_are_named_with_their_sigma(tmp_path: Path) -> None:
+    joint = {"stations": 7, "sigma_north_m": 0.03, "sigma_east_m": 0.04, "sigma_depth_m": 0.0,
+             "sigma_tilt_deg": 0.1, "sigma_heading_deg": 0.2}  # fmt: skip
+    figures, found = judged(tiny_workspace(tmp_path, sparse={"joints": [joint]}))
+    assert level_of(found, "7 stations show nothing that the others show") == "look"
+    assert any("sigma of 5" in verdict.text for verdict in found)
+    assert "across the gap" in summary(figures, found)["What to do next"]
+
+
+@pytest.mark.parametrize(("scale", "level"), [(0.99, "look"), (0.999, "good"), (1.01, "look")])
+def test_navigation_that_contradicts_the_rig_is_judged(
+    tmp_path: Path, scale: float, level: str
+) -> None:
+    place: dict[str, Any] = {"scale_of_navigation": scale, "scale_of_navigation_sigma": 0.001}
+    axes = {f"{kind}_{axis}_m": 0.1 for kind in ("rms", "sigma") for axis in
+            ("north", "east", "depth")}  # fmt: skip
+    place |= axes | {"sigma_heading_deg": 0.1, "sigma_tilt_deg": 0.1}
+    _, found = judged(tiny_workspace(tmp_path, sparse={"georeference": place}))
+    assert level_of(found, "navigation's differs") == level
+
+
+def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> None:
+    figures, found = judged(
+        tiny_workspace(
+            tmp_path, frame={"scaled": False}, sparse={"scale_source": "the model has no scale"}
+        )
+    )
+    assert found[0].level == "bad"
+    assert "no scale" in found[0].text
+    assert "scale bar" in summary(figures, found)["What to do next"]
+    assert any("unit" in value for _, value in facts(figures))
+
+
+@pytest.mark.parametrize(
+    ("miss_mm", "ratio", "levels"),
+    [(0.5, 1.1, ("good", "good")), (5.0, 1.1, ("bad", "good")), (0.5, 3.4, ("good", "look")),
+     (0.5, 0.3, ("good", "look"))],
+)  # fmt: skip
+def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
+    tmp_path: Path, miss_mm: float, ratio: float, levels: tuple[str, str]
+) -> None:
+    workspace = tiny_workspace(tmp_path)
+    write_json(workspace / "evaluation" / "stage.json", {"took_s": 1.0})
+    write_json(workspace / "evaluation" / "score.json", {
+        "cameras": {
+            "registered": 4, "total": 4, "rms_mm": 0.3, "max_mm": 0.5, "scale_error_ppm": 50.0,
+        },
+        "mosaic": {}, "lengths": {},
+        "surface": {
+            "distance_rms_mm": miss_mm, "ground_pixel_mm": 1.8, "doming": {"dome_mm": 0.1},
+            "error_over_sigma": {"rms": ratio}, "completeness_within_px": {"3": 0.99},
+        },
+    })  # fmt: skip
+    figures, found = judged(workspace)
+    assert (level_of(found, "against the truth"), level_of(found, "stated sigmas")) == levels
+    assert "Against the truth" in summary(figures, found)["How well"]
+
+
+def test_the_worst_comes_first(tmp_path: Path) -> None:
+    _, found = judged(tiny_workspace(tmp_path, sparse={"registered": 2}))
+    order = [("bad", "look", "good").index(verdict.level) for verdict in found]
+    assert order == sorted(order)
+    assert order[0] == 0
+
+
+def test_every_verdict_that_is_not_good_says_what_to_do(tmp_path: Path) -> None:
+    workspace = tiny_workspace(
+        tmp_path,
+        sparse={
+            "registered": 1,
+            "scale_source": "scale from the calibrated rig",
+            "acceptance": {"notes": ["stations lie elsewhere"]},
+            "doming": {"along": None, "across": None, "scale": None, "notes": ["it is bent"]},
+        },
+        mapping={"refraction": {"settled": False}},
+    )
+    _, found = judged(workspace)
+    asked = [verdict for verdict in found if verdict.level != "good"]
+    assert len(asked) >= 5
+    assert all(verdict.action for verdict in asked)
+
+
+def test_a_calibration_whose_own_checks_passed_asks_for_nothing(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    write_json(workspace / "calibration" / "stage.json", {"took_s": 1.0})
+    write_json(workspace / "calibration" / "report.json", {
+        "views": 25, "rms_px": 0.014, "parameters": [], "verdicts": [
+            {"level": "good", "text": "1 picture fits worse and changes nothing"},
+            {"level": "good", "text": "held-out views fit to 0.012 px rms"},
+        ],
+    })  # fmt: skip
+    write_json(workspace / "calibration" / "calibration.json",
+               {"parameters": ["a", "b"], "correlation": [[1.0, 0.1], [0.1, 1.0]]})  # fmt: skip
+    _, found = judged(workspace)
+    assert level_of(found, "calibration") == "good"

@@ -1,0 +1,313 @@
+"""Jobs of the studio: one at a time, stopped like Ctrl-C, found again by a later studio."""
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from filelock import FileLock
+
+from alice_survey.app.studio.heard import KEPT_LINES, EventsTail, Heard
+from alice_survey.app.studio.jobs import BusyError, JobRecord, Jobs
+from alice_survey.core.errors import AliceError
+from tests.alice_survey.app.studio.client import until
+
+PROGRAM = """
+import json, os, signal, subprocess, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background are deaf to it
+path = next(a.split("=", 1)[1] for a in sys.argv if a.startswith("--events="))
+def tell(**event):
+    with open(path, "a") as file:
+        file.write(json.dumps({"time_utc": "2026-01-01T00:00:00Z", **event}) + chr(10))
+tell(event="run_started", process=os.getpid(), command="x", folder="/", versions={})
+tell(event="stage_started", stage="plan", message="plan")
+kind = sys.argv[1]
+if kind == "plan":  # works until Ctrl-C, with a worker of its own
+    worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        tell(event="note", message=f"worker {worker.pid}")
+        for n in range(600):
+            tell(event="step_progress", stage="plan", step="work", step_number=1, done=n, total=600,
+                 elapsed_s=n / 10, remaining_s=60 - n / 10)
+            time.sleep(0.1)
+    except KeyboardInterrupt:
+        worker.wait()
+        tell(event="error", message="interrupted")
+        tell(event="run_finished", exit_code=130, elapsed_s=1.0)
+        sys.exit(130)
+if kind == "fly":
+    tell(event="error", message="no plan: run 'alice-survey plan -w reef' first")
+    tell(event="run_finished", exit_code=1, elapsed_s=1.0)
+    sys.exit(1)
+if kind == "image":  # deaf
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    tell(event="note", message="deaf")
+    time.sleep(60)
+if kind == "report":
+    print("error: no such option: --nothing", file=sys.stderr)
+    sys.exit(2)
+tell(event="stage_finished", stage="plan", took_s=1.0, cpu_s=1.0, peak_mib=1.0)
+tell(event="result", message="table" + chr(10) + "plan: 4 lines" + chr(10) + "image: about 17 s")
+tell(event="run_finished", exit_code=0, elapsed_s=1.0)
+"""
+
+
+class Published(list[tuple[str, Any]]):
+    """What is published."""
+
+    def __call__(self, event: str, data: Any) -> None:
+        self.append((event, data))
+
+
+@contextlib.contextmanager
+def jobs_in(folder: Path, told: Published | None = None) -> Iterator[Jobs]:
+    jobs = Jobs(folder, Published() if told is None else told, [sys.executable, "-c", PROGRAM])
+    try:
+        yield jobs
+    finally:
+        running = jobs.running()
+        jobs.close()
+        if running is not None:
+            with contextlib.suppress(OSError):
+                os.killpg(JobRecord.read(folder_of(folder) / "job.json").process, signal.SIGKILL)
+
+
+def folder_of(workspace: Path, number: int = 1) -> Path:
+    return workspace / ".studio" / "jobs" / f"{number:04d}"
+
+
+def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
+    told = Published()
+    with jobs_in(tmp_path, told) as jobs:
+        jobs.start("quality")
+        until(lambda: jobs.running() is None)
+        assert jobs.state()["job"] is None
+        (ended,) = jobs.history()
+    assert (ended["state"], ended["exit_code"], ended["line"]) == ("done", 0, "plan: 4 lines")
+    assert ended["finished"] == ["plan"] and ended["title"] == "Judge the pictures"
+    name, last = told[-1]
+    assert name == "run" and last["ended"] and last["last"] == ended
+    with jobs_in(tmp_path) as later:
+        assert later.history() == [ended]
+        texts = [line["text"] for line in later.log(1)["lines"]]
+    assert texts[1] == "stage plan" and texts[-1].startswith("run finished: exit code 0")
+
+
+def test_at_most_four_are_published_in_a_second(tmp_path: Path) -> None:
+    told = Published()
+    with jobs_in(tmp_path, told) as jobs:
+        jobs.start("plan")
+        until(lambda: any(data["job"] and data["job"]["steps"] for _, data in told))
+        before, began_s = len(told), time.monotonic()
+        time.sleep(1.5)
+        count, lasted_s = len(told) - before, time.monotonic() - began_s
+        assert 2 <= count <= 4 * lasted_s + 1
+        (step,) = told[-1][1]["job"]["steps"]
+        assert step["total"] == 600 and 0 < step["done"] < 600 and step["remaining_s"] > 0
+        jobs.stop()
+        until(lambda: jobs.running() is None)
+
+
+def test_stop_ends_its_whole_group_as_ctrl_c_does(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("plan")
+        until(lambda: any("worker" in line["text"] for line in jobs.log(1)["lines"]))
+        texts = " ".join(line["text"] for line in jobs.log(1)["lines"])
+        worker = int(texts.split("worker ")[1].split()[0])
+        assert psutil.pid_exists(worker)
+        assert jobs.stop()
+        until(lambda: jobs.running() is None)
+        (ended,) = jobs.history()
+        assert not jobs.stop()
+    assert (ended["state"], ended["exit_code"]) == ("stopped", 130)
+    until(lambda: not psutil.pid_exists(worker))
+
+
+def test_a_deaf_job_is_ended_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("alice_survey.app.studio.jobs._HARDER_S", (0.3, 0.3))
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("image")
+        until(lambda: any(line["text"] == "deaf" for line in jobs.log(1)["lines"]))
+        jobs.stop()
+        until(lambda: jobs.running() is None)
+        (ended,) = jobs.history()
+    assert ended["state"] == "stopped" and ended["exit_code"] == -signal.SIGKILL
+
+
+def test_a_studio_in_the_background_of_a_script_stops_jobs_as_soon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shell lets such programs, and so their jobs, ignore Ctrl-C."""
+    monkeypatch.setattr("alice_survey.app.studio.jobs._HARDER_S", (600.0, 600.0))
+    usual = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sleeping = [sys.executable, "-c", "import time; time.sleep(600)"]
+    try:
+        jobs = Jobs(tmp_path, Published(), sleeping)
+        jobs.start("plan")
+        jobs.stop()
+        until(lambda: jobs.running() is None)
+        jobs.start("plan")
+        jobs.close()
+        until(lambda: jobs.running() is None)
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    assert [one["state"] for one in jobs.history()] == ["stopped", "stopped"]
+
+
+def test_a_killed_job_says_so(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("plan")
+        until(lambda: jobs.log(1)["total"] > 2)
+        os.kill(JobRecord.read(folder_of(tmp_path) / "job.json").process, signal.SIGKILL)
+        until(lambda: jobs.running() is None)
+        (ended,) = jobs.history()
+        assert ended["state"] == "killed" and "start it again" in ended["line"]
+        jobs.start("quality")  # and another may begin
+        until(lambda: jobs.running() is None)
+        assert [one["state"] for one in jobs.history()] == ["done", "killed"]
+
+
+def test_a_fault_is_its_one_line(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("fly")
+        until(lambda: jobs.running() is None)
+        jobs.start("report")
+        until(lambda: jobs.running() is None)
+        usage, fault = jobs.history()
+    assert fault["state"] == "failed" and fault["stage"] == "plan"
+    assert fault["line"] == "no plan: run 'alice-survey plan -w reef' first"
+    assert usage["state"] == "failed" and usage["line"] == "no such option: --nothing"
+
+
+def test_a_second_start_is_refused(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as jobs, jobs_in(tmp_path) as another_page:
+        jobs.start("plan")
+        for refused in (jobs, another_page):
+            with pytest.raises(BusyError):
+                refused.start("quality")
+        assert another_page.running() is not None
+        jobs.stop()
+        until(lambda: jobs.running() is None and another_page.running() is None)
+        until(jobs.history)  # the job is kept a moment after it has ended
+        assert len(jobs.history()) == 1
+
+
+def test_a_command_elsewhere_is_seen_and_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("alice_survey.app.studio.jobs._LOCK_S", 0.2)
+    with jobs_in(tmp_path) as jobs:
+        (tmp_path / "dense.partial").mkdir()
+        assert jobs.state()["elsewhere"] is None
+        with FileLock(tmp_path / ".lock"):
+            assert jobs.state()["elsewhere"] == {"stage": "dense"}
+            with pytest.raises(BusyError):
+                jobs.start("quality")
+        assert jobs.state()["elsewhere"] is None
+        jobs.start("quality")
+        until(lambda: jobs.running() is None)
+
+
+def test_a_later_studio_finds_the_job_and_can_stop_it(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as killed:  # its threads go on; those of a killed studio would not
+        killed.start("plan")
+        until(lambda: killed.log(1)["total"] > 2)
+        told = Published()
+        with jobs_in(tmp_path, told) as later:
+            job = later.running()
+            assert job is not None and job["name"] == "plan" and job["state"] == "running"
+            until(lambda: any(data["job"] and data["job"]["steps"] for _, data in told))
+            later.stop()
+            until(lambda: later.running() is None)
+            (ended,) = later.history()
+    assert (ended["state"], ended["exit_code"]) == ("stopped", 130)
+
+
+def test_a_job_that_ended_while_no_studio_ran(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("quality")
+        until(lambda: jobs.running() is None)
+    file = folder_of(tmp_path) / "job.json"
+    record = JobRecord.read(file)
+    record.model_copy(update={"ended_utc": None, "state": "running"}).write(file)
+    with jobs_in(tmp_path) as later:
+        (ended,) = later.history()
+    assert (ended["state"], ended["exit_code"]) == ("done", 0)
+
+
+def test_another_process_of_the_same_number_is_not_the_job(tmp_path: Path) -> None:
+    own = psutil.Process()
+    same = JobRecord(
+        number=1, name="plan", title="", command="", started_utc="2026-01-01T00:00:00+00:00",
+        process=own.pid, created_s=own.create_time(),
+    )  # fmt: skip
+    assert same.is_alive()
+    assert not same.model_copy(update={"created_s": own.create_time() - 5}).is_alive()
+
+
+def test_the_studio_ends_its_job(tmp_path: Path) -> None:
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("plan")
+        until(lambda: jobs.log(1)["total"] > 2)
+        jobs.close()
+        (ended,) = jobs.history()
+    assert (ended["state"], ended["exit_code"]) == ("stopped", 130)
+
+
+def test_few_jobs_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("alice_survey.app.studio.jobs._KEPT_JOBS", 2)
+    with jobs_in(tmp_path) as jobs:
+        for _ in range(3):
+            jobs.start("quality")
+            until(lambda: jobs.running() is None)
+        assert [one["number"] for one in jobs.history()] == [3, 2]
+        with pytest.raises(FileNotFoundError):
+            jobs.log(1)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("rm", {}),
+        ("plan; rm -rf", {}),
+        ("plan", {"vehicle": "--help"}),
+        ("plan", {"vehicle": "a b"}),
+        ("plan", {"survey": "/etc/passwd"}),
+        ("run", {"threads": "2 --json"}),
+        ("reconstruct", {"crs": "EPSG:1 --export"}),
+        ("import-images", {"folders": ["--help"]}),
+        ("import-images", {"cameras": {"--rig": "/"}}),
+        ("import-log", {"log": "/", "output": "../x.csv"}),
+        ("import-log", {"log": "/", "output": "control.csv"}),
+    ],
+)
+def test_what_is_no_argument_is_refused(
+    name: str, arguments: dict[str, Any], tmp_path: Path
+) -> None:
+    with jobs_in(tmp_path) as jobs:
+        with pytest.raises(AliceError):
+            jobs.start(name, arguments)
+        assert jobs.running() is None and not jobs.history()
+
+
+def test_a_log_is_bounded_and_damaged_lines_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    tail, heard = EventsTail(path), Heard()
+    assert not heard.take(tail.read())
+    note = json.dumps({"event": "note", "message": "words", "time_utc": "2026"})
+    path.write_text(f"{note}\n" * (KEPT_LINES + 5) + "{damaged\n[1]\n" + note[:9])
+    assert heard.take(tail.read())
+    assert heard.lines_n == KEPT_LINES + 5 and len(heard.log()) == KEPT_LINES
+    with path.open("a") as file:
+        file.write(note[9:] + "\n")
+    heard.take(tail.read())
+    assert heard.lines_n == KEPT_LINES + 6
+    assert len(heard.log(after=KEPT_LINES + 5)) == 1 and heard.log(after=10**6) == []

@@ -1,0 +1,340 @@
+"""Whole journeys through the studio, from an empty folder to a result, at 1280 and 400 px.
+
+A dive is followed from an empty folder on in `test_follow_browser.py`.
+"""
+
+import csv
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from alice_survey.app.studio.server import Server
+from reconstruct.placing.control_file import read_control, read_picks
+from tests.alice_survey.app.studio.client import ask, looks_at, serving, still
+from tests.alice_survey.app.studio.journey_page import (
+    LONG_MS,
+    NARROW,
+    WIDE,
+    begun_page,
+    button,
+    is_accessible,
+    made,
+    opened,
+    survey_begun,
+    survey_flown,
+)
+from tests.alice_survey.app.studio.picture_page import PicturePage, said
+from tests.alice_survey.app.studio.test_model_browser import click, kept
+from tests.alice_survey.app.studio.test_model_browser import named as figures
+from tests.alice_survey.app.studio.test_pictures import Truth
+from tests.alice_survey.app.studio.test_plan_browser import PlanPage
+from tests.alice_survey.kit.browser import Heard
+from tests.docs import given_divers as dive
+
+Point = NDArray[np.float64]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+AT_BOTH = pytest.mark.parametrize("journey", [WIDE, NARROW], indirect=True, ids=["1280", "400"])
+
+
+@pytest.fixture
+def journey(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Heard]]:
+    """A page, 1280 px wide unless a test says otherwise, and what it complains about."""
+    with begun_page(getattr(request, "param", WIDE)) as page_and_heard:
+        yield page_and_heard
+
+
+@AT_BOTH
+def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path: Path) -> None:
+    page, heard = journey
+    reef = tmp_path / "reef"
+    with serving(reef) as server:
+        page.goto(server.address)
+        page.wait_for_selector(".start")
+        is_accessible(page, tmp_path / "start.png")
+        button(page, "Plan a survey").click()
+        assert page.get_by_label("Its name").input_value() == "reef"
+        page.get_by_label("Latitude, degrees").fill("43.05")
+        page.get_by_label("Longitude, degrees").fill("5.92")
+        page.get_by_label("Depth of the sea floor, m").fill("12")
+        assert not (reef / "survey.toml").exists()
+        with page.expect_navigation():
+            button(page, "Make the survey").click()
+        page.wait_for_selector("#panel-plan[data-read]")
+        plan = PlanPage(page=page, heard=heard)
+        before = plan.settled()
+        page.get_by_role("button", name=re.compile("^Delete")).first.click()
+        plan.settled(before)
+        plan.draw("Survey area", ((2.0, 2.0), (2.0, 5.0), (4.5, 5.0), (4.5, 2.0)))
+        is_accessible(page, tmp_path / "drawn.png")
+        survey_flown(page)
+        page.get_by_role("heading", name="Fly the plan: done").wait_for()
+        page.get_by_text("Log", exact=True).click()
+        page.get_by_text("run finished: exit code 0").wait_for()
+        page.get_by_text("Earlier runs").click()
+        page.get_by_role("row").nth(1).wait_for()
+        assert "of disk" in page.locator("section[aria-label=Start]").inner_text()
+        is_accessible(page, tmp_path / "flown.png")
+        with page.expect_popup() as popup:
+            page.get_by_role("link", name="the plan as a page").click()
+        popup.value.wait_for_load_state()
+        assert popup.value.title().startswith("reef")
+        popup.value.close()
+        assert heard.complaints == []
+    with (reef / "flight" / "triggers.csv").open(newline="") as rows:
+        assert len(list(csv.DictReader(rows))) > 10
+
+
+@pytest.fixture(scope="module")
+def modelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stereo survey from an empty folder to its model, made once through the page.
+
+    Its first half is seen at 1280 px, the second at 400.
+    """
+    folder = tmp_path_factory.mktemp("stereo")
+    with serving(folder / "reef") as server, begun_page(WIDE) as (page, heard):
+        survey_begun(page, server.address, length_m=1.3, width_m=1.5)
+        survey_flown(page)
+        page.set_viewport_size(NARROW)
+        button(page, "Make all that is left").click()
+        done = page.get_by_role("heading", name="Make all that is left: done")
+        done.wait_for(timeout=LONG_MS)
+        made(page, "mesh")
+        is_accessible(page, folder / "modelled.png", (WIDE, NARROW))
+        assert heard.complaints == []
+    return folder / "reef"
+
+
+def truth_of(workspace: Path, count: int) -> tuple[Truth, list[Point]]:
+    """The rendered truth, and places of it that many pictures show."""
+    truth, rng = Truth(workspace), np.random.default_rng(21)
+    places = [place for place in truth.places(rng, 12) if truth.nearest(place) is not None]
+    places.sort(key=lambda place: float(np.abs(place[:2] - [0.6, 0.45]).max()))
+    return truth, places[:count]
+
+
+def pictures_with(page: Any, truth: Truth, places: list[Point]) -> PicturePage:
+    """Pick places in the picture that shows each nearest its middle, and save them as P0, P1..."""
+    camera = next(iter(truth.rig.cameras.values()))
+    pictures = PicturePage(page=page, size_px=(camera.width_px, camera.height_px))
+    page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
+    for number, place in enumerate(places):
+        found = truth.nearest(place)
+        assert found is not None
+        image, pixel = found
+        view = pictures.opened(image, *(pixel - 0.5))
+        marked = pictures.moved_to(view, *(pixel - 0.5))
+        np.testing.assert_allclose(marked, pixel - 0.5, atol=0.06)
+        assert pictures.found_in_others() > 2
+        page.get_by_text("found, sigma").nth(2).wait_for()
+        pictures.saved(f"P{number}")
+    return pictures
+
+
+@contextmanager
+def pictures_shown(page: Any, modelled: Path, folder: Path) -> Iterator[tuple[Server, Path]]:
+    """Show the pictures of a copy of a model; what serves it, and its workspace."""
+    workspace = Path(shutil.copytree(modelled, folder / "reef"))
+    with serving(workspace) as server:
+        page.goto(server.address + "#pictures")
+        yield server, workspace
+
+
+@AT_BOTH
+def test_a_stereo_dive_gives_a_length_beside_its_truth(
+    journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
+) -> None:
+    page, heard = journey
+    with pictures_shown(page, modelled, tmp_path) as (_, workspace):
+        truth, ends = truth_of(workspace, 2)
+        pictures = pictures_with(page, truth, ends)
+        value, sigma = pictures.length("P0", "P1")
+        assert abs(value - float(np.linalg.norm(ends[0] - ends[1]))) < 4.0 * sigma < 0.004
+        is_accessible(page, tmp_path / "length.png")
+        assert heard.complaints == []
+
+
+@AT_BOTH
+def test_control_points_are_picked_and_their_residuals_shown(
+    journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
+) -> None:
+    page, heard = journey
+    with pictures_shown(page, modelled, tmp_path) as (server, workspace):
+        truth, places = truth_of(workspace, 3)
+        pictures_with(page, truth, places)
+        stored = read_picks(workspace / "picks.csv")
+        for number in range(3):
+            mine = [pick for pick in stored if pick.point == f"P{number}"]
+            (hand,) = (pick for pick in mine if not pick.matched_to)
+            assert hand.sigma_px == 0.05
+            assert {pick.matched_to for pick in mine} == {"", hand.image}
+
+        def save_known(number: int, place: Point) -> None:
+            page.get_by_text("Add a known point or length").click()
+            page.get_by_label("Point", exact=True).select_option(f"P{number}")
+            for label, coordinate in zip(("North, m", "East, m", "Depth, m"), place, strict=True):
+                page.get_by_label(label, exact=True).fill(f"{coordinate:.4f}")
+            button(page, "Save to control.csv").click()
+            button(page, f"Delete point P{number}").wait_for()
+
+        for number, place in enumerate(places):
+            save_known(number, place)
+        control = read_control(workspace / "control.csv").points
+        assert [(one.name, one.use) for one in control] == [(f"P{n}", "control") for n in range(3)]
+        rows = page.get_by_role("row").filter(has=page.get_by_label(re.compile("^Delete point")))
+        rows.filter(has_text="fitted").nth(2).wait_for()
+        spots = json.loads(ask(server, "/api/picks").text)["points"]
+        for row, spot, place in zip(rows.all_inner_texts(), spots, places, strict=True):
+            now, fitted = (
+                np.array([float(text) for text in re.split(", ", one.strip())])
+                for one in re.findall(r"(?:now|fitted) ([-\d., ]+)", row.replace("−", "-"))
+            )
+            off = np.array([spot["spot"][axis] for axis in ("n", "e", "down")]) - place
+            np.testing.assert_allclose(np.abs(now), 1000 * np.abs(off), rtol=0.01, atol=0.2)
+            assert np.abs(fitted).max() < 5.0
+            assert "BAD" not in row
+        save_known(0, places[0] + [0.5, 0.0, 0.0])
+        rows.filter(has_text="BAD").first.wait_for()
+        is_accessible(page, tmp_path / "control.png")
+
+        button(page, "Open P1").click()
+        page.wait_for_selector(".picture-view[data-ready]")
+        is_accessible(page, tmp_path / "picks.png")
+        button(page, "Delete P2").click()
+        said(page, "Took P2")
+        assert {pick.point for pick in read_picks(workspace / "picks.csv")} == {"P0", "P1"}
+        assert heard.complaints == []
+
+
+def pose(frame: int) -> tuple[Point, Rotation]:
+    """Where a frame of the dive was taken."""
+    angles = [6 * np.sin(frame / 5), 7 * np.cos(frame / 7), 4 * np.sin(frame / 9)]
+    return dive._path()[frame], Rotation.from_euler("xyz", angles, degrees=True)
+
+
+def floor(x: float, y: float) -> Point:
+    """A point of the floor."""
+    return np.array([x, y, -float(dive._relief_m(np.array(x), np.array(y)))])
+
+
+def seen(frame: int, point: Point) -> Point:
+    """Pixel at which a frame shows a point, as viewers count."""
+    place, turn = pose(frame)
+    ray = turn.inv().apply(point - place)
+    middle = np.array([dive.WIDTH / 2, dive.HEIGHT / 2])
+    return middle + dive.FOCAL_PX * ray[:2] / ray[2] - 0.5
+
+
+def card(folder: Path) -> list[int]:
+    """A diver's pictures without any calibration; the frames that they are."""
+    rng = np.random.default_rng(7)
+    side = round(dive._SIDE_M * dive._SHEET_PX_M)
+    sheet = dive.grains(rng, (side, side))
+    frames = list(range(0, len(dive._path()), 2))
+    folder.mkdir()
+    for frame in frames:
+        place, turn = pose(frame)
+        cv2.imwrite(str(folder / f"P{frame:04d}.png"), dive._seen(sheet, place, turn))
+    return frames
+
+
+def pick(page: Any, name: str, frames: list[int], point: Point, images: list[str]) -> None:
+    """Pick a point of the floor in the picture that shows it nearest its middle, and save it."""
+    half = np.array([dive.WIDTH, dive.HEIGHT]) / 2
+    at = min(frames, key=lambda frame: float(np.abs(seen(frame, point) - half).max()))
+    pictures = PicturePage(page=page, size_px=(dive.WIDTH, dive.HEIGHT))
+    view = pictures.opened(images[frames.index(at)], *seen(at, point))
+    pictures.moved_to(view, *seen(at, point))
+    pictures.found_in_others()
+    pictures.saved(name)
+
+
+def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
+    journey: tuple[Any, Heard], tmp_path: Path
+) -> None:
+    page, heard = journey
+    frames = card(tmp_path / "card")
+    workspace = tmp_path / "dive"
+    bar = [floor(0.5, 0.2), floor(1.7, 0.9)]
+    coral = [floor(0.8, 0.9), floor(1.5, 0.3)]
+    with serving(workspace) as server:
+        page.set_viewport_size(NARROW)
+        page.goto(server.address)
+        button(page, "I have pictures").click()
+        page.get_by_label("Folder of the pictures").fill(str(tmp_path / "card"))
+        button(page, "Look into it").click()
+        page.get_by_text(f"Found: {len(frames)} pictures").wait_for()
+        is_accessible(page, tmp_path / "found.png", (WIDE, NARROW))
+        button(page, "Import them").click()
+        page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
+        button(page, "Reconstruct the sea floor").click()
+        made(page, "mesh")
+        page.get_by_role("heading", name="Reconstruct the sea floor: done").wait_for()
+
+        with (workspace / "images" / "manifest.csv").open(newline="") as rows:
+            images = sorted(row["image"] for row in csv.DictReader(rows))
+        opened(page, "Pictures")
+        page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
+        for number, point in enumerate((*bar, *coral)):
+            page.set_viewport_size((WIDE, NARROW)[number % 2])
+            pick(page, f"end {number}", frames, point, images)
+        for number in range(2):
+            page.get_by_label(f"end {number}", exact=True).check()
+        true = float(np.linalg.norm(bar[1] - bar[0]))
+        page.get_by_label("Its true length, m").fill(f"{true:.6f}")
+        button(page, "Set the scale").click()
+        page.locator("#status", has_text="reconstruct").wait_for()
+        assert (workspace / "scale.json").is_file()
+        opened(page, "Run")
+        page.wait_for_selector("[data-stage=placing]:not([data-state='up to date'])")
+        button(page, "Reconstruct the sea floor").click()
+        made(page, "mesh")
+
+        page.reload()
+        opened(page, "Pictures")
+        true = float(np.linalg.norm(coral[1] - coral[0]))
+        for number in (2, 3):
+            page.get_by_label(f"end {number}", exact=True).check()
+        page.wait_for_selector("[data-value]")
+        is_accessible(page, tmp_path / "coral.png", (WIDE, NARROW))
+        shown = page.locator("[data-value]")
+        off = float(shown.get_attribute("data-value")) - true
+        assert abs(off) < 4.0 * float(shown.get_attribute("data-sigma"))
+        assert abs(off) < 0.01 * true
+
+        opened(page, "Model")
+        for number, size in enumerate((NARROW, WIDE), start=1):
+            page.set_viewport_size(size)
+            measured_coral(page, number)
+            is_accessible(page, tmp_path / "area.png")
+        assert heard.complaints == []
+
+
+def measured_coral(page: Any, number: int) -> None:
+    """Measure a triangle in the middle of the map, and look at its figures."""
+    box = page.locator("#map-canvas")
+    box.scroll_into_view_if_needed()
+    still(lambda: looks_at(page))
+    east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
+    corners = [(east - 0.2, north - 0.15), (east + 0.2, north - 0.15), (east, north + 0.2)]
+    button(page, "Area").click()
+    click(page, *corners)
+    button(page, "Finish").click()
+    page.wait_for_selector(f"tr[data-measure='{number}']")
+    measure = kept(page)[-1]
+    places = np.array(measure["places"])
+    (a, b), (c, d) = places[1:] - places[0]
+    plan = 0.5 * abs(a * d - b * c)
+    found = figures(measure)
+    assert found["plan_area"]["value"] == pytest.approx(plan, rel=0.01)
+    assert found["plan_area"]["value"] < found["surface_area"]["value"] < 2.0 * plan
+    assert 0 < found["surface_area"]["sigma"] < 0.1 * plan

@@ -1,0 +1,402 @@
+"""The tab Model in Chromium: measured by clicks and by keys, on the map and on the mesh."""
+
+import csv
+import io
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+from axe_playwright_python.sync_playwright import Axe
+from PIL import Image
+
+from alice_survey.core.artefacts import write_json
+from reconstruct.copc_nodes import read_nodes
+from tests.alice_survey.app.report.tiny import SLOPE, plane_of, tiny_workspace
+from tests.alice_survey.app.studio.client import FOLDED, move_map, serving, still
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.sketch import sketch_mesh
+from tests.reconstruct.tiny_cloud import deep_cloud, rippled
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+MAP = "#map-canvas"
+RISE = math.hypot(1.0, SLOPE)
+
+
+def with_mesh(folder: Path) -> Path:
+    """The tiny workspace, and a mesh about the middle of its surface."""
+    workspace = tiny_workspace(folder)
+    mesh = workspace / "mesh"
+    mesh.mkdir()
+    sketch_mesh(mesh).glb.rename(mesh / "mesh.glb")
+    parts = trimesh.load_scene(mesh / "mesh.glb").geometry.values()
+    about = {"area": 12.0, "textured_share": 1.0, "offset_east_north_up": [0.4, 0.6, -10.0]}
+    write_json(mesh / "mesh.json", {"triangles": sum(len(p.faces) for p in parts), **about})
+    Image.new("RGB", (40, 30)).save(mesh / "mesh.png")
+    write_json(mesh / "stage.json", {"stage": "mesh"})
+    return workspace
+
+
+@contextmanager
+def opened(
+    folder: Path, width: int = 1280, complaints: tuple[str, ...] = ()
+) -> Iterator[tuple[Any, Heard]]:
+    """The tab in a browser, which complains of nothing but answers of the server that are known."""
+    with serving(folder) as server, chromium() as browser:
+        page = browser.new_page(viewport={"width": width, "height": 900}, reduced_motion="reduce")
+        heard = Heard()
+        heard.listen(page)
+        page.add_init_script(FOLDED)
+        page.goto(server.address + "#model")
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
+        page.wait_for_selector("#panel-model:visible")
+        yield page, heard
+        assert [line for line in heard.complaints if not any(c in line for c in complaints)] == []
+        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
+            server.url.split("/")[2]
+        }
+        page.close()
+
+
+def at(page: Any, east: float, north: float) -> dict[str, float]:
+    """Pixel of the map that shows a place."""
+    view = page.locator(MAP)
+    box = view.bounding_box()
+    zoom, e, n = (float(view.get_attribute(f"data-{name}")) for name in ("zoom", "east", "north"))
+    return {
+        "x": box["width"] / 2 + (east - e) * 2**zoom,
+        "y": box["height"] / 2 - (north - n) * 2**zoom,
+    }
+
+
+def click(page: Any, *places: tuple[float, float]) -> None:
+    for place in places:
+        page.locator(MAP).click(position=at(page, *place))
+        page.wait_for_timeout(60)
+
+
+def kept(page: Any) -> list[dict[str, Any]]:
+    text = page.evaluate(
+        "Object.entries(sessionStorage).find(([key]) => key.startsWith('alice-survey measures'))[1]"
+    )
+    found: list[dict[str, Any]] = json.loads(text)
+    return found
+
+
+def named(measure: dict[str, Any]) -> dict[str, Any]:
+    return {one["name"]: one for one in measure["figures"]}
+
+
+def measured(page: Any, count: int) -> list[dict[str, Any]]:
+    page.wait_for_selector(f"tr[data-measure] >> nth={count - 1}", timeout=60_000)
+    return kept(page)
+
+
+def test_lengths_areas_and_exports(tmp_path: Path) -> None:
+    with opened(with_mesh(tmp_path / "reef")) as (page, _):
+        page.locator(MAP).hover(position=at(page, 0.4, 0.6))
+        page.locator(".under", has_text="Sigma").wait_for(timeout=60_000)
+        page.locator("#map-readout", has_text="height −9.").wait_for(timeout=60_000)
+
+        page.get_by_role("button", name="Length", exact=True).click()
+        click(page, (0.2, 0.5), (0.6, 0.5))
+        (length,) = measured(page, 1)
+        true = math.dist(*length["places"])
+        assert true == pytest.approx(0.4, abs=0.01)
+        assert named(length)["length"]["value"] == pytest.approx(true * RISE, rel=1e-3)
+        page.wait_for_selector(".model .profile-chart path.of")
+        page.get_by_role("slider", name="Place along the profile").focus()
+        page.keyboard.press("End")
+        assert "along: −9.8" in page.locator(".model .profile-chart p").inner_text()
+
+        page.get_by_role("button", name="Volume", exact=True).click()
+        page.get_by_label("Plane of the volume").select_option("level")
+        page.get_by_label("Height of the plane, m").fill("-10")
+        click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
+        page.get_by_role("button", name="Finish", exact=True).click()
+        volume = measured(page, 2)[1]
+        assert named(volume)["volume"]["value"] == pytest.approx(0.2 * 0.5 * SLOPE, rel=0.05)
+        assert named(volume)["aspect"]["value"] == pytest.approx(270.0, abs=1.0)
+
+        page.get_by_label("Name of Length 1").fill("coral =1")
+        page.keyboard.press("Tab")
+        assert kept(page)[0]["name"] == "coral =1"
+        with page.expect_download() as found:
+            page.get_by_role("button", name="Export CSV").click()
+        rows = list(csv.DictReader(io.StringIO(Path(found.value.path()).read_text())))
+        assert {row["name"] for row in rows} == {"coral =1", "Volume 1"}
+        with page.expect_download() as found:
+            page.get_by_role("button", name="Export GeoJSON").click()
+        features = json.loads(Path(found.value.path()).read_text())["features"]
+        assert [one["geometry"]["type"] for one in features] == ["LineString", "Polygon"]
+
+        groups = page.eval_on_selector_all(
+            "fieldset[data-group]", "all => all.map(g => g.dataset.group)"
+        )
+        assert groups[:2] == ["Base layer", "Overlays"]
+        layers = page.locator("#layer-list input[value^=measured-]")
+        assert layers.count() == 2
+        page.get_by_role("tab", name="Annotate").click()  # where measures are not shown
+        assert layers.count() == 0
+        page.get_by_role("tab", name="Model").click()
+        layers.nth(1).wait_for(state="attached")
+
+        page.reload()
+        page.wait_for_selector("tr[data-measure] >> nth=1")
+        page.get_by_role("button", name="Delete coral =1").click()
+        assert [one["name"] for one in kept(page)] == ["Volume 1"]
+
+
+def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
+    with opened(with_mesh(tmp_path / "reef")) as (page, _):
+        page.locator(MAP).focus()
+        page.keyboard.press("p")
+        for key in ("ArrowRight", "ArrowUp", "ArrowLeft"):
+            page.keyboard.press("Enter")
+            move_map(page, key)
+        page.keyboard.press("Enter")
+        page.keyboard.press("Backspace")
+        page.keyboard.press("f")
+        (line,) = measured(page, 1)
+        assert len(line["places"]) == 3
+        page.keyboard.press("r")
+        page.keyboard.press("Escape")
+        assert page.locator(MAP).get_attribute("data-tool") is None
+        page.keyboard.press("l")
+        page.keyboard.press("Enter")
+        page.keyboard.press("Enter")  # the same place is no length
+        page.wait_for_selector("#status.warn")
+        assert len(kept(page)) == 1
+
+
+def test_two_picks_on_the_mesh_are_a_length(tmp_path: Path) -> None:
+    import open3d as o3d
+
+    with opened(with_mesh(tmp_path / "reef")) as (page, _):
+        page.get_by_text("In 3D", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
+        canvas = page.locator("#mesh-canvas")
+        box = canvas.bounding_box()
+        canvas.click(position={"x": box["width"] * 0.45, "y": box["height"] * 0.5})
+        page.get_by_text("click another place").wait_for()
+        canvas.focus()
+        page.keyboard.press("Enter")
+        (length,) = measured(page, 1)
+        first, second = length["places"]
+        assert named(length)["length"]["value"] == pytest.approx(math.dist(first, second), rel=1e-6)
+        # picked points lie on the triangles of the file
+        mesh = trimesh.load_scene(tmp_path / "reef" / "mesh" / "mesh.glb").to_mesh()
+        points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+        assert scene.compute_distance(points.astype(np.float32)).numpy().max() < 1e-4
+        assert math.dist(first, second) > 1e-3
+        page.get_by_role("button", name="Larger, over the map").click()
+        assert canvas.bounding_box()["width"] > 800
+
+
+LIFT = 0.05
+"""Height of the finest tiles over the coarse one, so that a pick tells which it hit."""
+
+
+CLOUD_POINTS = 15_000
+MIDDLE = np.array([0.4, 0.6, -10.0])
+"""Of mesh and cloud."""
+EAST, NORTH, UP = np.eye(3)
+WALL = plane_of("wall", origin_enu=(0.0, 1.0, -10.5))
+
+
+def with_tiles(folder: Path) -> Path:
+    """The workspace with a mesh, a cloud, and tiles: a coarse one, a link, and two finest ones."""
+    workspace = with_mesh(folder)
+    deep_cloud(workspace / "dense" / "cloud.copc.laz", rippled(3.0, 2.0) + MIDDLE)
+    tiles = workspace / "mesh" / "tiles"
+    tiles.mkdir()
+    coarse = (workspace / "mesh" / "mesh.glb").read_bytes()
+    (tiles / "top.glb").write_bytes(coarse)
+    boxes = []
+    for side, name in ((-1, "west"), (1, "east")):
+        (sheet,) = trimesh.load_scene(io.BytesIO(coarse), file_type="glb").geometry.values()
+        sheet.update_faces(sheet.triangles_center[:, 0] * side > 0)
+        sheet.apply_translation([0.0, LIFT, 0.0])
+        (tiles / f"{name}.glb").write_bytes(sheet.export(file_type="glb"))
+        box = {"box": [side, 0, 0.05, 1.04, 0, 0, 0, 1.6, 0, 0, 0, 0.3]}
+        content = {"uri": f"{name}.glb"}
+        boxes.append({"boundingVolume": box, "geometricError": 0.0, "content": content})
+    whole = {"box": [0, 0, 0.02, 2.1, 0, 0, 0, 1.6, 0, 0, 0, 0.3]}
+    link = {"boundingVolume": whole, "geometricError": 0.0, "content": {"uri": "west.json"}}
+    inner = {"asset": {"version": "1.1"}, "geometricError": 0.0, "root": boxes[0]}
+    write_json(tiles / "west.json", inner)
+    root = {"boundingVolume": whole, "geometricError": 0.5, "refine": "REPLACE"}
+    root |= {"content": {"uri": "top.glb"}, "children": [link, boxes[1]]}
+    write_json(tiles / "tileset.json", {"asset": {"version": "1.1"}, "root": root})
+    return workspace
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_tiles_are_drawn_as_the_view_needs_them_and_picked(width: int, tmp_path: Path) -> None:
+    import open3d as o3d
+
+    with opened(with_tiles(tmp_path / "reef"), width) as (page, heard):
+        page.get_by_text("In 3D", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
+        canvas = page.locator("#mesh-canvas")
+
+        def loaded() -> set[str]:
+            return {url.split("/")[-1] for url in heard.requests if "/mesh/tiles/" in url}
+
+        assert loaded() == set()
+        canvas.focus()
+        for _ in range(16):
+            page.keyboard.press("-")
+        page.get_by_label("Drawn as").select_option("tiles")
+        page.wait_for_selector("#mesh-canvas[data-parts='1'][data-coming='0']", timeout=60_000)
+        assert loaded() == {"tileset.json", "top.glb"}
+        canvas.focus()
+        page.keyboard.press("0")
+        page.wait_for_selector("#mesh-canvas[data-parts='2'][data-coming='0']", timeout=60_000)
+        assert loaded() == {"tileset.json", "top.glb", "west.json", "west.glb", "east.glb"}
+        shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB"), float)
+        assert 0.1 < (np.abs(shot - [243, 246, 248]).max(axis=2) > 30).mean() < 0.95
+        assert Axe().run(page).violations_count == 0
+
+        box = canvas.bounding_box()
+        canvas.click(position={"x": box["width"] * 0.42, "y": box["height"] * 0.5})
+        page.get_by_text("click another place").wait_for()
+        canvas.focus()
+        page.keyboard.press("Enter")
+        (length,) = measured(page, 1)
+        mesh = trimesh.load_scene(tmp_path / "reef" / "mesh" / "mesh.glb").to_mesh()
+        scene = o3d.t.geometry.RaycastingScene()
+        lifted = (mesh.vertices + np.array([0.0, LIFT, 0.0])).astype(np.float32)
+        scene.add_triangles(lifted, mesh.faces.astype(np.uint32))
+        points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
+        assert scene.compute_distance(points.astype(np.float32)).numpy().max() < 1e-4
+        assert math.dist(*length["places"]) > 1e-3
+
+        page.get_by_label("Drawn as").select_option("light")
+        canvas.focus()
+        page.keyboard.press("Enter")
+        page.get_by_text("click another place").wait_for()
+
+        canvas.focus()
+        for _ in range(16):
+            page.keyboard.press("-")
+        page.get_by_label("Drawn as").select_option("points")
+        few = drawn_points(page)
+        canvas.focus()
+        page.keyboard.press("0")
+        many = drawn_points(page)
+        assert 0 < few < many < CLOUD_POINTS
+        page.get_by_text(re.compile(rf"{many:,} of {CLOUD_POINTS:,} points drawn, 0 on")).wait_for()
+        shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB"), float)
+        coloured = shot[np.abs(shot - [243, 246, 248]).max(axis=2) > 30]
+        assert 0.05 < len(coloured) / shot[..., 0].size < 0.95
+        assert (coloured[:, 0] > coloured[:, 1] + 80).mean() > 0.1  # red in the east
+        assert (coloured[:, 1] > coloured[:, 0] + 80).mean() > 0.1  # green in the west
+        for _ in range(8):
+            page.keyboard.press("+")
+        assert drawn_points(page) != many
+        page.keyboard.press("Enter")
+        page.get_by_text(
+            re.compile(r"with a sigma of 0\.001\d+ m across the surface: click")
+        ).wait_for()
+        canvas.click(position={"x": box["width"] * 0.42, "y": box["height"] * 0.45})
+        length = measured(page, 2)[1]
+        with laspy.open(tmp_path / "reef" / "dense" / "cloud.copc.laz") as file:
+            cloud = file.read().xyz
+        apart = np.linalg.norm(cloud[None] - np.array(length["places"])[:, None], axis=2)
+        assert apart.min(axis=1).max() < 1e-5
+        assert math.dist(*length["places"]) > 1e-3
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def drawn_points(page: Any) -> int:
+    """How many points are drawn when no more are on the way."""
+    page.wait_for_selector("#mesh-canvas[data-coming='0']", timeout=60_000)
+    text = still(page.get_by_text(re.compile("points drawn, 0 on the way")).inner_text)
+    return int(text.split(" of ")[0].replace(",", ""))
+
+
+def test_damaged_parts_and_little_memory_on_a_wall(tmp_path: Path) -> None:
+    """The rest is drawn, a line says what is not; picks are of the wall's own axes."""
+    workspace = with_tiles(tmp_path / "reef")
+    west = workspace / "mesh" / "tiles" / "west.glb"
+    west.write_bytes(west.read_bytes()[:-2000])
+    cloud = workspace / "dense" / "cloud.copc.laz"
+    nodes = read_nodes(cloud)
+    data, bad = bytearray(cloud.read_bytes()), int(nodes.entries["count"][1:].argmax()) + 1
+    at = int(nodes.entries[bad]["offset"])
+    data[at + 60 : at + 300] = b"\x5a" * 240
+    cloud.write_bytes(data)
+    write_json(workspace / "dense" / "plane.json", WALL)
+    with opened(workspace, complaints=("500", "409")) as (page, _):
+        page.get_by_text("In 3D", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
+        canvas, status = page.locator("#mesh-canvas"), page.locator("#status.error")
+        page.get_by_label("Drawn as").select_option("tiles")
+        page.wait_for_selector("#mesh-canvas[data-parts='1'][data-coming='0']", timeout=60_000)
+        assert status.inner_text() == (
+            "A part is not drawn: mesh/tiles/west.glb is cut off: delete it and run its stage again"
+        )
+        canvas.evaluate("canvas => { canvas.dataset.mostMib = '0.1'; }")
+        page.get_by_label("Drawn as").select_option("points")
+        first = drawn_points(page)
+        canvas.focus()
+        for _ in range(6):
+            page.keyboard.press("+")
+        assert 0 < drawn_points(page) <= 0.1 * 2**20 / 19
+        assert 0 < first <= 0.1 * 2**20 / 19
+        assert float(canvas.get_attribute("data-mib")) <= 0.1
+        canvas.evaluate("canvas => { canvas.dataset.mostMib = '9'; }")
+        canvas.focus()
+        page.keyboard.press("+")
+        assert drawn_points(page) > first
+        page.locator("#status.error", has_text=f"cloud.copc.laz: is damaged (node {bad}").wait_for()
+        page.keyboard.press("Enter")
+        box = canvas.bounding_box()
+        canvas.click(position={"x": box["width"] * 0.4, "y": box["height"] * 0.5})
+        (length,) = measured(page, 1)
+        for right, up, out in length["places"]:
+            place = np.array(WALL["origin_enu"]) + right * EAST + up * UP - out * NORTH
+            assert np.abs(place - MIDDLE).max() < 1.6
+
+        shutil.rmtree(workspace / "mesh")
+        page.reload()
+        page.get_by_text("In 3D", exact=True).click()
+        assert drawn_points(page) > first
+        assert not page.get_by_label("Drawn as").is_visible()
+        assert page.get_by_text("There is no mesh yet").is_visible()
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_it_is_accessible(width: int, tmp_path: Path) -> None:
+    with opened(with_mesh(tmp_path / "reef"), width) as (page, _):
+        page.get_by_role("button", name="Rugosity", exact=True).click()
+        page.get_by_label("Side of quadrats, m").fill("0.2")
+        click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
+        assert Axe().run(page).violations_count == 0
+        page.keyboard.press("f")
+        (area,) = measured(page, 1)
+        assert 4 <= len(area["quadrats"]) <= 6  # a row that is half outside
+        page.get_by_role("button", name="Profile", exact=True).click()
+        click(page, (0.2, 0.5), (0.6, 0.5), (0.6, 0.9))
+        page.keyboard.press("f")
+        measured(page, 2)
+        page.get_by_text("In 3D", exact=True).click()
+        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
+        for text in ("What the sigmas count", "Files"):
+            page.get_by_text(text, exact=True).click()
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width

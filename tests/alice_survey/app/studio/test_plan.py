@@ -1,0 +1,331 @@
+"""The tab Plan: drafts planned and saved as the command line would, and nothing lost."""
+
+import io
+import json
+import shutil
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alice_survey.app.pipeline import run, template_text
+from alice_survey.app.studio.newest import Newest, SupersededError
+from alice_survey.app.studio.server import Server
+from alice_survey.app.studio.setting_limits import setting_limits
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.errors import collected_by
+from alice_survey.core.executor import local_executor
+from missions.values.plan_file import read_plan
+from tests.alice_survey.app.studio.client import ask, call, serving
+from tests.small_survey import settings_in
+
+SQUARE = [[0, 0], [6, 0], [6, 5], [0, 5]]
+DRAWN = {
+    "survey": [{"outer": SQUARE, "holes": [[[2, 2], [2.5, 2], [2.5, 2.5]]]}],
+    "no_go": [{"outer": [[4, 3], [4.5, 3], [4.5, 3.5]]}],
+}
+EDITS: dict[str, dict[str, Any]] = {
+    "settings": {
+        "changes": {"plan": {"altitude_m": 2.25, "cross_lines": 2, "line_spacing_m": None}}
+    },
+    "drawn": {"shapes": DRAWN, "changes": {"plan": {"speed_mps": 0.25}}},
+    "corridor": {"shapes": {"corridors": [[[0, 0], [6, 2], [9, 9]]]},
+                 "changes": {"area": {"corridor_width_m": 3}, "vehicle": {"name": "sparus2"}}},
+}  # fmt: skip
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """A survey of 6 x 5 m that is not planned yet."""
+    text = template_text().replace("length_m = 15.0", "length_m = 6.0")
+    (tmp_path / "reef").mkdir()
+    (tmp_path / "reef" / "survey.toml").write_text(text.replace("width_m = 17.0", "width_m = 5.0"))
+    return tmp_path / "reef"
+
+
+@pytest.fixture
+def server(workspace: Path) -> Iterator[Server]:
+    with serving(workspace) as found:
+        yield found
+
+
+def get(server: Server) -> Any:
+    reply = ask(server, "/api/plan")
+    assert reply.status == 200, reply.text
+    return reply.json
+
+
+def post(server: Server, name: str, body: Any, **options: Any) -> Any:
+    reply = call(server, f"/api/plan/{name}", body, **options)
+    assert reply.status == 200, reply.text
+    return reply.json
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """All files of a stage but its record."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in ("stage.json", ".lock")
+    }
+
+
+def assert_planned_as_by_command(workspace: Path, elsewhere: Path) -> None:
+    """The plan is byte by byte the one of the command line on a copy of the saved settings."""
+    elsewhere.mkdir()
+    for file in workspace.glob("*.*"):
+        if file.is_file() and not file.name.startswith("."):
+            shutil.copy(file, elsewhere)
+    with collected_by(lambda *_: None):
+        run(["plan"], elsewhere, None, executor=local_executor(1))
+    assert files_of(workspace / "plan") == files_of(elsewhere / "plan")
+    one, other = (read_json(folder / "plan" / "stage.json") for folder in (workspace, elsewhere))
+    assert (one["version"], one["settings"]) == (other["version"], other["settings"])
+    digests = [
+        {name: (size, digest) for name, (size, _, digest) in record["inputs"].items()}
+        for record in (one, other)
+    ]
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_a_saved_plan_is_the_command_lines(
+    workspace: Path, server: Server, tmp_path: Path, edit: str
+) -> None:
+    shown = post(server, "preview", EDITS[edit])
+    assert shown["ok"], shown
+    before = (workspace / "survey.toml").read_bytes()
+    text = post(server, "text", EDITS[edit])["survey_toml"]
+    assert (workspace / "survey.toml").read_bytes() == before
+    assert not (workspace / "plan").exists()
+
+    saved = post(server, "save", {**EDITS[edit], "token": get(server)["token"]})
+    assert (workspace / "survey.toml").read_text() == text != before.decode()
+    assert saved["saved"] | {"cpu_s": 0} == shown | {"cpu_s": 0}
+    assert_planned_as_by_command(workspace, tmp_path / "copy")
+    plan = read_json(workspace / "plan" / "plan.json")
+    assert shown["totals"]["duration_s"] == plan["duration_s"]
+    now = get(server)
+    assert (now["token"], now["stage"]) == (saved["token"], "up to date")
+    again = post(server, "preview", {"shapes": now["shapes"]})
+    assert again | {"cpu_s": 0} == shown | {"cpu_s": 0}
+    assert post(server, "text", {"shapes": now["shapes"]})["survey_toml"] == text
+
+
+def test_a_new_survey_starts_from_the_commented_settings(tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        found = get(server)
+        assert (found["token"], found["saved"], found["stage"]) == ("", None, "missing")
+        assert not any(found["shapes"].values())
+        assert found["settings"]["plan"]["altitude_m"] == 2.0
+        assert not (tmp_path / "survey.toml").exists()
+        body = {"shapes": {"survey": [{"outer": SQUARE}]}, "token": ""}
+        assert post(server, "preview", body)["ok"]
+        saved = post(server, "save", body)
+        assert saved["saved"]["ok"] and saved["token"]
+        assert call(server, "/api/plan/save", body).status == 409
+    text = (tmp_path / "survey.toml").read_text()
+    new = [line for line in text.splitlines() if line not in template_text().splitlines()]
+    assert new == ["polygon_ne_m = [[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [0.0, 5.0]]"]
+    assert_planned_as_by_command(tmp_path, tmp_path.with_name("copy"))
+
+
+def test_the_second_of_two_writers_is_refused(workspace: Path, server: Server) -> None:
+    token = get(server)["token"]
+    post(server, "save", {"changes": {"plan": {"altitude_m": 2.5}}, "token": token})
+    kept = files_of(workspace)
+    for body in ({"changes": {"plan": {"altitude_m": 1.5}}, "token": token}, {}, {"token": ""}):
+        reply = call(server, "/api/plan/save", body)
+        assert reply.status == 409 and "changed meanwhile" in reply.json["error"]
+    assert call(server, "/api/plan/save", {"token": token}, token=None).status == 403
+    assert files_of(workspace) == kept
+    (workspace / "survey.toml").write_text("[plan]\naltitude_m = 1.75\n")  # by hand
+    assert get(server)["settings"]["plan"]["altitude_m"] == 1.75
+    assert get(server)["saved"]["totals"]["altitude_m"] == 1.75
+
+
+def test_what_cannot_be_planned_is_saved_and_said(workspace: Path, server: Server) -> None:
+    body = {"changes": {"area": {"seafloor_depth_m": 1.5}}, "token": get(server)["token"]}
+    saved = post(server, "save", body)
+    assert not saved["saved"]["ok"] and "altitude_m" in saved["saved"]["error"]
+    assert "\nseafloor_depth_m = 1.5 " in (workspace / "survey.toml").read_text()
+    assert not (workspace / "plan").exists()
+    assert get(server)["saved"] | {"cpu_s": 0} == saved["saved"] | {"cpu_s": 0}
+
+
+def test_a_conflict_comes_with_changes_that_solve_it(server: Server) -> None:
+    changes = {"plan": {"forward_overlap": 0.95, "speed_mps": 1.2}}
+    found = post(server, "preview", {"changes": changes})
+    assert not found["ok"] and found["ways"]
+    for way in found["ways"]:
+        both = {name: {**changes.get(name, {}), **way["changes"].get(name, {})}
+                for name in changes | way["changes"]}  # fmt: skip
+        assert post(server, "preview", {"changes": both})["ok"], way
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        (b"\xff\xfe", 400), (b"[1]", 400), (b"[" * 100_000, 400),
+        ({"changes": 3}, 400), ({"changes": {"plan": [1]}}, 400), ({"shape": {}}, 400),
+        ({"shapes": {"survey": [{"outer": [[0, 0]]}]}}, 400),
+        ({"shapes": {"survey": [{"outer": [[0, "a"], [1, 1], [2, 2]]}]}}, 400),
+        ({"changes": {"plan": {"altitude_m": "high"}}}, 200),
+        ({"changes": {"plan": {"altitude": 3}}}, 200),
+        ({"changes": {"nothing": {"a": 1}}}, 200),
+        ({"changes": {"area": {"file": "../../etc/passwd.wkt"}}}, 200),
+        ({"changes": {"plan": {"home_ne_m": [None, 1]}}}, 200),
+        ({"changes": {"area": {"layer": "\ud800"}}}, 400),
+        ({"changes": {"plan": {"altitude_m": 10**400}}}, 200),
+        ({"shapes": {"survey": []}}, 200),
+        ({"shapes": {"survey": [{"outer": [[0, 0], [1e300, 0], [0, 1e300]]}]}}, 400),
+        ({"shapes": {"survey": [{"outer": [[0, 0], [0, 0], [0, 0]]}]}}, 200),
+    ],
+)  # fmt: skip
+def test_malformed_requests_are_one_line(
+    workspace: Path, server: Server, body: Any, status: int
+) -> None:
+    before = files_of(workspace)
+    for name in ("preview", "text", "save"):
+        reply = call(server, f"/api/plan/{name}", body)
+        assert reply.status in (status, 400, 409), reply.text
+        if name == "preview":
+            assert reply.status == status
+        if "survey_toml" not in reply.json:
+            assert reply.json["error"] and len(reply.json["error"].splitlines()) == 1
+    assert files_of(workspace) == before
+
+
+def test_settings_that_cannot_be_read_are_said(workspace: Path, server: Server) -> None:
+    (workspace / "survey.toml").write_text("[plan\n")
+    found = get(server)
+    assert "not valid TOML" in found["error"] and found["saved"] is None
+    (workspace / "survey.toml").write_text('[area]\nfile = "gone.kml"\n')
+    found = get(server)
+    assert "gone.kml" in found["error"] and not found["saved"]["ok"]
+    drawn = post(server, "preview", {"shapes": {"survey": [{"outer": SQUARE}]}})
+    assert drawn["ok"]
+
+
+def test_what_the_page_starts_from(server: Server) -> None:
+    found = get(server)
+    assert found["shapes"]["survey"] == [{"outer": SQUARE, "holes": []}]
+    assert found["datum"] == {"latitude_deg": 32.8236, "longitude_deg": 34.9553}
+    assert "altitude_m" in found["written"]["plan"] and "dive_s" not in found["written"]["plan"]
+    limit = found["limits"]["plan.altitude_m"]
+    assert (limit["low"], limit["high"], limit["unit"]) == (0.3, 10.0, "m")
+    assert limit["about"] == "of the left port's outer glass"
+    assert {"alice", "sparus2"} <= set(found["vehicles"]) and 12.5 in found["lenses_mm"]
+    assert found["saved"]["ok"] and found["error"] is None
+    about = setting_limits(template_text())
+    for name in ("plan.side_overlap", "sea.current_mps", "camera.focal_mm", "vehicle.battery_wh"):
+        assert about[name]["step"] > 0 and about[name]["low"] is not None
+
+
+def test_dropped_files_become_shapes(server: Server) -> None:
+    ring = [[34.9553, 32.8236], [34.9554, 32.8236], [34.9554, 32.8237], [34.9553, 32.8236]]
+    text = json.dumps({"type": "Polygon", "coordinates": [ring]}).encode()
+    found = post(server, "import?name=reef.geojson", text)
+    ((outer),) = [polygon["outer"] for polygon in found["survey"]]
+    assert (
+        len(outer) == 3 and outer[0] == [0.0, 0.0] and outer[1][1] == pytest.approx(9.36, abs=0.01)
+    )
+    assert post(server, "preview", {"shapes": found})["ok"]
+    zone = post(server, "import?name=reef.geojson&role=no_go", text)
+    assert zone["no_go"] == found["survey"] and zone["survey"] == []
+    there = post(server, "import?name=reef.geojson&datum=32.8237,34.9553", text)
+    assert there["datum"]["latitude_deg"] == 32.8237
+    assert there["survey"][0]["outer"][0] == pytest.approx((-11.09, 0.0), abs=0.01)
+    own = post(server, "import?name=reef.geojson&datum=middle", text)
+    assert own["datum"] == {"latitude_deg": 32.82365, "longitude_deg": 34.95535}
+    assert call(server, "/api/plan/import?name=reef.geojson&datum=x,1", text).status == 400
+    for name, body in (("reef.kml", b"no"), ("reef.exe", text), ("", text), ("a.wkt", b"POINT (")):
+        reply = call(server, f"/api/plan/import?name={name}", body)
+        assert reply.status == 400 and len(reply.json["error"].splitlines()) == 1
+        assert "dropped" not in reply.json["error"]
+
+
+def test_playback_and_exports_of_the_plan(workspace: Path, server: Server) -> None:
+    played = post(server, "play", {})
+    assert played["what"] == "planned" and played["t_s"] == sorted(played["t_s"])
+    rows = ("t_s", "n", "e", "depth_m", "altitude_m", "heading_deg")
+    assert len({len(played[name]) for name in rows}) == 1 and len(played["pictures_s"]) > 50
+    assert set(played["depth_m"]) == {13.0} and set(played["altitude_m"]) == {2.0}
+    assert ask(server, "/api/plan/export?format=wpl").status == 404
+    changes = {"plan": {"dive_s": 400.0}}
+    saved = post(server, "save", {"changes": changes, "token": get(server)["token"]})
+    assert saved["saved"]["totals"]["dives"] == 2
+    packed = ask(server, "/api/plan/export?format=wpl")
+    names = [f"mission_dive{dive}.waypoints" for dive in (1, 2)]
+    with zipfile.ZipFile(io.BytesIO(packed.body)) as archive:
+        assert archive.namelist() == names
+        for name in names:
+            assert archive.read(name) == (workspace / "plan" / "exports" / name).read_bytes()
+    one = ask(server, "/api/plan/export?format=kml")
+    assert one.body == (workspace / "plan" / "exports" / "plan.kml").read_bytes()
+    assert "plan.kml" in one.headers["content-disposition"]
+    assert ask(server, "/api/plan/export?format=../plan").status == 400
+
+
+def test_a_dive_that_was_simulated_is_played_back(tmp_path: Path) -> None:
+    workspace = settings_in(tmp_path / "small")
+    with collected_by(lambda *_: None):
+        run(["plan", "fly"], workspace, None, executor=local_executor(1))
+    plan = read_json(workspace / "plan" / "plan.json")
+    with serving(workspace) as server:
+        flown = post(server, "play", {})
+        assert flown["what"] == "flown" and len(flown["pictures_s"]) == plan["stations"]
+        places = np.array([flown["n"], flown["e"]]).T
+        at = [np.interp(flown["pictures_s"], flown["t_s"], axis) for axis in places.T]
+        lines = read_plan(workspace / "plan" / "plan.json").lines
+        stations = np.vstack([line.stations_ne for line in lines])
+        off_m = np.linalg.norm(np.array(at).T - stations, axis=1)
+        assert 0.001 < np.median(off_m) < 0.3
+        assert 1.5 < np.interp(flown["pictures_s"][3], flown["t_s"], flown["altitude_m"]) < 2.5
+        changed = post(server, "play", {"changes": {"plan": {"altitude_m": 1.8}}})
+        assert changed["what"] == "planned" and set(changed["altitude_m"]) == {1.8}
+
+
+def test_precision_comes_with_a_layer(server: Server) -> None:
+    found = post(server, "precision", {})
+    assert 0.01 < found["height_mm"] < 20 and 0 < found["scale_ppm"] < 5000
+    assert found["layer"]["png"].startswith("data:image/png;base64,") and found["text"]
+
+
+def test_of_requests_that_wait_only_the_newest_of_a_page_is_worked_on() -> None:
+    newest, began, go_on = Newest(), threading.Event(), threading.Event()
+    done: list[str] = []
+
+    def first() -> None:
+        began.set()
+        go_on.wait()
+        done.append("first")
+
+    def later(page: str, name: str) -> None:
+        try:
+            newest.run(page, lambda: done.append(name))
+        except SupersededError:
+            done.append(f"{name} dropped")
+
+    threads = [threading.Thread(target=lambda: newest.run("a", first))]
+    threads[0].start()
+    began.wait()
+    for count, (page, name) in enumerate(
+        (("a", "second"), ("b", "other"), ("a", "third")), start=1
+    ):
+        threads.append(threading.Thread(target=later, args=(page, name)))
+        threads[-1].start()
+        while sum(newest.tickets.values()) <= count:
+            time.sleep(0.001)
+    while "second dropped" not in done:  # at once, while the first is still being worked on
+        time.sleep(0.001)
+    assert "first" not in done
+    go_on.set()
+    for thread in threads:
+        thread.join()
+    assert sorted(done) == ["first", "other", "second dropped", "third"]

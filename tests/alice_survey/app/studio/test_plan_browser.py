@@ -1,0 +1,364 @@
+"""The Plan tab in Chromium: a survey is drawn, re-planned, undone, saved and kept from others."""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from alice_survey.core.config import SurveyConfig, load_config
+from missions.plan.preview import preview
+from tests.alice_survey.app.studio.client import FOLDED, serving
+from tests.alice_survey.kit.browser import Heard, chromium
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+SIZES = {"desk": (1280, 800), "phone": (400, 800)}
+AREA = ((2.0, 2.0), (12.0, 2.0), (14.0, 12.0), (3.0, 14.0))
+LONG_PRESS_MS = 800
+DROP = """(text) => {
+  const data = new DataTransfer();
+  data.items.add(new File([text], "reef.geojson"));
+  const about = {dataTransfer: data, bubbles: true, cancelable: true};
+  document.getElementById("map-canvas").dispatchEvent(new DragEvent("drop", about));
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    preview(SurveyConfig())  # kernels are compiled before a page waits for them
+    with chromium() as started:
+        yield started
+
+
+@dataclass
+class PlanPage:
+    """A page of the studio on its Plan tab, and what a person does there."""
+
+    page: Any
+    heard: Heard
+
+    def settled(self, after: int = -1) -> int:
+        """Wait until a plan later than one is shown and none is on its way; count the plans."""
+        self.page.wait_for_function(
+            "(after) => Number(document.querySelector('#panel-plan')?.dataset.plans || -1) > after"
+            " && !document.querySelector('main[data-planning]')",
+            arg=after,
+            timeout=60_000,
+        )
+        return self.plans
+
+    @property
+    def plans(self) -> int:
+        return int(self.page.locator("#panel-plan").get_attribute("data-plans") or -1)
+
+    def at(self, north: float, east: float) -> tuple[float, float]:
+        """Where a place is on the screen."""
+        canvas = self.page.locator("#map-canvas")
+        canvas.scroll_into_view_if_needed()
+        box, scale = canvas.bounding_box(), 2 ** float(canvas.get_attribute("data-zoom"))
+        right = (east - float(canvas.get_attribute("data-east"))) * scale
+        up = (north - float(canvas.get_attribute("data-north"))) * scale
+        return box["x"] + box["width"] / 2 + right, box["y"] + box["height"] / 2 - up
+
+    def draw(self, kind: str, corners: tuple[tuple[float, float], ...]) -> None:
+        before = self.plans
+        self.page.get_by_role("button", name=kind, exact=True).click()
+        for corner in (*corners, corners[0]):
+            self.page.mouse.click(*self.at(*corner))
+            self.page.wait_for_timeout(350)  # two clicks are no double click
+        self.settled(before)
+
+    def corner(self, number: int) -> Any:
+        return self.page.locator(".vertex.corner").nth(number)
+
+    def drag(self, handle: Any, right: float, down: float) -> None:
+        before = self.plans
+        box = handle.bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        self.page.mouse.move(x + right, y + down, steps=5)
+        self.page.mouse.up()
+        self.settled(before)
+
+    def press(self, key: str) -> None:
+        before = self.plans
+        self.page.keyboard.press(key)
+        self.settled(before)
+
+    def text(self) -> str:
+        """What Save would write, as the page shows it."""
+        self.page.get_by_role("button", name="Text", exact=True).click()
+        text = self.page.locator("dialog .plan-text").inner_text()
+        self.page.get_by_role("button", name="Close", exact=True).click()
+        self.page.locator("dialog").wait_for(state="detached")
+        return str(text)
+
+    def altitude(self) -> float:
+        return float(self.page.get_by_role("spinbutton", name="Altitude").input_value())
+
+    def violations(self) -> list[str]:
+        rules = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+        found = Axe().run(self.page, options={"runOnly": rules, "resultTypes": ["violations"]})
+        return [
+            f"{fault['id']}: {node['html'][:160]}"
+            for fault in found.response["violations"]
+            for node in fault["nodes"]
+        ]
+
+
+def opened(browser: Any, address: str, size: str = "desk") -> PlanPage:
+    width, height = SIZES[size]
+    page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion="reduce")
+    page.set_default_timeout(15_000)
+    heard = Heard()
+    heard.listen(page)
+    page.add_init_script(FOLDED)
+    page.goto(f"{address}#plan")
+    page.wait_for_selector("#panel-plan[data-read]")
+    return PlanPage(page=page, heard=heard)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "reef"
+    folder.mkdir()
+    with serving(folder) as server:
+        plan = opened(browser, server.address, size)
+        page = plan.page
+        plan.draw("Survey area", AREA)
+        assert page.locator(".plan-list li").count() == 1  # in place of the default rectangle
+        assert plan.corner(3).is_visible()
+        drawn = plan.text()
+
+        plan.drag(plan.corner(2), -20, 15)
+        assert plan.text() != drawn
+        plan.press("Control+z")
+        assert plan.text() == drawn
+        plan.press("Control+Shift+Z")
+        assert plan.text() != drawn
+        plan.press("Control+z")
+
+        plan.drag(page.locator(".vertex.middle").first, -10, 0)
+        assert page.locator(".vertex.corner").count() == 5
+        plan.press("Delete")
+        assert page.locator(".vertex.corner").count() == 4
+        plan.corner(1).focus()
+        plan.press("ArrowUp")
+        plan.press("Control+z")
+        if size == "phone":
+            _press_long(plan, plan.corner(1))
+            assert page.locator(".vertex.corner").count() == 3
+            plan.press("Control+z")
+        for _ in range(2):  # what was removed, and what was inserted
+            plan.press("Control+z")
+        assert plan.text() == drawn
+
+        before = plan.altitude()
+        page.get_by_role("slider", name="Altitude").focus()
+        for _ in range(3):
+            page.keyboard.press("ArrowRight")
+        plan.settled(plan.plans - 1)
+        page.wait_for_timeout(400)
+        plan.settled()
+        raised = plan.altitude()
+        assert before < raised < before + 1.0
+        assert f"altitude_m = {raised:g}" in plan.text()
+
+        _way_out(plan)
+        _zone_by_keyboard(plan)
+        assert plan.violations() == []
+        page.screenshot(path=tmp_path / f"{size}.png", full_page=True)
+        saved = plan.text()
+        _save(plan)
+        assert (folder / "survey.toml").read_text(encoding="utf-8") == saved
+        assert {"plan.json", "plan.html"} <= {path.name for path in (folder / "plan").iterdir()}
+        config = load_config(folder / "survey.toml")
+        assert config.plan.altitude_m == plan.altitude()
+        assert "As in survey.toml" in page.locator(".plan-top .note").inner_text()
+        assert plan.heard.complaints == []
+        page.get_by_text("Export", exact=True).click()
+        links = page.locator("a[href^='/api/plan/export']")
+        assert links.count() > 5
+        sent = page.request.get(server.url.rstrip("/") + links.first.get_attribute("href"))
+        assert sent.ok and len(sent.body()) > 50
+        page.close()
+
+
+def _press_long(plan: PlanPage, handle: Any) -> None:
+    before = plan.plans
+    box = handle.bounding_box()
+    place = {"clientX": box["x"] + 5, "clientY": box["y"] + 5}
+    event = {"pointerType": "touch", "button": 0, "bubbles": True, **place}
+    handle.dispatch_event("pointerdown", event)
+    plan.page.wait_for_timeout(LONG_PRESS_MS)
+    plan.page.evaluate(
+        "(event) => window.dispatchEvent(new PointerEvent('pointerup', event))", event
+    )
+    plan.settled(before)
+
+
+def _way_out(plan: PlanPage) -> None:
+    """A speed that thrusters do not allow is refused, and the first way out leads to a plan."""
+    page, before = plan.page, plan.plans
+    box = page.get_by_role("spinbutton", name="Speed").first
+    box.fill("3")
+    box.press("Tab")
+    plan.settled(before)
+    assert page.get_by_text("No plan:").first.is_visible()
+    before = plan.plans
+    page.locator(".plan-ways button").first.click()
+    plan.settled(before)
+    assert not page.locator(".plan-ways button").first.is_visible()
+    assert "speed_mps = 1.5" in plan.text()
+
+
+def _zone_by_keyboard(plan: PlanPage) -> None:
+    page, before = plan.page, plan.plans
+    shapes = page.locator(".plan-list li").count()
+    page.get_by_role("button", name="No-go zone", exact=True).focus()
+    page.keyboard.press("Enter")
+    canvas = page.locator("#map-canvas")
+    for key, axis in (("ArrowRight", "east"), ("ArrowUp", "north"), ("ArrowLeft", "east")):
+        page.keyboard.press("Enter")
+        stood = canvas.get_attribute(f"data-{axis}")
+        page.keyboard.press(key)
+        page.wait_for_function(
+            "([axis, stood]) => document.getElementById('map-canvas').dataset[axis] !== stood"
+            " && !document.querySelector('.leaflet-pan-anim')",
+            arg=[axis, stood],
+        )
+    page.keyboard.press("f")
+    plan.settled(before)
+    assert page.locator(".plan-list li").count() == shapes + 1
+    assert canvas.get_attribute("data-tool") is None
+
+
+def _save(plan: PlanPage) -> None:
+    plan.page.get_by_role("button", name="Save", exact=True).click()
+    plan.page.wait_for_function(
+        "() => document.getElementById('status').textContent.startsWith('Saved')", timeout=60_000
+    )
+
+
+def test_two_pages_do_not_overwrite_each_other(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        one, other = opened(browser, server.address), opened(browser, server.address)
+        other.draw("Survey area", AREA)
+        speed = other.page.get_by_role("spinbutton", name="Speed").first
+        before = other.plans
+        speed.fill("0.25")
+        speed.press("Tab")
+        other.settled(before)
+        one.draw("Survey area", AREA)
+        _save(one)
+        theirs = (tmp_path / "survey.toml").read_text(encoding="utf-8")
+
+        other.page.get_by_role("button", name="Save", exact=True).click()
+        refused = other.page.get_by_role("dialog")
+        refused.wait_for()
+        assert (tmp_path / "survey.toml").read_text(encoding="utf-8") == theirs
+        assert other.violations() == []
+        before = other.plans
+        refused.get_by_role("button", name="Keep mine on top of theirs").click()
+        other.settled(before)
+        assert "speed_mps = 0.25" in other.text()
+        _save(other)
+        both = load_config(tmp_path / "survey.toml")
+        assert both.plan.speed_mps == 0.25
+        assert "speed_mps = 0.25" not in theirs
+
+        assert [text for text in other.heard.complaints if "409" not in text] == []
+        assert one.heard.complaints == []
+        _leaving_is_asked(one)
+
+
+def _leaving_is_asked(plan: PlanPage) -> None:
+    before = plan.plans
+    slider = plan.page.get_by_role("slider", name="Altitude")
+    slider.focus()
+    plan.page.keyboard.press("ArrowRight")
+    plan.settled(before)
+    asked: list[str] = []
+    plan.page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.accept()))
+    plan.page.reload()
+    assert asked == ["beforeunload"]
+
+
+REEF = {
+    "type": "Polygon",
+    "coordinates": [
+        [[34.9553, 32.8236], [34.9554, 32.8236], [34.9554, 32.8237], [34.9553, 32.8236]]
+    ],
+}
+
+
+def test_sea_import_profile_and_playback(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        plan = opened(browser, server.address)
+        page = plan.page
+        plan.draw("Survey area", AREA)
+        page.get_by_text("Current and swell").click()
+        page.get_by_role("slider", name="Current, direction").focus()
+        plan.press("ArrowRight")
+        assert "current_towards_deg = 95" in plan.text()
+        page.get_by_role("slider", name="Current, direction").focus()
+        plan.press("ArrowUp")
+        assert "current_mps = 0.06" in plan.text()
+
+        before = plan.plans
+        page.locator("#panel-plan input[type=file]").set_input_files(
+            {
+                "name": "reef.geojson",
+                "mimeType": "application/json",
+                "buffer": json.dumps(REEF).encode(),
+            }
+        )
+        plan.settled(before)
+        assert (
+            page.locator(".plan-list .choose")
+            .all_inner_texts()[0]
+            .startswith("Survey area\n3 corners")
+        )
+        page.evaluate(DROP, json.dumps(REEF))
+        plan.settled(before + 1)
+        plan.press("Control+z")
+
+        profile = page.get_by_role("slider", name="Place along the way")
+        profile.focus()
+        page.keyboard.press("End")
+        words = profile.get_attribute("aria-valuetext")
+        assert "dive 1" in words and "over the sea floor" in words
+        assert words == page.locator("#panel-plan .profile-chart .note").inner_text()
+
+        page.get_by_text("Play the dive").click()
+        page.get_by_role("button", name="Play", exact=True).click()
+        page.wait_for_function("() => / of .* pictures/.test(document.body.innerText)")
+        page.get_by_role("button", name="Pause", exact=True).click()
+        scrub = page.get_by_role("slider", name="Time")
+        scrub.focus()
+        page.keyboard.press("End")
+        shown = page.locator("#panel-plan").inner_text()
+        taken, of = re.search(r"([\d,]+) of ([\d,]+) pictures", shown).groups()
+        assert taken == of != "0"
+
+        page.get_by_text("Expected precision").click()
+        page.get_by_role("button", name="Compute it").click()
+        page.wait_for_function(
+            "() => /\\d mm/.test(document.querySelector('.plan-precision').textContent)",
+            timeout=120_000,
+        )
+        if not page.locator("#layers").evaluate("(layers) => layers.open"):
+            page.locator("#layers summary").click()
+        expected = page.locator("[data-layer=plan-sigma]")
+        expected.wait_for()
+        assert expected.get_by_role("checkbox").is_checked()
+        page.get_by_role("button", name="Compute it").scroll_into_view_if_needed()
+        page.screenshot(path=tmp_path / "more.png")
+        assert plan.violations() == []
+        assert plan.heard.complaints == []
+        page.close()

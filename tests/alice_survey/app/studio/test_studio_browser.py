@@ -1,0 +1,121 @@
+"""The studio's shell in Chromium: its map loads tiles and zooms, layers are chosen, tabs turn."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from rasterio.transform import Affine
+
+from tests.alice_survey.app.report.tiny import tiny_workspace
+from tests.alice_survey.app.studio.client import serving
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.sketch import seafloor
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
+MAP = "#map-canvas"
+PICTURES = f"{MAP} img.leaflet-image-layer"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A workspace with a mosaic of four levels."""
+    import rasterio
+
+    workspace = tiny_workspace(tmp_path / "reef")
+    floor = np.asarray(seafloor(2500, 2400))
+    bands = np.concatenate([np.moveaxis(floor, 2, 0), np.full((1, 2400, 2500), 255, np.uint8)])
+    with rasterio.open(
+        workspace / "mosaic" / "mosaic.tif", "w", driver="GTiff", count=4, dtype="uint8",
+        width=2500, height=2400, photometric="RGB", alpha="YES", tiled=True,
+        transform=Affine(0.0005, 0, 0, 0, -0.0005, 1.2),
+    ) as raster:  # fmt: skip
+        raster.write(bands)
+    return workspace
+
+
+def tiles(page: Any) -> list[tuple[str, int]]:
+    """Addresses and widths of the pictures on the map."""
+    found = page.evaluate(
+        f"[...document.querySelectorAll('{PICTURES}')]"
+        ".map((tile) => [new URL(tile.src).pathname, tile.complete ? tile.naturalWidth : 0])"
+    )
+    return [(path, width) for path, width in found]
+
+
+def all_loaded(page: Any, level: int) -> list[tuple[str, int]]:
+    page.wait_for_function(
+        """([pictures, level]) => {
+          const tiles = [...document.querySelectorAll(pictures)];
+          return tiles.length > 0 && tiles.every((tile) => tile.complete
+            && new URL(tile.src).pathname.split("/")[3] === String(level));
+        }""",
+        arg=[PICTURES, level],
+        timeout=60_000,
+    )
+    return tiles(page)
+
+
+def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
+    with serving(folder) as server, chromium() as browser:
+        page = browser.new_page(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
+        heard = Heard()
+        heard.listen(page)
+        page.goto(server.address)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
+        assert "token" not in page.url
+        first = int(page.locator(MAP).get_attribute("data-level"))
+        shown = all_loaded(page, first)
+        assert shown and all(path.startswith("/tiles/mosaic/") for path, _ in shown)
+        assert all(width > 0 for _, width in shown)
+
+        page.locator(MAP).focus()
+        for _ in range(3):
+            page.keyboard.press("+")
+            page.wait_for_timeout(250)
+        page.wait_for_selector(f"{MAP}[data-level='3']")
+        assert first < 3
+        assert all(width > 0 for _, width in all_loaded(page, 3))
+
+        page.get_by_label("Height", exact=True).check()
+        page.wait_for_function(
+            "() => document.querySelector('img[src*=\"/tiles/height/\"]')?.naturalWidth > 0",
+            timeout=60_000,
+        )
+        assert page.get_by_text("height, m").first.is_visible()
+        for name in ("Mosaic", "Sigma of height", "Height") * 3:  # faster than tiles come
+            page.get_by_label(name, exact=True).check()
+        page.get_by_role("button", name="Show all").click()
+        assert heard.complaints == []
+        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
+            server.url.split("/")[2]
+        }
+        page.close()
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "light"), (1280, "dark")])
+def test_every_tab_is_accessible(folder: Path, width: int, scheme: str) -> None:
+    with serving(folder) as server, chromium() as browser:
+        page = browser.new_page(
+            viewport={"width": width, "height": 900}, reduced_motion="reduce", color_scheme=scheme
+        )
+        heard = Heard()
+        heard.listen(page)
+        page.goto(server.address)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
+        names = page.locator("#tabs [role=tab]").all_inner_texts()
+        for name in names:
+            page.get_by_role("tab", name=name, exact=True).click()
+            page.wait_for_timeout(300)
+            assert page.locator("[role=tabpanel]:visible").count() == 1
+            found = Axe().run(page)
+            assert (name, found.violations_count) == (name, 0), found.generate_report()
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert (name, wide <= width) == (name, True)
+        page.locator("#tabs [role=tab]").first.focus()
+        for name in names[1:]:
+            page.keyboard.press("ArrowRight")
+            assert page.locator("[role=tab][aria-selected=true]").inner_text() == name
+        assert heard.complaints == []
+        page.close()

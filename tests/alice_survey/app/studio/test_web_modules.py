@@ -1,0 +1,456 @@
+"""Pure functions of the studio's tabs, run with node: shapes, undo, requests, words."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import Polygon
+
+import alice_survey.app.studio
+from tests.alice_survey.kit.node import run_modules
+
+WEB = Path(alice_survey.app.studio.__file__).with_name("web")
+SQUARE: dict[str, Any] = {
+    "outer": [[0, 0], [10, 0], [10, 8], [0, 8]],
+    "holes": [[[2, 2], [4, 2], [4, 4], [2, 4]]],
+}
+LINE = [[0.0, 0.0], [3.0, 4.0], [3.0, 10.0]]
+SHAPES = {"survey": [SQUARE], "no_go": [], "allowed": [], "corridors": [LINE]}
+OUTER = {"kind": "survey", "index": 0, "ring": 0}
+HOLE = {"kind": "survey", "index": 0, "ring": 1}
+WAY = {"kind": "corridors", "index": 0, "ring": 0}
+
+
+def run(folder: Path, module: str, expression: str, **values: Any) -> Any:
+    """The value of an expression of JavaScript; `m` is a module, and values are named."""
+    lines = [f'import * as m from "./{module}.js";']
+    lines += [f"const {name} = {json.dumps(value)};" for name, value in values.items()]
+    lines.append(f"console.log(JSON.stringify(await ({expression})));")
+    return run_modules(WEB, folder, "\n".join(lines))
+
+
+def test_rings_move_alone_or_with_their_holes(tmp_path: Path) -> None:
+    moved, hole, way = run(
+        tmp_path, "plan_shapes",
+        "[m.moveRing(s, outer, 1, 2), m.moveRing(s, hole, 1, 2), m.moveRing(s, way, -1, 0.5)]",
+        s=SHAPES, outer=OUTER, hole=HOLE, way=WAY,
+    )  # fmt: skip
+    assert moved["survey"][0]["outer"][2] == [11, 10]
+    assert moved["survey"][0]["holes"][0][0] == [3, 4]
+    assert hole["survey"][0] == {
+        "outer": SQUARE["outer"],
+        "holes": [[[3, 4], [5, 4], [5, 6], [3, 6]]],
+    }
+    assert way["corridors"] == [[[-1, 0.5], [2, 4.5], [2, 10.5]]]
+    assert moved["corridors"] == [LINE]
+
+
+def test_vertices_come_and_go_and_the_last_take_their_ring(tmp_path: Path) -> None:
+    more, fewer, no_hole, nothing, no_way = run(
+        tmp_path, "plan_shapes",
+        """(() => {
+          const more = m.insertVertex(s, outer, 3);
+          const hole3 = m.removeVertex(s, hole, 0);
+          const way2 = m.removeVertex(s, way, 1);
+          return [more, m.removeVertex(more, outer, 4), m.removeVertex(hole3, hole, 0),
+                  m.removeRing(s, outer), m.removeVertex(way2, way, 0)];
+        })()""",
+        s=SHAPES, outer=OUTER, hole=HOLE, way=WAY,
+    )  # fmt: skip
+    assert more["survey"][0]["outer"] == [*SQUARE["outer"], [0, 4]]
+    assert fewer == SHAPES
+    assert no_hole["survey"] == [{"outer": SQUARE["outer"], "holes": []}]
+    assert nothing == {**SHAPES, "survey": []}
+    assert no_way["corridors"] == []
+
+
+def test_names_and_sizes(tmp_path: Path) -> None:
+    names, sizes, several = run(
+        tmp_path, "plan_shapes",
+        """(() => {
+          const all = m.paths(s);
+          const two = m.addRing(s, "survey", [[20, 0], [30, 0], [30, 1]]);
+          return [all.map((p) => m.nameOf(s, p)), all.map((p) => m.sizeOf(s, p)),
+                  [m.nameOf(two.shapes, two.path), two.path]];
+        })()""",
+        s=SHAPES,
+    )  # fmt: skip
+    assert names == ["Survey area", "Hole of survey area", "Corridor"]
+    assert sizes == ["4 corners, 80.0 m²", "4 corners, 4.0 m²", "3 points, 11.0 m"]
+    assert several == ["Survey area 2", {"kind": "survey", "index": 1, "ring": 0}]
+
+
+def test_areas_and_what_is_under_the_pointer_agree_with_shapely(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 11))
+    star = (
+        rng.uniform(2, 9, 11)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    ).round(3)
+    places = rng.uniform(-10, 10, (200, 2))
+    area, inside, away, bounds = run(
+        tmp_path, "plan_shapes",
+        "[m.areaOf(p), q.map((x) => m.encloses(p, x)), q.map((x) => m.distanceTo(p, true, x)),"
+        " m.boundsOf({survey: [{outer: p, holes: []}]})]",
+        p=star.tolist(), q=places.tolist(),
+    )  # fmt: skip
+    polygon, points = Polygon(star), shapely.points(places)
+    assert area == pytest.approx(polygon.area, rel=1e-12)
+    assert inside == shapely.contains(polygon, points).tolist()
+    assert 20 < sum(inside) < 180
+    np.testing.assert_allclose(away, shapely.distance(polygon.exterior, points), atol=1e-9)
+    assert bounds == list(polygon.bounds)
+
+
+def test_an_edge_within_reach_comes_before_what_encloses(tmp_path: Path) -> None:
+    found = run(
+        tmp_path, "plan_shapes", "q.map((x) => m.pathAt(s, x, 0.5))", s=SHAPES,
+        q=[[3, 3], [6, 3], [10.3, 4], [12, 4], [3, 9.5], [1.7, 3]],
+    )  # fmt: skip
+    assert found == [HOLE, OUTER, OUTER, None, WAY, HOLE]
+
+
+def test_what_a_file_has_replaces_what_is_of_its_kind(tmp_path: Path) -> None:
+    imported = {"survey": [], "no_go": [SQUARE], "corridors": [LINE]}
+    zones, kept = run(
+        tmp_path, "plan_shapes",
+        "[m.withImported(s, imported), m.withImported(s, {allowed: [a]})]",
+        s=SHAPES, imported=imported, a=SQUARE,
+    )  # fmt: skip
+    assert zones == {"survey": [], "no_go": [SQUARE], "allowed": [], "corridors": [LINE]}
+    assert kept == {**SHAPES, "allowed": [SQUARE]}
+
+
+def test_reports_of_own_saves_are_known_whatever_comes_first(tmp_path: Path) -> None:
+    """The report before its answer; both answers before the first report; content saved twice."""
+    early, late, again, other, failed = run(
+        tmp_path, "own_saves",
+        """(async () => {
+          const wait = (ms, value) => new Promise((done) => setTimeout(() => done(value), ms));
+          const saves = m.startOwnSaves();
+          const slow = saves.save(wait(30, {token: "a"}));
+          const early = await saves.isOwn("a");
+          await slow;
+          await saves.save(wait(0, {token: "b"}));
+          await saves.save(wait(0, {token: "a"}));
+          await saves.save(wait(0, {token: "b"}));
+          const late = [await saves.isOwn("b"), await saves.isOwn("a")];
+          const again = await saves.isOwn("b");
+          const other = [await saves.isOwn("b"), await saves.isOwn("c")];
+          const refused = saves.save(Promise.reject(new Error("no"))).catch((no) => no.message);
+          return [early, late, again, other, [await saves.isOwn("d"), await refused]];
+        })()""",
+    )  # fmt: skip
+    assert (early, late, again) == (True, [True, True], True)
+    assert other == [False, False] and failed == [False, "no"]
+
+
+edits = st.lists(
+    st.tuples(st.sampled_from(["move", "insert", "remove", "drop", "shift", "add", "hole"]),
+              st.integers(0, 40), st.integers(0, 40), st.floats(-5, 5)), max_size=30,
+)  # fmt: skip
+
+
+@settings(max_examples=12, deadline=None)
+@given(edits=edits)
+def test_undoing_all_of_random_edits_returns_to_the_start(
+    edits: list[tuple[str, int, int, float]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """And every state on the way has rings of enough points, to a millimetre."""
+    start, end, again, states = run(
+        tmp_path_factory.mktemp("undo"), "plan_shapes",
+        """(async () => {
+          const h = await import("./undo.js");
+          let history = h.startHistory({changes: {}, shapes: s});
+          let count = 1;
+          edits.forEach(([what, a, b, x]) => {
+            const shapes = h.current(history).shapes;
+            const all = m.paths(shapes);
+            const path = all[a % Math.max(1, all.length)];
+            const places = [[x, b], [x + 3, b], [x + 3, b + 2.00049]];
+            const areas = all.filter((p) => p.kind === "survey");
+            let next = shapes;
+            if (what === "add") next = m.addRing(shapes, "no_go", places).shapes;
+            if (what === "hole" && areas.length) {
+              next = m.addRing(shapes, "survey", places, areas[0]).shapes;
+            }
+            const i = path ? b % m.pointsOf(shapes, path).length : 0;
+            if (path && what === "move") next = m.moveVertex(shapes, path, i, [x, x / 3]);
+            if (path && what === "insert") next = m.insertVertex(shapes, path, i);
+            if (path && what === "remove") next = m.removeVertex(shapes, path, i);
+            if (path && what === "drop") next = m.removeRing(shapes, path);
+            if (path && what === "shift") next = m.moveRing(shapes, path, x, -x);
+            history = h.record(history, {changes: {}, shapes: next});
+          });
+          const end = h.current(history);
+          const states = history.states.flatMap(({shapes}) => m.paths(shapes).map(
+            (path) => [path.kind, m.pointsOf(shapes, path)]));
+          while (h.canUndo(history)) history = h.undo(history);
+          const first = h.current(history);
+          while (h.canRedo(history)) history = h.redo(history);
+          return [first, end, h.current(history), states];
+        })()""",
+        s=SHAPES, edits=edits,
+    )  # fmt: skip
+    assert start == {"changes": {}, "shapes": SHAPES}
+    assert again == end
+    for kind, points in states:
+        assert len(points) >= (2 if kind == "corridors" else 3)
+        assert np.allclose(1000 * np.array(points), np.round(1000 * np.array(points)), atol=1e-6)
+
+
+def test_edits_of_one_tag_within_a_second_are_one_step(tmp_path: Path) -> None:
+    sizes = run(
+        tmp_path, "undo",
+        """(() => {
+          const state = (v) => ({changes: {plan: {altitude_m: v}}, shapes: null});
+          let h = m.startHistory(state(0));
+          h = m.record(h, state(1), "altitude", 0);
+          h = m.record(h, state(2), "altitude", 900);
+          h = m.record(h, state(3), "altitude", 1800);
+          const one = h.states.length;
+          h = m.record(h, state(4), "altitude", 2900);
+          h = m.record(h, state(5), "speed", 2950);
+          const three = h.states.length;
+          h = m.record(h, state(5), "heading", 9000);
+          h = m.record(m.undo(h), state(6), "speed", 2960);
+          return [one, three, h.states.length, m.canRedo(h), m.current(m.undo(h))];
+        })()""",
+    )  # fmt: skip
+    assert sizes == [2, 4, 4, False, {"changes": {"plan": {"altitude_m": 4}}, "shapes": None}]
+
+
+def test_a_value_that_the_file_has_is_no_change(tmp_path: Path) -> None:
+    file = {
+        "settings": {"plan": {"altitude_m": 2.0, "line_spacing_m": 1.0, "side_overlap": 0.28}},
+        "written": {"plan": ["line_spacing_m"]},
+    }
+    changed = run(
+        tmp_path, "plan_changes",
+        """[
+          m.withChange({}, f, "plan", "altitude_m", 2.5),
+          m.withChange({plan: {altitude_m: 2.5}}, f, "plan", "altitude_m", 2.0),
+          m.withChange({}, f, "plan", "line_spacing_m", null),
+          m.withChange({}, f, "plan", "altitude_m", null),
+          m.withChanges({sea: {current_mps: 0.1}}, f,
+            {plan: {side_overlap: 0.5, line_spacing_m: null}}),
+          m.valueOf({plan: {line_spacing_m: null}}, f, "plan", "line_spacing_m"),
+          m.valueOf({}, f, "plan", "altitude_m"),
+          m.valueOf({}, f, "sea", "current_mps"),
+        ]""",
+        f=file,
+    )  # fmt: skip
+    assert changed == [
+        {"plan": {"altitude_m": 2.5}}, {}, {"plan": {"line_spacing_m": None}}, {},
+        {"sea": {"current_mps": 0.1}, "plan": {"side_overlap": 0.5, "line_spacing_m": None}},
+        None, 2.0, None,
+    ]  # fmt: skip
+
+
+def test_no_answer_is_shown_after_that_of_a_newer_request(tmp_path: Path) -> None:
+    """The first answer takes longest and ignores that it was stopped; the third fails."""
+    asked, seen = run(
+        tmp_path, "plan_latest",
+        """(async () => {
+          const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+          const [asked, seen] = [[], []];
+          const way = m.latest({
+            delay: 20,
+            ask: async (state, signal) => {
+              asked.push(state);
+              await pause({slow: 150, quick: 10, bad: 5}[state]);
+              if (state === "bad") throw new Error("bad");
+              return [state, signal.aborted];
+            },
+            shown: (answer) => seen.push(answer),
+            failed: (error) => seen.push(error.message),
+          });
+          way.request("never"); way.request("slow"); await pause(60);
+          way.request("quick"); await pause(250);
+          way.request("bad"); await pause(60);
+          way.request("quick"); way.stop(); await pause(60);
+          return [asked, seen];
+        })()""",
+    )  # fmt: skip
+    assert asked == ["slow", "quick", "bad"]
+    assert seen == [["quick", False], "bad"]
+
+
+def test_totals_as_words(tmp_path: Path) -> None:
+    totals = {
+        "area_m2": 255.0, "lines": 18, "stations": 612, "pictures": 1224, "length_m": 330.2,
+        "duration_s": 1690.0, "energy_wh": 61.3, "usable_wh": 1120.0, "longest_dive_wh": 61.3,
+        "dives": 1, "data_gb": 11.2,
+        "interval_s": 1.21, "exposure_s": 0.00183, "gain_db": 0.0, "aperture": 4.0, "gsd_mm": 0.44,
+        "line_spacing_m": 1.0, "forward_overlap": 0.63, "side_overlap": 0.281, "covered": 0.999996,
+        "at_overlap": None, "speed_mps": 0.2,
+    }  # fmt: skip
+    rows, summary, refused, times = run(
+        tmp_path, "plan_words",
+        """[m.totalRows(t), m.summaryOf({ok: true, totals: t, warnings: [], holes: [1]}),
+            m.summaryOf({ok: false, error: "too steep"}),
+            await import("./words.js").then(
+              (w) => [...[98, 3600, 14400].map(w.duration), w.clock(3723), w.clock(48)])]""",
+        t=totals,
+    )  # fmt: skip
+    assert dict(rows)["Covered"] == "99.99 %"
+    assert dict(rows)["Exposure"] == "1.83 ms, f/4, gain 0 dB"
+    assert dict(rows)["Longest dive"] == "61 of 1120 Wh usable"
+    assert "At the requested overlap" not in dict(rows)
+    assert summary == "18 lines, 28 min, 1 dive, 1,224 pictures, 99.99 % covered, 1 hole"
+    assert refused == "No plan: too steep"
+    assert times == ["98 s", "60 min", "4.0 h", "1:02:03", "0:48"]
+
+
+def test_counts_are_coloured_and_what_lacks_overlap_stands_out(tmp_path: Path) -> None:
+    """Five pixels: outside, few, most, half, and one without its overlap."""
+    pixels = [(255, 0, 0), (1, 1, 1), (8, 2, 1), (4, 2, 1), (3, 1, 0)]
+    most, painted = run(
+        tmp_path, "plan_words",
+        "(() => { const d = new Uint8ClampedArray(p); return [m.paintCounts(d), [...d]]; })()",
+        p=[value for pixel in pixels for value in (*pixel, 255)],
+    )  # fmt: skip
+    rgba = np.array(painted).reshape(-1, 4)
+    assert most == math.floor(most) and 4 <= most <= 8
+    assert rgba[:, 3].tolist() == [0, 215, 215, 215, 190]
+    assert rgba[4, :3].tolist() == [0xD3, 0x54, 0x00]
+    assert rgba[1, :3].sum() > rgba[3, :3].sum() > rgba[2, :3].sum()
+
+
+def test_places_along_a_way_agree_with_shapely(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    way = rng.uniform(-20, 20, (12, 2))
+    line = shapely.LineString(way)
+    lengths = rng.uniform(0, line.length, 60)
+    found, beyond = run(
+        tmp_path, "way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
+        p=way.tolist(), s=lengths.tolist(),
+    )  # fmt: skip
+    expected = shapely.get_coordinates(shapely.line_interpolate_point(line, lengths))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert beyond == way[-1].tolist()
+
+
+def test_a_profile_leads_to_its_place_whether_or_not_dives_begin_at_zero(tmp_path: Path) -> None:
+    """Halfway between two samples of each dive, at its ends, and beyond all."""
+    routes = [[[0, 0], [10, 0]], [[5, 5], [5, 25]]]
+    ends = {
+        "s_m": [0, 10, 0, 20], "dive": [1, 1, 2, 2],
+        "floor_depth_m": [14, 16, 15, None], "vehicle_depth_m": [12, 14, 13, 13],
+    }  # fmt: skip
+    goes_on = {**ends, "s_m": [0, 10, 10, 30]}
+    found, along = run(
+        tmp_path, "way",
+        "[both.map((p) => s.map((x) => m.profileAt(p, routes, m.growing(p.s_m), x))),"
+        " both.map((p) => m.growing(p.s_m))]",
+        both=[ends, goes_on], routes=routes, s=[0, 5, 20, 30, 99],
+    )  # fmt: skip
+    assert along == [goes_on["s_m"]] * 2
+    for places in found:
+        assert [one["place"] for one in places] == [[0, 0], [5, 0], [5, 15], [5, 25], [5, 25]]
+        assert [one["dive"] for one in places] == [1, 1, 2, 2, 2]
+        assert [one["floor"] for one in places] == [14, 15, None, None, None]
+        assert [one["vehicle"] for one in places] == [12, 13, 13, 13, 13]
+
+
+def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> None:
+    dive = {
+        "t_s": [0, 2, 4, 6], "n": [0, 1, 2, 3], "e": [0, 0, 0, 4], "depth_m": [0, 10, 10, 10],
+        "altitude_m": [12, 2, 2, 2], "heading_deg": [350, 10, 10, 190],
+    }  # fmt: skip
+    states, counts = run(
+        tmp_path, "way",
+        "[[0, 1, 2, 3.5, 9, -1].map((t) => m.stateAt(d, t)),"
+        " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t))]",
+        d=dive,
+    )  # fmt: skip
+    assert [state["heading"] for state in states] == [350, 0, 10, 10, 190, 350]
+    assert [state["index"] for state in states] == [0, 0, 1, 1, 3, 0]
+    assert states[3]["n"] == 1.75 and states[1]["depth"] == 5
+    assert states[4]["e"] == 4 and states[5]["n"] == 0
+    assert counts == [0, 1, 3, 4]
+
+
+def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
+    path = run(tmp_path, "way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
+    assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
+
+
+def test_ticks_are_round_and_within_their_limits(tmp_path: Path) -> None:
+    limits = [(-12.31, -11.87, 5), (0.0, 1234.0, 5), (0.0, 4.0, 4), (-5.0, 0.0, 5)]
+    found = run(tmp_path, "way", "l.map(([a, b, n]) => m.ticks(a, b, n))", l=limits)
+    for (low, high, most), (values, digits) in zip(limits, found, strict=True):
+        assert 2 <= len(values) <= most + 1
+        assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
+        assert np.allclose(values, np.round(values, digits), atol=1e-9)
+
+
+def test_words_of_figures(tmp_path: Path) -> None:
+    words = run(
+        tmp_path, "words",
+        """[m.number(-1234.56, "m", 4), m.number(null), m.withSigma(-1.23456, 0.0123, "m"),
+            m.withSigma(2, 0), m.clock(-20.5), m.clock(null), m.share(0.9996, 1), m.share(null),
+            m.counted(1, "line"), m.counted(1200, "pass", "passes"), m.fixed(-0.256, 2, "m"),
+            m.csv(["a", "b"], [['x"y', null], ["1,2", 3]])]""",
+    )  # fmt: skip
+    assert words == [
+        "−1,235 m", "unknown", "−1.235 ± 0.012 m", "2.000", "−0:20", "–", "99.9 %", "–",
+        "1 line", "1,200 passes", "−0.26 m", 'a,b\n"x""y",\n"1,2",3\n',
+    ]  # fmt: skip
+
+
+def annotation(kind: str, points: Sequence[Sequence[float]], **more: Any) -> dict[str, Any]:
+    return {"id": "a", "shape": {"kind": kind, "points": points, "holes": [], **more}}
+
+
+def test_vertices_of_annotations_come_and_go(tmp_path: Path) -> None:
+    """Handles have places [north, east], annotations [east, north]."""
+    outer, hole = [[0, 0], [4, 0], [4, 3]], [[2, 1], [3, 1], [3, 2]]
+    shape = annotation("polygon", outer, holes=[hole])
+    rings, moved, more, fewer, none, shifted = run(
+        tmp_path, "annotate_shapes",
+        """(() => {
+          const t = m.targetOf(s);
+          return [t.rings, t.move(1, 0, [9, 8]).shape, t.insert(0, 2, null).shape,
+                  t.remove(1, 0).shape, t.remove(0, 0), t.shift(1, 10).shape];
+        })()""",
+        s=shape,
+    )  # fmt: skip
+    assert [ring["closed"] for ring in rings] == [True, True]
+    assert rings[0]["points"] == [[0, 0], [0, 4], [3, 4]]
+    assert moved["points"] == outer and moved["holes"][0][0] == [8, 9]
+    assert more["points"] == [*outer, [2, 1.5]]
+    assert fewer["holes"] == [] and fewer["points"] == outer
+    assert none is None
+    assert shifted["points"][0] == [10, 1] and shifted["holes"][0][0] == [12, 2]
+
+
+@settings(max_examples=8, deadline=None)
+@given(corner=st.integers(0, 3), turn=st.floats(0, 3), place=st.tuples(*[st.floats(-9, 9)] * 2))
+def test_a_rectangle_stays_one(
+    corner: int,
+    turn: float,
+    place: tuple[float, float],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Whichever corner moves anywhere, the opposite one stays and all angles are right."""
+    c, s = math.cos(turn), math.sin(turn)
+    points = [[c * x - s * y, s * x + c * y] for x, y in ((0, 0), (4, 0), (4, 3), (0, 3))]
+    moved = run(
+        tmp_path_factory.mktemp("rectangle"), "annotate_shapes",
+        "m.targetOf(a).move(0, corner, place).shape.points",
+        a=annotation("rectangle", points), corner=corner, place=place,
+    )  # fmt: skip
+    got = np.array(moved)
+    opposite = (corner + 2) % 4
+    assert np.allclose(got[opposite], points[opposite])
+    assert np.allclose(got[corner], place[::-1])
+    assert np.allclose(got[0] + got[2], got[1] + got[3], atol=1e-9)
+    sides = np.roll(got, -1, axis=0) - got
+    assert np.allclose((sides * np.roll(sides, -1, axis=0)).sum(axis=1), 0, atol=1e-8)

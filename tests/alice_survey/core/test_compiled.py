@@ -1,0 +1,171 @@
+"""Compiled kernels are kept between processes, and dropped when what they are made of changes."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+
+from alice_survey.core.compiled import closure_digest
+
+ASK = "import inner, outer; print(outer.twice(3.0), sum(outer.twice.stats.cache_hits.values()))"
+INNER = '''
+from alice_survey.core.compiled import compiled
+{above}
+OFFSET = {offset}
+
+@compiled
+def once(x):
+    """{doc}"""
+    return x + OFFSET
+'''
+OUTER = """
+from alice_survey.core.compiled import compiled
+import numbers_used
+from inner import once
+
+@compiled
+def twice(x):
+    return once(x) * numbers_used.FACTOR
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write(tmp_path)
+    (tmp_path / "outer.py").write_text(OUTER)
+    assert ask(tmp_path) == (8.0, 0)
+    return tmp_path
+
+
+def write(
+    folder: Path, offset: float = 1.0, factor: float = 2.0, above: str = "", doc: str = ""
+) -> None:
+    (folder / "inner.py").write_text(INNER.format(offset=offset, above=above, doc=doc))
+    (folder / "numbers_used.py").write_text(f"FACTOR = {factor}\nUNUSED = 1\n")
+
+
+def asking(folder: Path) -> dict[str, str]:
+    """Environment of a process that imports from a folder and keeps its kernels there."""
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[3])]),
+        "NUMBA_CACHE_DIR": str(folder / "kept"),
+        "PYTHONDONTWRITEBYTECODE": "1",  # which an edit in the same second would leave
+    }
+
+
+def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
+    environment = asking(folder)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    value, hits = done.stdout.split()
+    return float(value), int(hits)
+
+
+def test_a_kernel_is_kept_between_processes(folder: Path) -> None:
+    assert ask(folder) == (8.0, 1)
+
+
+def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -> None:
+    (folder / "other.py").write_text("FACTOR = 7.0\n")
+    write(folder, above="# more lines\nUNUSED = 3.0\n", doc="Other words.")
+    (folder / "numbers_used.py").write_text("UNUSED = 2\nFACTOR = 2.0\n")
+    assert ask(folder) == (8.0, 1)
+
+
+def test_a_constant_of_a_called_kernel_counts(folder: Path) -> None:
+    write(folder, offset=10.0)
+    assert ask(folder) == (26.0, 0)
+
+
+def test_a_constant_named_through_a_module_counts(folder: Path) -> None:
+    write(folder, factor=3.0)
+    assert ask(folder) == (12.0, 0)
+
+
+def test_the_code_of_a_called_kernel_counts(folder: Path) -> None:
+    inner = (folder / "inner.py").read_text()
+    (folder / "inner.py").write_text(inner.replace("x + OFFSET", "x - OFFSET"))
+    assert ask(folder) == (4.0, 0)
+
+
+def test_a_kernel_whose_argument_has_a_new_class_name_is_compiled_again(tmp_path: Path) -> None:
+    """The kept index names the old class, which is not there any more."""
+    text = """
+from typing import NamedTuple
+from alice_survey.core.compiled import compiled
+
+class {name}(NamedTuple):
+    length: float
+
+@compiled
+def twice(x):
+    return 2.0 * x.length + 2.0
+
+def run(x):
+    return twice({name}(x))
+run.stats = twice.stats
+"""
+    (tmp_path / "inner.py").write_text("")
+    ask_run = ASK.replace("outer.twice(3.0)", "outer.run(3.0)")
+    for name in ("Old", "New"):
+        (tmp_path / "outer.py").write_text(text.format(name=name))
+        assert ask(tmp_path, ask_run) == (8.0, 0)
+    assert ask(tmp_path, ask_run) == (8.0, 1)
+
+
+def scaled(table: np.ndarray, unit: float = 1.0) -> Callable[[int], float]:
+    def value(i: int) -> float:
+        return float(table[i] * unit)
+
+    return value
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        (njit(scaled(np.array([1.0, 2.0]))), njit(scaled(np.array([1.0, 2.0]))), True),
+        (njit(scaled(np.array([1.0, 2.0]))), njit(scaled(np.array([1.0, 2.5]))), False),
+        (njit(scaled(np.ones(2), 1.0)), njit(scaled(np.ones(2), 2.0)), False),
+        (njit(scaled(np.ones(2))), njit(error_model="numpy")(scaled(np.ones(2))), False),
+    ],
+)
+def test_enclosed_values_and_options_count(first: object, second: object, same: bool) -> None:
+    assert (closure_digest(first) == closure_digest(second)) is same
+
+
+def test_recursion_ends() -> None:
+    @njit
+    def down(n: int) -> int:
+        if n <= 0:
+            return 0
+        return int(down(n - 1) + 1)
+
+    assert closure_digest(down) == closure_digest(down)
+
+
+def test_processes_that_start_together_compile_a_kernel_once(tmp_path):
+    write(tmp_path)
+    (tmp_path / "outer.py").write_text(OUTER)
+    code = (
+        "import pathlib, time, outer\n"
+        "from inner import once\n"
+        f"pathlib.Path({str(tmp_path / 'ready')!r} + str(__import__('os').getpid())).touch()\n"
+        f"while len(list(pathlib.Path({str(tmp_path)!r}).glob('ready*'))) < 3: time.sleep(0.01)\n"
+        "kernels = outer.twice, once\n"
+        "print(outer.twice(3.0), *[sum(k.stats.cache_misses.values()) for k in kernels])"
+    )
+    environment = asking(tmp_path)
+    started = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE)
+        for _ in range(3)
+    ]
+    found = [process.communicate(timeout=120)[0].split() for process in started]
+    assert [float(answer) for answer, *_ in found] == [8.0] * 3
+    assert [sum(int(row[k]) for row in found) for k in (1, 2)] == [1, 1]

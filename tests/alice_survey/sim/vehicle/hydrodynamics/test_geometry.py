@@ -1,0 +1,110 @@
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.hydrodynamics.entrained import entrained_water
+from alice_survey.sim.vehicle.hydrodynamics.geometry import (
+    ALICE,
+    SHELL_M,
+    SPARUS2,
+    T200_DIAMETER_M,
+    T200_LENGTH_M,
+    Geometry,
+    Outline,
+    farthest_tunnel_x,
+)
+
+RHO, BUOYANCY_KG = 1025.0, 52.1
+BOTH = [ALICE, SPARUS2]
+
+
+def test_sparus2_is_as_long_and_thick_as_the_paper_states() -> None:
+    assert SPARUS2.outline.length_m == pytest.approx(1.6, abs=0.015)
+    assert SPARUS2.outline.diameter_m == pytest.approx(0.230, abs=1e-9)
+
+
+def test_alice_is_as_long_as_its_lift_implies() -> None:
+    """Y_uv = -39.71 and M_uw = -8.498 hold for this hull and its nose."""
+    assert ALICE.outline.length_m == pytest.approx(1.96, abs=1e-12)
+    assert ALICE.outline.nose_x_m == 1.06
+    assert ALICE.outline.diameter_m == SPARUS2.outline.diameter_m
+    assert ALICE.outline.side_fullness == pytest.approx(0.940, abs=5e-4)
+
+
+@pytest.mark.parametrize("geometry", BOTH)
+def test_parts_touch_the_hull(geometry: Geometry) -> None:
+    mast, mount, pod = geometry.mast, geometry.mount, geometry.pod
+    root = geometry.outline.radius_at(np.array([mast.x_m]))[0]
+    assert mast.root_z_m == pytest.approx(-root, abs=2e-3)
+    middle = np.array([(mount.aft_x_m + mount.fore_x_m) / 2.0])
+    assert geometry.outline.radius_at(middle)[0] < mount.tip_y_m
+    assert mount.tip_y_m == pytest.approx(pod.y_m - pod.body_diameter_m / 2.0, abs=1e-3)
+    assert pod.outline.tail_x_m < mount.aft_x_m < mount.fore_x_m < pod.outline.nose_x_m + 0.02
+    assert geometry.tunnels[0].x_m == 0.0
+
+
+@pytest.mark.parametrize("geometry", BOTH)
+def test_the_envelope_holds_more_than_the_dry_vehicle(geometry: Geometry) -> None:
+    hull, all_ = geometry.outline.volume_m3, geometry.envelope_volume_m3
+    assert hull < all_ < 1.05 * hull
+    assert 60.0 < RHO * all_ < 80.0
+
+
+@pytest.mark.parametrize("end", ["bow", "stern"])
+def test_lateral_thrusters_sit_as_far_out_as_they_fit(end: Literal["bow", "stern"]) -> None:
+    """Points all over the thruster lie inside the hull; some do not when it moves 2 mm out."""
+    x = farthest_tunnel_x(ALICE.outline, end)
+    tunnel = next(t for t in ALICE.tunnels if t.name == end)
+    assert tunnel.x_m == pytest.approx(x, abs=6e-4)
+    angle, y = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(-0.5, 0.5, 21))
+    radius, side = T200_DIAMETER_M / 2.0, T200_LENGTH_M * y
+
+    def clearance(at: float) -> float:
+        along, up = at + radius * np.cos(angle), radius * np.sin(angle)
+        return float(np.min(ALICE.outline.radius_at(along) - np.hypot(side, up)))
+
+    outward = 0.002 if end == "bow" else -0.002
+    assert clearance(x) == pytest.approx(SHELL_M, abs=1e-6)
+    assert clearance(x + outward) < SHELL_M < clearance(x - outward)
+
+
+@pytest.mark.parametrize("geometry", BOTH)
+def test_water_fills_what_the_dry_vehicle_leaves_and_balances_it(geometry: Geometry) -> None:
+    """Slices of 0.1 mm: mass, centre, inertia; and what is dry has its centre at the origin."""
+    inside = entrained_water(geometry, BUOYANCY_KG, RHO)
+    assert inside.mass_kg == pytest.approx(RHO * geometry.envelope_volume_m3 - BUOYANCY_KG)
+    dry = geometry.envelope_volume_m3 * geometry.envelope_x_m - inside.mass_kg * inside.x_m / RHO
+    assert dry == pytest.approx(0.0, abs=1e-9)
+
+    outline = geometry.outline
+    x = np.arange(outline.tail_x_m, outline.nose_x_m, 1e-4) + 5e-5
+    wet = (x > inside.nose_from_x_m) | (x < inside.tail_to_x_m)
+    x, r = x[wet], outline.radius_at(x)[wet]
+    mass = RHO * np.pi * r**2 * 1e-4
+    assert mass.sum() == pytest.approx(inside.mass_kg, rel=1e-3)
+    assert (mass @ x) / mass.sum() == pytest.approx(inside.x_m, abs=1e-3)
+    pitch = mass @ ((x - inside.x_m) ** 2 + r**2 / 4.0)
+    np.testing.assert_allclose(inside.inertia_kg_m2, [mass @ r**2 / 2.0, pitch, pitch], rtol=2e-3)
+    assert outline.tail_x_m < inside.tail_to_x_m < 0 < inside.nose_from_x_m < outline.nose_x_m
+
+
+def test_a_symmetric_hull_holds_its_water_symmetrically() -> None:
+    outline = Outline(x_m=(-1.0, -0.8, 0.8, 1.0), radius_m=(0.0, 0.1, 0.1, 0.0))
+    centred = replace(
+        SPARUS2, outline=outline, mast=replace(SPARUS2.mast, height_m=1e-9),
+        pod=replace(SPARUS2.pod, body_diameter_m=1e-9),
+    )  # fmt: skip
+    inside = entrained_water(centred, 40.0, RHO)
+    assert inside.x_m == pytest.approx(0.0, abs=1e-8)
+    assert inside.nose_from_x_m == pytest.approx(-inside.tail_to_x_m, abs=1e-7)
+
+
+def test_impossible_displacements_are_refused() -> None:
+    with pytest.raises(VehicleError, match="90 kg"):
+        entrained_water(ALICE, 90.0, RHO)
+    ahead = replace(SPARUS2, outline=SPARUS2.outline.moved(0.5))
+    with pytest.raises(VehicleError):
+        entrained_water(ahead, 52.1, RHO)

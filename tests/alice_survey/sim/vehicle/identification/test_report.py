@@ -1,0 +1,120 @@
+"""The command, from files to files."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from alice_survey.app.cli.vehicle import app
+from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.files import coefficients_from_file
+from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
+from alice_survey.sim.vehicle.log import write_vehicle_log
+from tests.alice_survey.sim.vehicle.identification.manoeuvres import (
+    fly,
+    hidden,
+    measured,
+    survey_like,
+)
+from tests.alice_survey.sim.vehicle.identification.test_bollard import pull_csv
+
+TRUTH = {"X_uu": -12.0, "N_rr": -70.0}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A log, and one of another day: another current, other manoeuvres."""
+    folder = tmp_path_factory.mktemp("logs")
+    truth = hidden(TRUTH)
+    first = fly(truth, duration_s=40.0, current=(0.1, -0.05))
+    second = fly(
+        truth, duration_s=30.0, current=(-0.05, 0.1), asked=lambda time_s: survey_like(time_s + 53)
+    )
+    for seed, (name, log) in enumerate((("first", first), ("second", second))):
+        write_vehicle_log(folder / f"{name}.csv", measured(log, np.random.default_rng(seed)))
+    return folder / "first.csv", folder / "second.csv"
+
+
+def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: Path) -> None:
+    options = IdentifyOptions(free=("X_uu", "N_rr", "current"), validate=logs[1])
+    text, data = identify_report([logs[0]], tmp_path / "out", options)
+    found = data["identified"]
+    assert found["X_uu"]["identified"] == pytest.approx(-12.0, rel=0.05)
+    assert found["N_rr"]["identified"] == pytest.approx(-70.0, rel=0.05)
+    assert found["X_uu"]["factor"] == pytest.approx(12.0 / 15.23, rel=0.05)
+    assert found["current_north_mps"]["identified"] == pytest.approx(0.1, abs=0.01)
+    assert found["current_north_mps"]["factor"] is None
+    assert min(data["validation"]["fit_percent"].values()) > 80.0
+    assert data["validation"]["constant_fit_percent"]["u"] < 50.0
+    fits, before = (data["validation"][key] for key in ("fit_percent", "start_fit_percent"))
+    assert before["u"] < fits["u"] - 1.0 and before["r"] < fits["r"] - 1.0
+    assert data["validation"]["worse_than_start"] == []
+    assert any(line.split()[0] == "start" for line in text.splitlines() if line)
+    for name in ("report.txt", "coefficients.json", "fit.png", "validation.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 500
+    lines = text.splitlines()
+    assert any(line.split()[:2] == ["X_uu", "-15.23"] for line in lines)
+    # The other day's current is that day's, and is reported.
+    of_that_day = [float(number) for number in re.findall(r"(-?[\d.]+) m/s", text)[-2:]]
+    assert of_that_day == pytest.approx([-0.05, 0.1], abs=0.01)
+    read = coefficients_from_file(tmp_path / "out" / "coefficients.json")
+    assert read.values["X_uu"] == found["X_uu"]["identified"]
+    assert read.values["Y_vv"] == -321.597
+    identify_report([logs[0]], tmp_path / "again", options)
+    for name in ("coefficients.json", "report.txt", "fit.png"):
+        again = (tmp_path / "again" / name).read_bytes()
+        assert again == (tmp_path / "out" / name).read_bytes()
+
+
+def test_a_fit_that_is_worse_than_its_start_is_said_to_be(
+    logs: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Identified from a vehicle with other drag, and validated on the one it is."""
+    log = fly(hidden({}), duration_s=24.0, asked=lambda time_s: survey_like(time_s + 53))
+    write_vehicle_log(tmp_path / "own.csv", measured(log, np.random.default_rng(4)))
+    options = IdentifyOptions(free=("X_uu", "N_rr", "current"), validate=tmp_path / "own.csv")
+    text, data = identify_report([logs[0]], tmp_path / "out", options)
+    assert set(data["validation"]["worse_than_start"]) >= {"u", "r"}
+    assert "Worse than the values that the fit began with in u" in text
+
+
+@pytest.mark.parametrize("method", ["joint", "two-step"])
+def test_the_command_takes_a_bollard_pull_and_held_values(
+    logs: tuple[Path, Path], tmp_path: Path, method: str
+) -> None:
+    pull = pull_csv(tmp_path / "pull.csv", 0.0, factors=(1.0, 1.0))
+    arguments = [
+        "identify", str(logs[0]), "--method", method, "--free", "X_uu,N_rr", "--bollard",
+        str(pull), "--held", "current_north_mps=0.1", "--held", "current_east_mps=-0.05", "-o",
+        str(tmp_path / "out"), "--json",
+    ]  # fmt: skip
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    assert data["method"] == method
+    assert [round(one["factor"], 6) for one in data["thrust"]] == [1.0, 1.0]
+    assert data["identified"]["X_uu"]["identified"] == pytest.approx(-12.0, rel=0.05)
+    assert data["identified"]["N_rr"]["identified"] == pytest.approx(-70.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (IdentifyOptions(method="guess"), "'guess'"),
+        (IdentifyOptions(held=("current_north_mps",)), "current_north_mps"),
+        (IdentifyOptions(held=("X_uu=3",)), "X_uu"),
+        (IdentifyOptions(vehicle="sparus2"), "sparus2"),
+        (IdentifyOptions(given=("u",)), "'u'"),
+        (IdentifyOptions(free=("gain",)), "gain_X"),
+    ],
+)
+def test_wrong_options_are_refused(
+    logs: tuple[Path, Path], tmp_path: Path, options: IdentifyOptions, message: str
+) -> None:
+    with pytest.raises(VehicleError) as raised:
+        identify_report([logs[0]], tmp_path / "out", options)
+    assert message in str(raised.value)
+    assert not (tmp_path / "out").exists()

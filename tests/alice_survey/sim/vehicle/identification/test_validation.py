@@ -1,0 +1,59 @@
+"""How well a model predicts a log."""
+
+import numpy as np
+import pytest
+
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.identification.parameters import free_parameters
+from alice_survey.sim.vehicle.identification.validation import fit_percent, validate
+from alice_survey.sim.vehicle.identification.windows import make_windows
+from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
+
+
+def test_the_fit_is_as_defined() -> None:
+    y = np.array([[1.0], [2.0], [3.0], [6.0]])
+    assert fit_percent(y, y)[0] == 100.0
+    assert fit_percent(y, np.full((4, 1), 3.0))[0] == 0.0
+    # Off by one everywhere: 2 against the root of 4 + 1 + 0 + 9.
+    assert fit_percent(y, y + 1)[0] == pytest.approx(100 * (1 - 2 / np.sqrt(14)))
+    gappy = y.copy()
+    gappy[1] = np.nan
+    assert np.isfinite(fit_percent(gappy, y)[0])
+    assert np.isnan(fit_percent(np.ones((3, 1)), np.ones((3, 1)))[0])
+
+
+def test_the_truth_predicts_itself_and_a_wrong_model_does_not() -> None:
+    truth = hidden({"X_uu": -12.0, "N_rr": -70.0})
+    log = fly(truth, duration_s=40.0, current=(0.1, 0.05))
+    parameters = free_parameters(vehicle_from("alice"), ("X_uu", "N_rr", "current"))
+    windows = make_windows(log, vehicle_from("alice"), window_s=10.0)
+    right = validate(windows, parameters, np.array([-12.0, -70.0, 0.1, 0.05]))
+    wrong = validate(windows, parameters, np.array([-24.0, -35.0, 0.1, 0.05]))
+    assert np.all(right.fit_percent > 99.0)
+    assert np.all(right.constant_fit_percent < 60.0)
+    assert wrong.fit_percent[0] < 97.0
+    assert wrong.fit_percent[5] < 95.0
+    assert [one.horizon_s for one in right.forecasts] == [0.5, 1.0, 2.0, 5.0]
+    for one in right.forecasts:
+        assert np.all(one.model < 0.02 * one.constant + 1e-4)
+
+
+def test_a_kept_velocity_errs_by_what_the_velocity_changes() -> None:
+    log = fly(hidden({}), duration_s=20.0)
+    windows = make_windows(log, vehicle_from("alice"))
+    parameters = free_parameters(vehicle_from("alice"), ("X_uu",))
+    (found,) = validate(windows, parameters, parameters.start, horizons_s=(1.0,)).forecasts
+    starts = np.arange(0, 380, 10)
+    change = log.velocity_body[starts + 20] - log.velocity_body[starts]
+    assert found.starts == len(starts)
+    np.testing.assert_allclose(found.constant[:3], np.sqrt(np.mean(change**2, axis=0)), rtol=1e-9)
+
+
+def test_a_motion_that_follows_the_log_is_not_scored() -> None:
+    windows = make_windows(
+        fly(hidden({}), duration_s=10.0), vehicle_from("alice"), given=("p", "q")
+    )
+    parameters = free_parameters(vehicle_from("alice"), ("X_uu",))
+    found = validate(windows, parameters, parameters.start)
+    assert np.all(np.isnan(found.fit_percent[3:5]))
+    assert np.all(found.fit_percent[[0, 1, 2, 5]] > 99.0)

@@ -1,0 +1,240 @@
+"""A small closed loop for the pilot: true state, exact wrench with its lag, full dynamics."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.sim.vehicle.dynamics import (
+    Plant,
+    Scratch,
+    initial_state,
+    rk4_step,
+    scratch_for,
+)
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
+from alice_survey.sim.vehicle.pilot.guidance import steer
+from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
+from alice_survey.sim.vehicle.pilot.path import Path, path_from_legs
+from alice_survey.sim.vehicle.pilot.settings import Guidance, pilot_guidance
+from alice_survey.sim.vehicle.sea import Current, constant_current, current_at
+
+Controller = Literal["sway", "los"]
+TICK_S = 0.05
+STEPS = 5
+DEEPEST_M = 40.0
+
+
+@kernel
+def estimate_truth(state: Array, water: Array, point: Array, floor: Array, out: Array) -> None:
+    """Write the true state as a navigation would: floor is depth, slope to north, lock or not."""
+    x, y, z, s = state[3], state[4], state[5], state[6]
+    r00, r10, r20 = 1 - 2 * (y * y + z * z), 2 * (x * y + z * s), 2 * (x * z - y * s)
+    r01, r11, r21 = 2 * (x * y - z * s), 1 - 2 * (x * x + z * z), 2 * (y * z + x * s)
+    r02, r12, r22 = 2 * (x * z + y * s), 2 * (y * z - x * s), 1 - 2 * (x * x + y * y)
+    for i in range(3):
+        out[i] = state[i]
+        out[9 + i] = state[10 + i]
+    out[3], out[4], out[5] = math.atan2(r21, r22), -math.asin(r20), math.atan2(r10, r00)
+    out[6] = state[7] + r00 * water[0] + r10 * water[1]
+    out[7] = state[8] + r01 * water[0] + r11 * water[1]
+    out[8] = state[9] + r02 * water[0] + r12 * water[1]
+    north = state[0] + r00 * point[0] + r01 * point[1] + r02 * point[2]
+    depth = state[2] + r20 * point[0] + r21 * point[1] + r22 * point[2]
+    out[12] = floor[0] + floor[1] * north - depth if floor[2] > 0.0 else math.nan
+    out[13] = out[12]
+
+
+@kernel
+def _fly(
+    first: int,
+    state: Array,
+    load: Array,
+    floor: Array,
+    keep: Array,
+    plant: Plant,
+    current: Current,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+    scratch: Scratch,
+    room: Array,
+    rows: Array,
+) -> None:
+    estimate, wrench, water, command = room[:14], room[14:20], room[20:26], room[26:]
+    step = 0.05 / 5
+    for k in range(rows.shape[0]):
+        time_s = (first + k) * 0.05
+        current_at(current, time_s, state[2], water)
+        estimate_truth(state, water, guidance.point_body_m, floor, estimate)
+        steer(time_s, 0.05, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+        rows[k, 0] = time_s
+        for i in range(14):
+            rows[k, 1 + i] = estimate[i]
+        for i in range(13):
+            rows[k, 15 + i] = pilot.report[i]
+        for i in range(6):
+            rows[k, 28 + i] = wrench[i]
+        for i in range(5):
+            for j in range(6):
+                load[j] = wrench[j] + keep[j] * (load[j] - wrench[j])
+            rk4_step(time_s + i * step, step, state, command, load, plant, current, scratch)
+
+
+@dataclass(eq=False)
+class Flight:
+    """A vehicle under way; `fly` takes it further."""
+
+    path: Path
+    guidance: Guidance
+    gains: Gains
+    plant: Plant
+    current: Current
+    state: Array
+    floor: Array
+    pilot: PilotState
+    load: Array
+    ticks: int = 0
+
+    def fly(self, seconds: float) -> "Rows":
+        """Fly on."""
+        rows = np.zeros((round(seconds / TICK_S), 34))
+        thrusters = len(self.state) - 13
+        lag_s = np.zeros(6)
+        lag_s[list(DEGREES)] = np.maximum(self.gains.axes[: len(DEGREES), LAG] - TICK_S / 2, 0.0)
+        keep = np.exp(-TICK_S / STEPS / np.maximum(lag_s, 1e-6))
+        _fly(
+            self.ticks, self.state, self.load, self.floor, keep, self.plant, self.current,
+            self.path, self.guidance, self.gains, self.pilot, scratch_for(thrusters),
+            np.zeros(26 + thrusters), rows,
+        )  # fmt: skip
+        self.ticks += len(rows)
+        return Rows(rows)
+
+
+@dataclass(eq=False)
+class Rows:
+    """What happened, tick by tick."""
+
+    table: Array
+
+    @property
+    def time_s(self) -> Array:
+        return self.table[:, 0]
+
+    @property
+    def estimate(self) -> Array:
+        return self.table[:, 1:15]
+
+    @property
+    def report(self) -> Array:
+        return self.table[:, 15:28]
+
+    @property
+    def wrench(self) -> Array:
+        return self.table[:, 28:]
+
+    def on_lines(self) -> "Rows":
+        """The part on survey lines."""
+        following = self.report[:, slot.PHASE] == slot.FOLLOW
+        return Rows(self.table[following & (self.report[:, slot.LINE] >= 0)])
+
+    @property
+    def cross_m(self) -> Array:
+        return self.report[:, slot.CROSS]
+
+    @property
+    def heading_error_rad(self) -> Array:
+        off = self.estimate[:, vector.HEADING] - self.report[:, slot.PATH_HEADING]
+        return np.asarray(np.angle(np.exp(1j * off)))
+
+    def phases(self) -> list[int]:
+        """Phases in the order in which they came."""
+        phase = self.report[:, slot.PHASE].astype(int)
+        return [int(phase[0]), *(int(p) for p in phase[1:][np.diff(phase) != 0])]
+
+
+@cache
+def gains_of(name: str, speed_mps: float = 0.2) -> Gains:
+    return gains_for(vehicle_from(name), speed_mps)
+
+
+def straight(length_m: float, heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
+    return path_from_legs([(0.0, 0.0)], [heading_rad], [length_m], [0.0], [0], 2.0, speed_mps)
+
+
+def lawnmower(lines: int, length_m: float, speed_mps: float = 0.2, run_m: float = 0.5) -> Path:
+    """Lines 1 m apart, to and fro along north, with half circles between their run-ins."""
+    legs: list[tuple[tuple[float, float], float, float, float, int]] = []
+    heading = 0.0
+    for i in range(lines):
+        low, high, way = (
+            (-run_m, length_m + run_m, 1) if i % 2 == 0 else (length_m + run_m, -run_m, -1)
+        )
+        legs.append(((low, float(i)), heading, run_m, 0.0, -1))
+        legs.append(((low + way * run_m, float(i)), heading, length_m, 0.0, i))
+        legs.append(((high - way * run_m, float(i)), heading, run_m, 0.0, -1))
+        if i + 1 < lines:
+            legs.append(((high, float(i)), heading, math.pi / 2, 2.0 * way, -1))
+            heading += way * math.pi
+    start, headings, length, curvature, line = zip(*legs, strict=True)
+    return path_from_legs(start, headings, length, curvature, line, 2.0, speed_mps)
+
+
+Move = tuple[str, float] | tuple[str, float, int]
+
+
+def with_stops(moves: Sequence[Move], heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
+    """A path of moves: ("go", m) with a line's index if it is one, ("spot", rad), ("step", m)."""
+    place, heading = np.zeros(2), heading_rad
+    rows = []
+    for kind, amount, *line in moves:
+        turn = amount if kind == "spot" else 0.0
+        side = -math.copysign(math.pi / 2, amount) if kind == "step" else 0.0
+        length = 0.0 if kind == "spot" else abs(amount)
+        rows.append(
+            (tuple(place), heading - side, length, 0.0, line[0] if line else -1, turn, side)
+        )
+        place = place + length * np.array([math.cos(heading - side), math.sin(heading - side)])
+        heading += turn
+    start, headings, lengths, curvature, lines, turns, sides = zip(*rows, strict=True)
+    return path_from_legs(
+        start, headings, lengths, curvature, lines, 2.0, speed_mps, turns, sides
+    )  # fmt: skip
+
+
+def launch(
+    path: Path,
+    name: str = "alice",
+    controller: Controller = "sway",
+    *,
+    current: tuple[float, float] = (0.0, 0.0),
+    at_ned: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    heading_rad: float = 0.0,
+    floor_m: float = 15.0,
+    slope: float = 0.0,
+    following: bool = False,
+) -> Flight:
+    """A vehicle at rest over a plane; `following`: at depth, with the path begun."""
+    craft, gains = vehicle_from(name), gains_of(name, path.speed_mps)
+    guidance = pilot_guidance(gains, path, controller, most_depth_m=DEEPEST_M)
+    pilot = new_pilot()
+    if following:
+        pilot.report[slot.PHASE] = slot.FOLLOW
+        at_ned = (at_ned[0], at_ned[1], floor_m - path.altitude_m - guidance.point_body_m[2])
+    n = len(craft.thrusters)
+    return Flight(
+        path, guidance, gains, craft.plant, constant_current(*current),
+        initial_state(np.array(at_ned), np.array([0.0, 0.0, heading_rad]), n),
+        np.array([floor_m, slope, 1.0]), pilot, np.zeros(6),
+    )  # fmt: skip

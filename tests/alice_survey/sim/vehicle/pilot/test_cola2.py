@@ -1,0 +1,108 @@
+"""COLA2's law by itself: where it heads, its steady offset, its circle, its captain's time."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from alice_survey.core.config import VehicleConfig
+from alice_survey.sim.vehicle.pilot.cola2 import (
+    Cola2Settings,
+    aim,
+    circling_m,
+    steady_drift,
+    timeout_s,
+)
+from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.pilot.mission import COLA2, mission_of
+from alice_survey.sim.vehicle.pilot.steps import (
+    BY_ALTITUDE,
+    BY_DEPTH,
+    COLUMNS,
+    SPEED,
+)
+from missions.route.energy import craft_of
+
+FAR = 1000.0
+
+
+@given(
+    course=st.floats(-math.pi, math.pi),
+    along=st.floats(10.0, 900.0),
+    cross=st.floats(-1.9, 1.9),
+    delta=st.floats(2.0, 8.0),
+)
+def test_the_point_aimed_at_is_on_the_section_at_the_look_ahead(
+    course: float, along: float, cross: float, delta: float
+) -> None:
+    c, s = math.cos(course), math.sin(course)
+    north, east = along * c - cross * s, along * s + cross * c
+    heading = aim(north, east, 0.0, 0.0, FAR * c, FAR * s, delta)
+    # Fossen 2011, equation 10.72: the point is delta away from the vehicle, and on the straight.
+    point = np.array([north + delta * math.cos(heading), east + delta * math.sin(heading)])
+    assert abs(point @ [-s, c]) < 1e-6
+    assert point @ [c, s] > along
+
+
+@pytest.mark.parametrize(
+    ("place", "bearing"),
+    [
+        ((-5.0, 1.0), math.atan2(-1.0, 5.0)),  # long before it: to its start
+        ((11.0, 1.0), math.atan2(-1.0, -1.0)),  # past its end: back to it
+        ((9.0, 1.0), math.atan2(-1.0, 1.0)),  # within the look-ahead of its end: to the end
+        ((5.0, 3.0), -math.pi / 2),  # farther off than the look-ahead: straight towards it
+    ],
+)
+def test_the_ends_of_a_section(place: tuple[float, float], bearing: float) -> None:
+    assert aim(*place, 0.0, 0.0, 10.0, 0.0, 2.0) == pytest.approx(bearing, abs=1e-9)
+
+
+@pytest.mark.parametrize("current", [0.02, 0.05, 0.1, -0.1, 0.2, 0.3])
+def test_a_current_across_holds_it_off_by_the_look_ahead_times_the_sine_of_the_drift(
+    current: float,
+) -> None:
+    """A vehicle that heads where it is wanted to and is carried along by the water."""
+    delta, speed, north, east = 3.0, 0.2, 0.0, 0.0
+    for _ in range(12000):
+        heading = aim(north, east, 0.0, 0.0, FAR, 0.0, delta)
+        sway = current * math.cos(heading)
+        north += 0.05 * (speed * math.cos(heading) - sway * math.sin(heading))
+        east += 0.05 * (speed * math.sin(heading) + sway * math.cos(heading))
+    wanted = math.copysign(delta * steady_drift(current, speed), current)
+    assert east == pytest.approx(wanted, rel=1e-3)
+    assert 0.0 < abs(wanted) < delta
+
+
+def test_in_weak_currents_the_offset_is_that_of_the_drift_angle() -> None:
+    for ratio in (1e-3, 0.01, 0.05):
+        assert steady_drift(0.2 * ratio, 0.2) == pytest.approx(math.tan(ratio), rel=2 * ratio**2)
+    assert steady_drift(0.0, 0.2) == 0.0
+    # It grows with the current, and no current turns the vehicle right across.
+    drifts = [steady_drift(current, 0.2) for current in np.linspace(0.0, 5.0, 50)]
+    assert np.all(np.diff(drifts) > 0.0)
+    assert drifts[-1] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"), [("alice", 0.34, 0.44), ("sparus2", 0.55, 0.72)]
+)
+def test_the_circle_is_that_of_a_simulated_vehicle(name: str, least: float, most: float) -> None:
+    """Bounds: 10 % about what `test_mission_flight` measures."""
+    vehicle = craft_of(VehicleConfig(name=name))
+    circle = circling_m(gains_for(vehicle, 0.2), 0.2)
+    assert least < circle < most
+    assert circling_m(gains_for(vehicle, 0.4), 0.4) > circle
+
+
+def test_the_captain_waits_twice_the_way_and_half_a_minute() -> None:
+    row = np.zeros(COLUMNS)
+    row[[SPEED, BY_DEPTH]] = 0.2, 1.0
+    settings = mission_of(COLA2, row[None], Cola2Settings()).settings
+    assert timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * math.sqrt(2) * 10 / 0.2)
+    assert timeout_s(row, 1.0, -12.0, settings) == pytest.approx(30 + 2 * 12 / 0.3)
+    row[[BY_DEPTH, BY_ALTITUDE]] = 0.0, 1.0  # by altitude: as if through the range of a DVL
+    assert timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * 200 / 0.3)
+    row[SPEED] = 3.0  # no faster than the pilot's parameter
+    assert timeout_s(row, 900.0, 1.0, settings) == pytest.approx(30 + 2 * math.sqrt(2) * 900 / 0.5)

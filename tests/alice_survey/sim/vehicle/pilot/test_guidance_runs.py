@@ -1,0 +1,261 @@
+"""Guidance in a closed loop: true state, exact wrench with its lag, full dynamics, currents."""
+
+import math
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.pilot import gains as g
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot import safety
+from alice_survey.sim.vehicle.pilot.memory import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import (
+    Controller,
+    Rows,
+    launch,
+    lawnmower,
+    straight,
+)
+from tests.oracles_guidance import los_offset_m
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.mark.parametrize(
+    ("name", "speed_mps", "towards_deg"),
+    [
+        ("sparus2", 0.1, 90.0), ("sparus2", 0.05, 270.0), ("sparus2", 0.1, 45.0),
+        ("sparus2", 0.1, 135.0), ("alice", 0.1, 90.0),
+    ],
+)  # fmt: skip
+def test_los_settles_at_the_offset_that_the_current_gives(
+    name: str, speed_mps: float, towards_deg: float
+) -> None:
+    flight = launch(straight(100.0), name, "los", current=(speed_mps, towards_deg), following=True)
+    rows = flight.fly(300.0)
+    settled = rows.cross_m[-600:]
+    across = speed_mps * math.sin(math.radians(towards_deg))
+    along = speed_mps * math.cos(math.radians(towards_deg))
+    expected = los_offset_m(flight.guidance.look_ahead_m, 0.2, across, along)
+    assert abs(expected) > 0.3
+    assert settled.mean() == pytest.approx(expected, rel=0.02)
+    assert np.ptp(settled) < 0.05 * abs(expected)
+    crab = math.atan2(expected, flight.guidance.look_ahead_m)
+    assert -rows.heading_error_rad[-1] == pytest.approx(crab, abs=0.01)
+
+
+@pytest.mark.parametrize("towards_deg", [90.0, 0.0, 225.0])
+def test_sway_holds_lines_and_heading_in_a_current(towards_deg: float) -> None:
+    flight = launch(lawnmower(4, 8.0), current=(0.1, towards_deg))
+    rows = flight.fly(420.0)
+    assert rows.phases() == [DIVE, APPROACH, FOLLOW, ASCEND, DONE]
+    lines = rows.on_lines()
+    assert sorted(set(lines.report[:, slot.LINE])) == [0, 1, 2, 3]
+    assert 1e-5 < rms(lines.cross_m) < 0.03
+    assert 1e-4 < rms(lines.heading_error_rad) < math.radians(1.0)
+    assert np.all(lines.report[:, slot.BY_SWAY] == 1.0)
+    assert rms(lines.estimate[:, vector.ALTITUDE] - 2.0) < 0.05
+    turns = Rows(rows.table[(rows.report[:, slot.PHASE] == FOLLOW)])
+    assert 0.0 < np.abs(turns.cross_m).max() < 0.12
+    # Lines last as long as their length at the wanted speed over ground.
+    assert len(lines.table) * 0.05 == pytest.approx(4 * 8.0 / 0.2, rel=0.02)
+
+
+@pytest.mark.parametrize("towards_deg", [90.0, 0.0])
+def test_a_vehicle_without_sway_flies_every_line_in_order(towards_deg: float) -> None:
+    flight = launch(lawnmower(4, 8.0), "sparus2", "los", current=(0.1, towards_deg))
+    rows = flight.fly(420.0)
+    assert rows.phases() == [DIVE, APPROACH, FOLLOW, ASCEND, DONE]
+    following = rows.report[rows.report[:, slot.PHASE] == FOLLOW]
+    legs = following[:, slot.LEG].astype(int)
+    assert set(np.diff(legs)) <= {0, 1}
+    assert legs[0] == 0
+    assert legs[-1] == 4 * 3 + 3 - 1
+    assert not np.any(following[:, slot.BY_SWAY])
+    assert not np.any(rows.wrench[:, 1])
+    for line in range(4):
+        seconds = 0.05 * np.count_nonzero(following[:, slot.LINE] == line)
+        assert 0.6 * 8.0 / 0.2 < seconds < 1.6 * 8.0 / 0.2
+
+
+def test_surge_over_ground_is_held_against_a_head_current() -> None:
+    flight = launch(straight(60.0), "alice", "sway", current=(0.15, 180.0), following=True)
+    rows = flight.fly(120.0)
+    assert rows.estimate[-200:, vector.U].mean() == pytest.approx(0.2, abs=0.003)
+    # The thrust is the drag at the speed through the water.
+    quadratic = -flight.gains.body.quadratic[0, 0]
+    assert rows.wrench[-200:, 0].mean() == pytest.approx(quadratic * 0.35**2, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "speed_mps", "current"),
+    [
+        ("alice", 0.2, (0.0, 0.0)), ("alice", 0.5, (0.0, 0.0)), ("alice", 1.0, (0.0, 0.0)),
+        ("sparus2", 0.2, (0.05, 0.0)), ("sparus2", 0.2, (0.05, 180.0)),
+    ],
+)  # fmt: skip
+def test_speed_is_reached_without_overshoot(
+    name: str, speed_mps: float, current: tuple[float, float]
+) -> None:
+    path = straight(100.0, speed_mps=speed_mps)
+    controller: Literal["sway", "los"] = "sway" if name == "alice" else "los"
+    flight = launch(path, name, controller, current=current, following=True)
+    surge = flight.fly(60.0).estimate[:, vector.U]
+    assert surge.max() < 1.05 * speed_mps
+    assert surge[-200:].mean() == pytest.approx(speed_mps, rel=0.01 if name == "alice" else 0.02)
+    assert name != "alice" or np.argmax(surge > 0.9 * speed_mps) * 0.05 < 15.0
+
+
+def test_far_off_the_path_it_heads_for_it_and_near_it_sways() -> None:
+    flight = launch(straight(40.0), at_ned=(0.0, 3.0, 0.0), following=True)
+    rows = flight.fly(120.0)
+    by_sway = rows.report[:, slot.BY_SWAY]
+    assert np.count_nonzero(np.diff(by_sway)) == 1  # hysteresis: no chatter
+    near = np.argmax(by_sway)
+    assert abs(rows.cross_m[near]) == pytest.approx(flight.guidance.near_m, abs=0.02)
+    assert np.abs(rows.heading_error_rad[: near - 1]).max() > math.radians(20.0)
+    assert np.abs(rows.heading_error_rad[-400:]).max() < math.radians(0.5)
+    assert np.abs(rows.cross_m[-400:]).max() < 0.01
+
+
+def test_between_the_switches_it_stays_as_it_is() -> None:
+    for at_m, flag in ((0.6, 0.0), (0.6, 1.0)):
+        flight = launch(straight(40.0), at_ned=(0.0, at_m + 0.05, 0.0), following=True)
+        flight.pilot.report[slot.BY_SWAY] = flag
+        assert flight.guidance.near_m < at_m < flight.guidance.far_m
+        assert flight.fly(0.5).report[-1, slot.BY_SWAY] == flag
+
+
+def test_a_far_vehicle_with_sway_comes_back_in_any_current() -> None:
+    # Where a current alone would hold the original guidance 1 m off for ever.
+    flight = launch(straight(80.0), at_ned=(0.0, 2.0, 0.0), current=(0.1, 90.0), following=True)
+    rows = flight.fly(150.0)
+    assert los_offset_m(flight.guidance.look_ahead_m, 0.2, 0.1) > flight.guidance.near_m
+    assert rows.report[-1, slot.BY_SWAY] == 1.0
+    assert abs(rows.cross_m[-1]) < 0.02
+
+
+@pytest.mark.parametrize(("name", "controller"), [("alice", "sway"), ("sparus2", "los")])
+def test_the_start_is_reached_from_afar_against_the_current(
+    name: str, controller: Controller
+) -> None:
+    path = lawnmower(2, 6.0)
+    flight = launch(
+        path, name, controller, current=(0.1, 150.0), at_ned=(-6.0, 14.0, 0.0), heading_rad=2.0
+    )
+    rows = flight.fly(300.0)
+    assert rows.phases()[:3] == [DIVE, APPROACH, FOLLOW]
+    first = rows.on_lines()
+    assert first.report[0, slot.LINE] == 0
+    began = rows.time_s[np.argmax(rows.report[:, slot.PHASE] == FOLLOW)]
+    assert began < 200.0
+    if name == "alice":
+        assert np.abs(first.cross_m).max() < 0.05
+
+
+def test_carried_off_it_goes_back_to_where_it_left_the_path() -> None:
+    flight = launch(straight(40.0), following=True)
+    left = flight.fly(60.0).report[-1, slot.ALONG]
+    flight.state[1] += 12.0
+    rows = flight.fly(150.0)
+    assert rows.phases() == [APPROACH, FOLLOW]
+    back = np.argmax(np.diff(rows.report[:, slot.PHASE]) > 0) + 1
+    resumed = rows.report[back:]
+    # From before the place, on the path when there.
+    assert resumed[0, slot.ALONG] == pytest.approx(left - flight.guidance.way_in_m, abs=0.3)
+    there = np.argmax(resumed[:, slot.ALONG] > left)
+    assert np.abs(resumed[there:, slot.CROSS]).max() < 0.03
+
+
+def test_carried_off_again_and_again_it_gives_up() -> None:
+    flight = launch(straight(200.0), following=True)
+    phases: list[int] = []
+    for _ in range(4):
+        flight.fly(20.0)
+        flight.state[1] += 12.0
+        phases = flight.fly(150.0).phases()
+        if phases[-1] == ABORT:
+            break
+    assert flight.pilot.memory[slot.RETURNS] == flight.guidance.limits.most_returns + 1
+    assert phases[-1] == ABORT
+    assert flight.pilot.report[slot.REASON] == safety.LOST_PATH
+
+
+def test_a_current_too_strong_for_the_vehicle_ends_in_an_explained_abort() -> None:
+    flight = launch(straight(40.0), "sparus2", "los", current=(2.5, 90.0))
+    rows = flight.fly(400.0)
+    assert rows.phases()[-1] == ABORT
+    assert rows.report[-1, slot.REASON] in (safety.NO_DIVE, safety.NO_APPROACH)
+    assert rows.report[-1, slot.AT_SURFACE] == 1.0
+
+
+def test_no_bottom_within_the_depth_allowed_ends_the_dive() -> None:
+    flight = launch(straight(40.0))
+    flight.floor[2] = 0.0
+    rows = flight.fly(360.0)
+    assert rows.phases() == [DIVE, ABORT]
+    assert rows.report[-1, slot.REASON] == safety.NO_BOTTOM
+    assert 39.0 < rows.estimate[:, vector.DEPTH].max() < 40.0
+    # From rest to a depth far away: the speed is the one allowed, and no integral winds up.
+    sinking = np.diff(rows.estimate[400:2000, vector.DEPTH]) / 0.05
+    assert 0.8 < sinking.mean() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.05
+
+
+def test_a_blind_dive_goes_no_deeper_than_it_may_unseeing() -> None:
+    flight = launch(straight(40.0))
+    flight.guidance = flight.guidance._replace(
+        limits=flight.guidance.limits._replace(blind_depth_m=12.0)
+    )
+    flight.floor[2] = 0.0
+    rows = flight.fly(150.0)
+    assert rows.phases() == [DIVE, ABORT]
+    assert 11.9 < rows.estimate[:, vector.DEPTH].max() < 12.1
+
+
+@pytest.mark.parametrize("slope", [-0.1, 0.1])
+def test_a_slope_is_followed_without_lag(slope: float) -> None:
+    flight = launch(straight(60.0), following=True, slope=slope)
+    rows = flight.fly(150.0)
+    settled = rows.estimate[1200:, vector.ALTITUDE]
+    # Pitch and the point's lever are seen by the altitude itself.
+    assert settled.mean() == pytest.approx(2.0, abs=0.02)
+    assert np.ptp(settled) < 0.05
+
+
+@pytest.mark.parametrize("name", ["alice", "sparus2"])
+def test_fast_paths_slow_down_for_turns_that_are_too_tight(name: str) -> None:
+    controller: Controller = "sway" if name == "alice" else "los"
+    flight = launch(
+        lawnmower(3, 8.0, speed_mps=0.5),
+        name,
+        controller,
+        following=True,
+        at_ned=(-0.5, 0.0, 0.0),
+    )
+    rows = flight.fly(110.0)
+    yaw = flight.gains.axes[g.YAW, g.FASTEST]
+    on_arcs = rows.report[(rows.report[:, slot.LEG].astype(int) % 4) == 3]
+    middle = (on_arcs[:, slot.ALONG] > 0.6) & (on_arcs[:, slot.ALONG] < 1.0)
+    assert np.count_nonzero(middle) > 10
+    limit = min(yaw, flight.gains.axes[g.SWAY, g.FASTEST] / 0.55 if name == "alice" else yaw) / 2.0
+    assert on_arcs[middle, slot.WANTED_SURGE].max() < 1.1 * limit
+    assert rows.on_lines().report[:, slot.WANTED_SURGE].max() == pytest.approx(0.5, abs=0.01)
+    # Braking begins before the turn.
+    run_outs = rows.report[(rows.report[:, slot.LEG].astype(int) % 4) == 2]
+    assert run_outs[:, slot.WANTED_SURGE].min() < 0.5 * (0.5 + limit)
+
+
+def test_mirrored_currents_mirror_the_flight() -> None:
+    crossings = []
+    for towards_deg in (90.0, 270.0):
+        flight = launch(
+            straight(30.0), "sparus2", "los", current=(0.08, towards_deg), following=True
+        )
+        flight.guidance = flight.guidance._replace(point_body_m=np.array([0.55, 0.0, 0.08]))
+        crossings.append(flight.fly(100.0).cross_m)
+    np.testing.assert_allclose(crossings[0], -crossings[1], atol=1e-6)

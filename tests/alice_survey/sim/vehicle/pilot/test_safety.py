@@ -1,0 +1,231 @@
+"""Safety: each reason to abort, none without one, and what an abort does."""
+
+import math
+
+import numpy as np
+import pytest
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.pilot import gains as g
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot import safety
+from alice_survey.sim.vehicle.pilot.guidance import steer
+from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
+from alice_survey.sim.vehicle.pilot.safety import REASONS, SafetyLimits
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import Flight, launch, straight
+
+LIMITS = SafetyLimits(1.0, 20.0, math.radians(30.0), 20.0, 90.0, 3.0, 5000.0)
+TICK_S = 0.05
+
+
+def calm(altitude_m: float = 2.0, pitch_rad: float = 0.0, depth_m: float = 13.0) -> Array:
+    estimate = np.zeros(vector.ESTIMATE)
+    estimate[[vector.ALTITUDE, vector.PITCH, vector.DEPTH]] = altitude_m, pitch_rad, depth_m
+    estimate[vector.CLEARANCE] = altitude_m
+    return estimate
+
+
+def watched(
+    pilot: PilotState, estimate: Array, seconds: float, speed: float = 0.2, time_s: float = 0.0
+) -> tuple[int, float]:
+    """The reason, and after how long, while progress grows at a speed."""
+    for k in range(round(seconds / TICK_S)):
+        progress = time_s + speed * k * TICK_S
+        reason = safety.watch(time_s, TICK_S, estimate, progress, LIMITS, pilot)
+        if reason:
+            return reason, (k + 1) * TICK_S
+    return safety.NONE, math.nan
+
+
+def pilot_in(phase: int) -> PilotState:
+    pilot = new_pilot()
+    pilot.memory[slot.FLOOR_KNOWN] = 1.0
+    pilot.report[slot.PHASE] = phase
+    return pilot
+
+
+@pytest.mark.parametrize("phase", [slot.DIVE, slot.APPROACH, slot.FOLLOW])
+def test_a_calm_mission_goes_on(phase: int) -> None:
+    assert watched(pilot_in(phase), calm(), 200.0)[0] == safety.NONE
+
+
+@pytest.mark.parametrize(
+    ("estimate", "phase", "speed", "reason", "after_s"),
+    [
+        (calm(altitude_m=0.9), slot.FOLLOW, 0.2, safety.TOO_LOW, 10.0),
+        (calm(altitude_m=0.9), slot.DIVE, 0.2, safety.TOO_LOW, 10.0),
+        (calm(altitude_m=0.49), slot.FOLLOW, 0.2, safety.TOO_LOW, 1.0),
+        (calm(altitude_m=0.49), slot.DIVE, 0.2, safety.TOO_LOW, 1.0),
+        (calm(pitch_rad=0.6), slot.FOLLOW, 0.2, safety.TOO_STEEP, 1.0),
+        (calm(pitch_rad=-0.6), slot.APPROACH, 0.2, safety.TOO_STEEP, 1.0),
+        (calm(altitude_m=math.nan), slot.FOLLOW, 0.2, safety.NO_BOTTOM, 20.0),
+        (calm(depth_m=20.1), slot.DIVE, 0.2, safety.TOO_DEEP, TICK_S),
+        (calm(), slot.DIVE, 0.0, safety.NO_DIVE, 90.0),
+        (calm(), slot.APPROACH, -0.1, safety.NO_APPROACH, 90.0),
+        (calm(), slot.FOLLOW, 0.0005, safety.NO_PROGRESS, 90.0),
+    ],
+)
+def test_each_reason_comes_after_its_time(
+    estimate: Array, phase: int, speed: float, reason: int, after_s: float
+) -> None:
+    found, after = watched(pilot_in(phase), estimate, 120.0, speed)
+    assert found == reason
+    assert after == pytest.approx(after_s, abs=2.1 * TICK_S)
+
+
+def test_without_bottom_lock_the_navigation_decides_if_it_may() -> None:
+    blind, limits = calm(altitude_m=math.nan), LIMITS._replace(blind_sigma_m=0.5)
+    for sigma_m, goes_on in ((0.4, True), (0.6, False), (math.nan, False)):
+        pilot = pilot_in(slot.FOLLOW)
+        pilot.memory[slot.SIGMA_M], pilot.memory[slot.LOST_S] = sigma_m, 30.0
+        safety.mind_floor(10.0, blind, limits, pilot)
+        assert pilot.memory[slot.PACE] == (1.0 if goes_on else 0.0)
+        reason = safety.watch(0.0, TICK_S, blind, 1.0, limits, pilot)
+        assert reason == (safety.NONE if goes_on else safety.NO_BOTTOM)
+
+
+def test_a_mission_that_takes_too_long_ends() -> None:
+    assert watched(pilot_in(slot.FOLLOW), calm(), 1.0, time_s=5000.1)[0] == safety.TOO_LONG
+
+
+def test_the_dive_may_begin_out_of_reach_of_the_bottom() -> None:
+    assert watched(pilot_in(slot.DIVE), calm(altitude_m=math.nan), 80.0)[0] == safety.NONE
+
+
+def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
+    pilot = pilot_in(slot.FOLLOW)
+    for k in range(100):
+        # 0.9 s of false echoes, a good one; 19 s without lock, a good one.
+        assert watched(pilot, calm(altitude_m=0.1), 0.9, time_s=40.0 * k)[0] == safety.NONE
+        assert watched(pilot, calm(), 0.1, time_s=40.0 * k + 10)[0] == safety.NONE
+        lost = watched(pilot, calm(altitude_m=math.nan), 19.0, time_s=40.0 * k + 15)
+        assert lost[0] == safety.NONE
+        assert watched(pilot, calm(), 0.1, time_s=40.0 * k + 35)[0] == safety.NONE
+
+
+def test_echoes_between_gaps_still_show_a_low_altitude() -> None:
+    pilot, reason = pilot_in(slot.FOLLOW), 0
+    for k in range(200):
+        altitude = 0.4 if k % 4 == 0 else math.nan
+        reason = reason or safety.watch(0.0, TICK_S, calm(altitude), 0.2 * k, LIMITS, pilot)
+    assert reason == safety.TOO_LOW
+
+
+@pytest.mark.parametrize("phase", [slot.ASCEND, slot.DONE, slot.ABORT])
+def test_on_the_way_up_nothing_aborts(phase: int) -> None:
+    assert watched(pilot_in(phase), calm(0.1, 1.0, 30.0), 200.0, 0.0)[0] == safety.NONE
+
+
+def test_every_reason_has_words() -> None:
+    borrowed = vars(vector).keys() | vars(slot).keys()
+    codes = [
+        value
+        for name, value in vars(safety).items()
+        if name.isupper() and type(value) is int and name not in borrowed
+    ]
+    assert sorted(REASONS) == sorted(codes)
+    assert len(set(REASONS.values())) == len(REASONS)
+
+
+def _steered(flight: Flight, estimate: Array) -> Array:
+    wrench = np.full(6, math.nan)
+    steer(
+        10.0,
+        TICK_S,
+        estimate,
+        flight.path,
+        NO_MISSION,
+        flight.guidance,
+        flight.gains,
+        flight.pilot,
+        wrench,
+    )
+    return wrench
+
+
+@pytest.mark.parametrize("lost", range(12))
+def test_without_navigation_the_vehicle_pushes_itself_up(lost: int) -> None:
+    flight = launch(straight(10.0), following=True)
+    estimate = calm()
+    assert _steered(flight, estimate)[2] > -1.0
+    estimate[lost] = math.nan
+    for _ in range(3):
+        wrench = _steered(flight, estimate)
+        expected = g.STEADY_SHARE * flight.gains.axes[g.HEAVE, g.LEAST]
+        np.testing.assert_array_equal(wrench, [0, 0, expected, 0, 0, 0])
+    assert flight.pilot.report[slot.PHASE] == slot.ABORT
+    assert flight.pilot.report[slot.REASON] == safety.NO_NAVIGATION
+    assert np.all(np.isfinite(flight.pilot.memory[: slot.BEST]))
+
+
+def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
+    flight = launch(straight(50.0), following=True, current=(0.1, 90.0))
+    flight.fly(20.0)
+    flight.floor[0] -= 1.8  # a rock: 0.2 m below the port
+    rows = flight.fly(90.0)
+    assert rows.phases() == [slot.FOLLOW, slot.ABORT]
+    assert rows.report[-1, slot.REASON] == safety.TOO_LOW
+    low_s = rows.time_s[np.argmax(rows.report[:, slot.PHASE] == slot.ABORT)] - rows.time_s[0]
+    assert 0.9 < low_s < 1.2
+    assert rows.estimate[:, vector.CLEARANCE].min() > 0.1
+    assert rows.report[-1, slot.AT_SURFACE] == 1.0
+    assert rows.estimate[-1, vector.DEPTH] < 0.3
+    # It rises at the speed that is allowed, without turning round.
+    rising = -np.diff(rows.estimate[:, vector.DEPTH]) / TICK_S
+    assert 0.8 < rising.max() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.2
+    assert np.abs(rows.estimate[:, vector.HEADING]).max() < math.radians(15.0)
+
+
+@pytest.mark.parametrize("part", [vector.ALTITUDE, vector.CLEARANCE])
+def test_either_too_low_stops_the_surge_and_raises_the_vehicle(part: int) -> None:
+    pilot, estimate = pilot_in(slot.FOLLOW), calm()
+    for clear_m, pace, rise_m in ((1.5, 1.0, 0.0), (1.125, 0.5, 0.125), (0.9, 0.0, 0.35)):
+        estimate[part] = clear_m
+        depth = safety.mind_floor(13.0, estimate, LIMITS, pilot)
+        assert depth == pytest.approx(13.0 - rise_m)
+        assert pilot.memory[slot.PACE] == pytest.approx(pace)
+
+
+def test_over_a_rock_it_stops_climbs_and_goes_on() -> None:
+    flight = launch(straight(50.0), following=True)
+    flight.fly(20.0)
+    flight.floor[0] -= 1.3  # a rock: 0.7 m below the port
+    rows = flight.fly(60.0)
+    assert rows.phases() == [slot.FOLLOW]
+    assert rows.estimate[:, vector.CLEARANCE].min() > 0.6
+    low = rows.estimate[:, vector.CLEARANCE] < 1.0
+    assert 0.5 < low.sum() * TICK_S < LIMITS.climb_s
+    assert np.all(rows.report[low, slot.WANTED_SURGE] == 0.0)
+    assert rows.estimate[-1, vector.ALTITUDE] == pytest.approx(2.0, abs=0.1)
+    assert rows.report[-1, slot.WANTED_SURGE] == pytest.approx(0.2)
+
+
+def test_without_the_bottom_it_stops_rises_as_the_floor_did_and_goes_on_when_it_hears() -> None:
+    flight = launch(straight(50.0), following=True, slope=-0.4)
+    flight.fly(60.0)
+    floor = flight.floor.copy()
+    flight.floor[2] = 0.0
+    rows = flight.fly(15.0)
+    north, depth = rows.estimate[:, vector.NORTH], rows.estimate[:, vector.DEPTH]
+    clear = floor[0] + floor[1] * (north + 0.55) - depth - 0.08
+    assert clear.min() > 1.8
+    assert 0.005 < np.ptp(north[200:]) < 0.1  # at full speed: 1 m
+    assert 0.2 < depth[0] - depth[-1] < 0.7
+    flight.floor[2] = 1.0
+    rows = flight.fly(30.0)
+    assert rows.phases() == [slot.FOLLOW]
+    assert rows.estimate[-1, vector.U] == pytest.approx(0.2, abs=0.02)
+
+
+def test_depth_is_held_while_the_bottom_is_not_heard() -> None:
+    flight = launch(straight(50.0), following=True, slope=-0.05)
+    flight.fly(60.0)
+    flight.floor[2] = 0.0
+    rows = flight.fly(21.0)
+    held = rows.estimate[(rows.time_s < rows.time_s[0] + 20.0), vector.DEPTH]
+    # The rise that was followed fades as the vehicle stops; then depth stays.
+    assert np.ptp(held[-100:]) < 0.01
+    assert abs(held[-1] - held[0]) < 0.1
+    assert rows.report[-1, slot.REASON] == safety.NO_BOTTOM

@@ -1,0 +1,270 @@
+"""Stops: references that can be followed, one tick against its twin, and closed loops."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.limits import SPOT_RAD_S, STEP_MPS
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
+from alice_survey.sim.vehicle.pilot.guidance import steer
+from alice_survey.sim.vehicle.pilot.memory import new_pilot
+from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
+from alice_survey.sim.vehicle.pilot.path import Path
+from alice_survey.sim.vehicle.pilot.settings import (
+    Guidance,
+    pilot_guidance,
+    stop_speeds,
+)
+from alice_survey.sim.vehicle.pilot.standing import STOP_M, STOP_RAD, ramp
+from tests import oracles_guidance as oracle
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import (
+    DEEPEST_M,
+    Flight,
+    Rows,
+    gains_of,
+    launch,
+    with_stops,
+)
+
+TICK_S = 0.05
+QUARTER = math.pi / 2
+SPOTS = with_stops(
+    [("go", 3.0, 0), ("spot", QUARTER), ("go", 1.0), ("spot", QUARTER), ("go", 3.0, 1)]
+)
+STEPS = with_stops([("go", 3.0, 0), ("step", 1.0), ("spot", math.pi), ("go", 3.0, 1)])
+MOTIONS = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
+SCALES = np.array([0.2, 0.2, 1.0, 0.1, 0.1, 0.15, 0.2, 0.2, 0.1, 0.05, 0.05, 0.2])
+
+
+@given(goal=st.floats(0.02, 20.0), most=st.floats(0.05, 0.5), acceleration=st.floats(0.02, 0.5))
+@settings(deadline=None, max_examples=60)
+def test_a_reference_goes_as_far_as_the_closed_form_says(
+    goal: float, most: float, acceleration: float
+) -> None:
+    at, speed, time_s = 0.0, 0.0, 0.0
+    top = min(most, math.sqrt(goal * acceleration))
+    total_s = goal / top + top / acceleration
+    while at < goal:
+        before, last = at, speed
+        at, speed, quicken = ramp(at, speed, goal, most, acceleration, TICK_S)
+        time_s += TICK_S
+        assert before <= at <= goal
+        assert 0.0 <= speed <= most + 1e-12
+        assert abs(quicken) <= acceleration + 1e-12
+        assert speed - last <= acceleration * TICK_S + 1e-12
+        # Held for a tick, and late by less than two of them.
+        here = oracle.trapezoid(goal, most, acceleration, time_s)[0]
+        assert abs(at - here) <= 2.0 * top * TICK_S
+        assert time_s < total_s + 1.0
+    assert speed == 0.0
+    assert time_s > total_s - 3 * TICK_S - 2.0 * math.sqrt(2.0 * TICK_S**2)
+
+
+@given(speed=st.floats(0.0, 0.4), goal=st.floats(0.0, 2.0))
+@settings(deadline=None, max_examples=40)
+def test_a_reference_that_is_too_fast_still_stops_at_its_goal(speed: float, goal: float) -> None:
+    at = 0.0
+    for _ in range(2000):
+        at, speed, quicken = ramp(at, speed, goal, 0.2, 0.05, TICK_S)
+        assert at <= goal
+        assert abs(quicken) <= 0.05 + 1e-12
+    assert (at, speed) == (goal, 0.0)
+
+
+def test_a_reference_without_a_pace_waits() -> None:
+    at, speed = 1.0, 0.2
+    for _ in range(200):
+        at, speed, _ = ramp(at, speed, 5.0, 0.0, 0.05, TICK_S)
+    assert speed == 0.0
+    # 0.2^2 / (2 x 0.05) = 0.4 m of braking.
+    assert at == pytest.approx(1.4, abs=0.02)
+
+
+def guidance_of(path: Path, name: str = "alice") -> Guidance:
+    gains = gains_of(name, path.speed_mps)
+    return pilot_guidance(gains, path, "sway" if name == "alice" else "los", most_depth_m=DEEPEST_M)
+
+
+@pytest.mark.parametrize(("leg", "progress"), [(1, 0.4), (2, 0.8), (0, 2.7)])
+@given(motion=MOTIONS, share=st.floats(0.0, 1.0))
+@settings(deadline=None, max_examples=60)
+def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
+    leg: int, progress: float, motion: Array, share: float
+) -> None:
+    path, gains = STEPS, gains_of("alice")
+    guidance, pilot = guidance_of(path), new_pilot()
+    fastest = (0.2, guidance.step_mps, guidance.spot_rad_s)[leg]
+    slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.spot_rad_s2)[leg]
+    goal = (path.length_m[0], path.length_m[1], abs(path.turn_rad[2]))[leg]
+    speed = share * fastest
+    pilot.report[[slot.PHASE, slot.LEG, slot.ALONG]] = slot.FOLLOW, leg, progress
+    pilot.memory[[slot.STANDING, slot.REF, slot.REF_SPEED]] = 1.0, progress, speed
+    pilot.memory[[slot.RAMP, slot.RAMP_SPEED]] = progress, speed
+    _, rate, quicken = ramp(progress, speed, goal, fastest, slowing, TICK_S)
+    # What thrusters that lag make of it.
+    rate = speed + (rate - speed) * TICK_S / gains.axes[(SURGE, SWAY, YAW)[leg], LAG]
+    after = min(progress + rate * TICK_S, goal)
+    start, course = np.array([path.start_n[leg], path.start_e[leg]]), path.heading_rad[leg]
+    ahead = np.array([math.cos(course), math.sin(course)])
+    if leg == 2:
+        sense = math.copysign(1.0, path.turn_rad[leg])
+        place, moves, quickens = start, np.zeros(2), np.zeros(2)
+        turning = np.array([course + sense * after, sense * rate, sense * quicken])
+    else:
+        place, moves, quickens = start + after * ahead, rate * ahead, quicken * ahead
+        turning = np.array([course + path.side_rad[leg], 0.0, 0.0])
+    estimate = np.append(SCALES * motion, [2.0, 2.0])
+    estimate[[vector.NORTH, vector.EAST]] += place - np.array([0.55, 0.0])
+    estimate[vector.DEPTH] += 13.0
+    estimate[vector.HEADING] += turning[0]
+    # Near enough that the reference does not wait.
+    point, _ = oracle.point_motion(estimate, guidance)
+    behind = start + progress * ahead - point[:2] if leg < 2 else np.zeros(2)
+    assume(behind @ ahead < 0.3)
+    assume(abs(SCALES[5] * motion[5]) + 0.05 < math.radians(20.0))
+    expected = oracle.standing_demand(
+        estimate, guidance, gains, path.speed_mps, place, moves, quickens, turning
+    )
+    wrench = np.zeros(6)
+    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+    found = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(wrench, oracle.wrench(gains, pilot.demand), atol=1e-9)
+
+
+def glass_of(flight: Flight, rows: Rows) -> Array:
+    """(T, 2) where the followed point is."""
+    heading, lever = rows.estimate[:, vector.HEADING], flight.guidance.point_body_m
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    across = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    return np.asarray(rows.estimate[:, :2] + lever[0] * ahead + lever[1] * across)
+
+
+def on_leg(rows: Rows, leg: int) -> Array:
+    following = rows.report[:, slot.PHASE] == slot.FOLLOW
+    return np.asarray(following & (rows.report[:, slot.LEG] == leg))
+
+
+@pytest.mark.parametrize("current", [(0.0, 0.0), (0.1, 30.0), (0.2, 90.0)])
+def test_alice_turns_on_the_spot_about_her_port(current: tuple[float, float]) -> None:
+    flight = launch(SPOTS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
+    rows = flight.fly(90.0)
+    assert rows.phases()[-1] == slot.ASCEND
+    glass = glass_of(flight, rows)
+    for leg in (1, 3):
+        on = on_leg(rows, leg)
+        away = np.linalg.norm(
+            glass[on] - [SPOTS.start_n[leg], SPOTS.start_e[leg]], axis=1
+        )  # fmt: skip
+        assert 0.005 < away.max() < 0.2
+        rate = np.rad2deg(rows.estimate[on, vector.R])
+        assert 13.0 < rate.max() < 20.0
+        assert rate.min() > -3.0
+        # Six seconds at full rate and the ramp of it; then it is left at once.
+        assert 6.5 < on.sum() * TICK_S < 11.0
+        end = rows.estimate[on, vector.HEADING][-1]
+        turned = math.remainder(end - SPOTS.heading_rad[leg] - QUARTER, 2 * math.pi)
+        assert abs(turned) < 1.5 * STOP_RAD
+    after = rows.on_lines()
+    second = after.report[:, slot.LINE] == 1
+    assert np.abs(after.cross_m[second]).max() < 0.1
+
+
+@pytest.mark.parametrize("current", [(0.0, 0.0), (0.1, 30.0), (0.2, 90.0)])
+def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -> None:
+    flight = launch(STEPS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
+    rows = flight.fly(90.0)
+    assert rows.phases()[-1] == slot.ASCEND
+    on, glass = on_leg(rows, 1), glass_of(flight, rows)
+    assert np.abs(np.rad2deg(rows.estimate[on, vector.HEADING])).max() < 4.0
+    assert np.abs(glass[on, 0] - 3.0).max() < 0.2
+    np.testing.assert_allclose(glass[on][-1], [3.0, 1.0], atol=1.5 * STOP_M)
+    sideways = np.diff(glass[on, 1]) / TICK_S
+    assert 0.12 < sideways.max() < 0.2
+    # 1 m at 0.15 m/s, and two ramps.
+    assert 6.7 < on.sum() * TICK_S < 12.0
+
+
+def test_the_vehicle_comes_to_rest_before_it_turns() -> None:
+    flight = launch(SPOTS, at_ned=(-1.2, 0.0, 0.0), following=True)
+    rows = flight.fly(60.0)
+    on = on_leg(rows, 0)
+    speed = np.hypot(rows.estimate[on, vector.U], rows.estimate[on, vector.V])
+    assert speed.max() > 0.18
+    assert speed[-1] < 0.06
+    # Not long before: from full speed it takes no more than its braking and the loop's settling.
+    slow = np.flatnonzero(speed < 0.18)
+    braking = slow[slow > np.argmax(speed)]
+    assert 2.0 < len(braking) * TICK_S < 12.0
+
+
+def test_a_turn_goes_its_given_way_even_if_it_is_longer() -> None:
+    path = with_stops([("go", 2.0, 0), ("spot", -1.5 * math.pi), ("go", 2.0, 1)])
+    rows = launch(path, at_ned=(-1.2, 0.0, 0.0), following=True).fly(60.0)
+    heading = np.unwrap(rows.estimate[:, vector.HEADING])
+    assert rows.phases()[-1] == slot.ASCEND
+    assert heading[-1] - heading[0] == pytest.approx(-1.5 * math.pi, abs=0.05)
+
+
+def test_a_vehicle_without_sway_turns_and_goes_on_but_takes_no_steps() -> None:
+    flight = launch(SPOTS, "sparus2", "los", at_ned=(-1.2, 0.0, 0.0), following=True)
+    rows = flight.fly(120.0)
+    assert rows.phases()[-1] == slot.ASCEND
+    # It swings about its middle: along its heading the port is in its place again.
+    on = on_leg(rows, 1)
+    off = glass_of(flight, rows)[on][-1] - [3.0, 0.0]
+    heading = rows.estimate[on, vector.HEADING][-1]
+    assert abs(off @ [math.cos(heading), math.sin(heading)]) < 2 * STOP_M
+    assert np.linalg.norm(off) > 0.3
+    with pytest.raises(VehicleError, match=r"1 sway step.* los "):
+        guidance_of(STEPS, "sparus2")
+
+
+def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
+    path, guidance, gains = SPOTS, guidance_of(SPOTS), gains_of("alice")
+    pilot, wrench = new_pilot(), np.zeros(6)
+    pilot.report[[slot.PHASE, slot.LEG]] = slot.FOLLOW, 1
+    pilot.memory[[slot.STANDING, slot.REF, slot.RAMP]] = 1.0, QUARTER, QUARTER
+    estimate = np.zeros(vector.ESTIMATE)
+    # The port 0.25 m beyond its place, for ever.
+    estimate[[vector.NORTH, vector.EAST]] = 3.25 - 0.05, -0.55
+    estimate[[vector.HEADING, vector.DEPTH]] = QUARTER, 13.0
+    estimate[[vector.ALTITUDE, vector.CLEARANCE]] = 2.0
+    left = None
+    for tick in range(600):
+        steer(tick * TICK_S, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+        if pilot.report[slot.LEG] == 2.0:
+            left = tick * TICK_S
+            break
+    # 0.1 m (1 + t / 5 s) reaches 0.25 m after 7.5 s.
+    assert left == pytest.approx(7.5, abs=0.2)
+
+
+def test_carried_off_a_stop_the_vehicle_comes_back_to_it() -> None:
+    flight = launch(SPOTS, at_ned=(-1.2, 0.0, 0.0), following=True)
+    flight.fly(30.0)
+    assert flight.pilot.report[slot.LEG] == 1.0
+    flight.state[0] -= 9.0
+    rows = flight.fly(200.0)
+    assert rows.phases() == [
+        slot.APPROACH, slot.FOLLOW, slot.ASCEND, slot.DONE,
+    ]  # fmt: skip
+    on = on_leg(rows, 2)
+    assert np.abs(rows.cross_m[on]).max() < 0.3
+
+
+def test_stops_are_no_faster_than_the_vehicle() -> None:
+    gains = gains_of("alice")
+    assert stop_speeds(gains, 0.55, by_sway=True) == (SPOT_RAD_S, STEP_MPS)
+    rate, step = stop_speeds(gains, 2.0, by_sway=True, spot_rad_s=9.0)
+    assert step == STEP_MPS
+    assert rate == min(gains.axes[SWAY, FASTEST] / 2.0, gains.axes[YAW, FASTEST])
+    assert stop_speeds(gains_of("sparus2"), 0.55, by_sway=False)[1] == 0.0

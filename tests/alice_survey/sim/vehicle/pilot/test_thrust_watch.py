@@ -1,0 +1,151 @@
+"""Thrusters that turn and push nothing are found by force, and sound ones are left alone."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.pilot.thrust_watch import FALSE_ALARM_H, NavigatedStretch, ThrustWatch
+from alice_survey.sim.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure
+from alice_survey.sim.vehicle.vehicle import Vehicle
+from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, survey_like
+
+TICK_S, STRETCH = 0.05, 100
+ALICE = vehicle_from("alice")
+NAMES = tuple(thruster.name for thruster in ALICE.thrusters)
+GUST_N = np.array([0.5, 0.5, 0.5, 0.0, 0.0, 0.1])
+SOUND_S = 60.0
+
+
+def without(name: str, share: float = 0.0) -> Vehicle:
+    """ALICE with a share of a thruster's thrust and torque left."""
+    return replace(
+        ALICE,
+        thrusters=tuple(
+            thruster
+            if thruster.name != name
+            else replace(
+                thruster,
+                kt_forward=thruster.kt_forward * max(share, 1e-9),
+                kt_reverse=thruster.kt_reverse * max(share, 1e-9),
+                kq_forward=thruster.kq_forward * share,
+                kq_reverse=thruster.kq_reverse * share,
+                advance_slope=thruster.advance_slope * share,
+                torque_slope=thruster.torque_slope * share,
+            )
+            for thruster in ALICE.thrusters
+        ),
+    )
+
+
+@cache
+def flown(name: str, share: float, seed: int, duration_s: float = 60.0) -> tuple[Array, Array]:
+    """What navigation and thrusters say, (T, 12) and (T, n), of a vehicle in gusts of 2 s."""
+    rng, gust = np.random.default_rng(seed), np.zeros(6)
+    truth = ALICE if not name else without(name, share)
+    kept = math.exp(-TICK_S / 2.0)
+
+    def push() -> Array:
+        gust[:] = kept * gust + math.sqrt(1.0 - kept**2) * GUST_N * rng.normal(size=6)
+        return gust
+
+    begin_s = float(rng.uniform(0.0, 120.0))
+    log = fly(
+        truth, duration_s=duration_s, push=push, asked=lambda time_s: survey_like(time_s + begin_s)
+    )
+    motion = np.column_stack([log.velocity_body, log.rates_body])
+    motion += rng.normal(size=motion.shape) * ([0.001] * 3 + [0.0005] * 3)
+    angles = Rotation.from_quat(log.quaternion_xyzw).as_euler("ZYX")[:, ::-1]
+    rps = np.column_stack([log.rpm[one] / 60.0 for one in NAMES])
+    return np.column_stack([log.position_ned, angles, motion]), rps
+
+
+def judged(
+    watch: ThrustWatch, begin_s: float, flight: tuple[Array, Array], water_mps: float = 0.0
+) -> tuple[list[FoundFailure], list[Array]]:
+    found, sums = [], []
+    for first in range(0, len(flight[0]), STRETCH):
+        part = slice(first, first + STRETCH)
+        end_s = begin_s + (first + STRETCH) * TICK_S
+        current = np.array([water_mps, 0.0])
+        found += watch.judge(
+            end_s, NavigatedStretch(flight[0][part], current, 0.05), flight[1][part]
+        )
+        sums.append(watch.sums)
+    return found, sums
+
+
+def test_sound_thrusters_add_up_to_less_than_chance_allows() -> None:
+    """The stated rate of false alarms rests on it: a sum is above x no more often than exp(-x)."""
+    sums = []
+    for seed in range(6):
+        found, own = judged(ThrustWatch(ALICE, TICK_S), 0.0, flown("", 1.0, seed, 120.0))
+        assert found == []
+        sums += own
+    table = np.array(sums)
+    assert table.shape == (6 * 24, len(NAMES))
+    assert 0.0 < table.max() < 6.0
+    for above in (1.0, 2.0, 4.0):
+        assert np.mean(table > above) < math.exp(-above)
+    alarm = ThrustWatch(ALICE, TICK_S).alarm
+    # Lorden's bound for each of the thrusters, by the stated hours of all.
+    assert math.exp(alarm) * WATCHED_S / 3600.0 / len(NAMES) == pytest.approx(FALSE_ALARM_H)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_thruster_that_pushes_nothing_is_found_in_two_minutes(name: str) -> None:
+    delays = []
+    for seed in range(3):
+        watch = ThrustWatch(ALICE, TICK_S)
+        assert judged(watch, 0.0, flown("", 1.0, seed))[0] == []
+        found, _ = judged(watch, SOUND_S, flown(name, 0.0, 10 + seed, 120.0))
+        assert found == [FoundFailure(time_s=found[0].time_s, thruster=name, left=0.0, turns=True)]
+        delays.append(found[0].time_s - SOUND_S)
+    assert 5.0 <= min(delays) <= max(delays) <= 120.0
+
+
+def test_a_model_that_is_off_and_a_wrong_current_are_no_failure() -> None:
+    """Drag of 1.3 times, thrust of 0.8, and a current of 0.1 m/s that is not there."""
+    values = ALICE.coefficients.values
+    draggy = ALICE.with_coefficients(
+        ALICE.coefficients.replaced(
+            "draggy", {name: 1.3 * values[name] for name in ("X_uu", "Y_vv", "Z_ww", "N_rr")}
+        )
+    )
+    strong = replace(
+        ALICE,
+        thrusters=tuple(
+            replace(t, kt_forward=1.25 * t.kt_forward, kt_reverse=1.25 * t.kt_reverse)
+            for t in ALICE.thrusters
+        ),
+    )
+    for believed, water_mps in ((draggy, 0.0), (strong, 0.0), (ALICE, 0.1)):
+        for seed in range(2):
+            flight = flown("", 1.0, seed, 120.0)
+            found, sums = judged(ThrustWatch(believed, TICK_S), 0.0, flight, water_mps)
+            assert found == []
+            assert np.max(sums) < 8.0
+
+
+def test_a_thruster_that_is_known_to_be_gone_is_not_found_again() -> None:
+    watch = ThrustWatch(ALICE, TICK_S)
+    judged(watch, 0.0, flown("", 1.0, 0))
+    watch.known_gone("stern")
+    flight, rps = flown("stern", 0.0, 10)
+    assert judged(watch, SOUND_S, (flight, rps))[0] == []
+    assert watch.sums[NAMES.index("stern")] == 0.0
+
+
+def test_estimates_that_are_none_are_not_judged() -> None:
+    watch = ThrustWatch(ALICE, TICK_S)
+    flight, rps = flown("", 1.0, 0)
+    unknown = NavigatedStretch(flight[:STRETCH] * np.nan, np.zeros(2), 0.1)
+    assert watch.judge(5.0, unknown, rps[:STRETCH]) == []
+    short = NavigatedStretch(flight[:10], np.zeros(2), 0.1)
+    assert watch.judge(5.0, short, rps[:10]) == []
+    assert not watch.sums.any()

@@ -1,0 +1,196 @@
+"""Fins: lift, drag and stall of a surface, and the motion of a vehicle that they steer."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.fins import Fin, add_fins, fin_slope, pack_fins, write_fin_matrix
+from tests import oracles_dynamics as oracle
+from tests.alice_survey.sim.vehicle.motions import (
+    SHEAR_AND_TIDE,
+    advance,
+    rates,
+    rotations,
+    state_of,
+)
+from tests.alice_survey.sim.vehicle.test_dynamics_motion import thrust_of_all_laws
+
+Array = NDArray[np.float64]
+REMUS = vehicle_from("remus100")
+PLANE = Fin(
+    name="plane", positions_body_m=((-0.6, 0.1, 0.02),), shaft_body=(0.0, 1.0, 0.0), area_m2=0.01,
+    aspect_ratio=2.0, most_angle_deg=20.0, most_rate_deg_s=40.0, profile_drag=0.01,
+)  # fmt: skip
+SPEEDS = st.floats(-2.0, 2.0)
+
+
+def wrench(fin: Fin, angle: float, nu: Array) -> Array:
+    force = np.zeros(6)
+    add_fins(pack_fins([fin], 1000.0), np.array([angle]), nu, force)
+    return force
+
+
+def test_lift_of_a_plane_at_a_small_angle() -> None:
+    """1/2 rho A U^2 a alpha, with a = 1 / (1 / (1.8 pi) + 1 / (2 pi)) = 2.976 per radian: at 2 m/s
+    and 3 deg 3.117 N, up at the stern (shaft to starboard); its drag is induced, and profile."""
+    force = wrench(PLANE, math.radians(3.0), np.array([2.0, 0, 0, 0, 0, 0]))
+    lift = 0.5 * 1000 * 0.01 * 4 * 2.9762 * math.radians(3.0)
+    drag = 20.0 * (0.01 + (2.9762 * math.radians(3.0)) ** 2 / (0.9 * math.pi * 2.0))
+    assert force[2] == pytest.approx(-lift, rel=1e-4)
+    assert force[0] == pytest.approx(-drag, rel=1e-4)
+    assert force[1] == 0.0
+    np.testing.assert_allclose(force[3:], np.cross([-0.6, 0.1, 0.02], force[:3]), atol=1e-12)
+
+
+def test_a_fin_square_to_the_flow_is_a_plate() -> None:
+    force = wrench(PLANE, 0.0, np.array([0, 0, 1.5, 0, 0, 0]))
+    assert force[2] == pytest.approx(-0.5 * 1000 * 0.01 * 1.5**2 * (0.56 + 0.01))
+    assert abs(force[0]) < 1e-12
+
+
+def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
+    alpha = np.radians(np.linspace(-180.0, 180.0, 3601))
+    lift = np.array([-wrench(PLANE, a, np.array([1.0, 0, 0, 0, 0, 0]))[2] for a in alpha]) / 5.0
+    assert np.degrees(abs(alpha[np.argmax(lift)])) == pytest.approx(21.0, abs=2.0)
+    assert 0.9 < lift.max() < 1.2
+    assert np.abs(np.diff(lift)).max() < 0.025
+    np.testing.assert_allclose(lift, -lift[::-1], atol=1e-12)
+
+
+def _triple(place: Array) -> tuple[float, float, float]:
+    x, y, z = place.tolist()
+    return x, y, z
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    nu=st.tuples(*[SPEEDS] * 6),
+    angles=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)),
+    roll=st.floats(-math.pi, math.pi),
+)
+def test_the_wrench_is_that_of_vectors_in_space(
+    nu: tuple[float, ...], angles: tuple[float, float], roll: float
+) -> None:
+    """Any motion, any angles, the tail turned about its axis."""
+    turned = Rotation.from_euler("x", roll)
+    fins = tuple(
+        replace(
+            fin,
+            shaft_body=_triple(turned.apply(fin.shaft_body)),
+            positions_body_m=tuple(map(_triple, turned.apply(fin.positions_body_m))),
+            profile_drag=0.01,
+        )
+        for fin in REMUS.fins
+    )
+    vehicle, force = replace(REMUS, fins=fins), np.zeros(6)
+    add_fins(vehicle.plant.fins, np.array(angles), np.array(nu), force)
+    expected = oracle.fin_wrench(vehicle, np.array(angles), np.array(nu))
+    np.testing.assert_allclose(force, expected, atol=1e-10 * (1.0 + np.abs(expected).max()))
+
+
+@settings(max_examples=40, deadline=None)
+@given(nu=st.tuples(*[SPEEDS] * 6))
+def test_fins_that_are_not_turned_take_energy_out(nu: tuple[float, ...]) -> None:
+    force, motion = np.zeros(6), np.array(nu)
+    add_fins(REMUS.plant.fins, np.zeros(2), motion, force)
+    assert force @ motion <= 1e-12
+
+
+def test_the_matrix_of_fins_is_the_slope_of_their_wrench() -> None:
+    nu, step = np.array([1.2, 0, 0, 0, 0, 0]), 1e-6
+    matrix = np.zeros((6, 3))
+    write_fin_matrix(REMUS.plant.fins, nu, matrix, 1)
+    for drive in range(2):
+        ends = []
+        for sign in (1.0, -1.0):
+            force, angles = np.zeros(6), np.zeros(2)
+            angles[drive] = sign * step
+            add_fins(REMUS.plant.fins, angles, nu, force)
+            ends.append(force)
+        slope = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(matrix[:, 1 + drive], slope, atol=1e-6 * np.abs(slope).max())
+    assert not matrix[:, 0].any()
+    assert matrix[4, 1] < -10.0 and matrix[5, 2] < -10.0
+    write_fin_matrix(REMUS.plant.fins, -nu, matrix, 1)
+    assert not matrix.any()
+
+
+def test_the_slope_by_velocity_is_that_of_fixed_fins() -> None:
+    """Y_uv = -rho a S u of two fins, N_ur that times x^2 (Prestero's equations 4.51 and 4.52)."""
+    slope = fin_slope(REMUS.plant.fins, np.array([1.5, 0, 0, 0, 0, 0]))
+    force = 1030.0 * 3.1166 * 0.00665 * 1.5
+    np.testing.assert_allclose(slope[[1, 2], [1, 2]], force, rtol=1e-4)
+    np.testing.assert_allclose(slope[[4, 5], [4, 5]], 0.638**2 * force, rtol=1e-4)
+    # In roll all four are lifted by their own motion.
+    assert slope[3, 3] == pytest.approx(2 * 0.108**2 * force, rel=1e-4)
+
+
+def test_a_drive_lags_and_is_limited_in_rate_and_angle() -> None:
+    """From rest to 30 deg asked: 60 deg/s, then exp(-t / 0.1 s) to its limit of 13.6 deg."""
+    state = state_of(REMUS)
+    command = np.array([0.0, math.radians(30.0), math.radians(-1.0)])
+    assert rates(REMUS, state, command_rps=command)[14] == pytest.approx(math.radians(60.0))
+    states = advance(REMUS, state, 1.0, 0.01, command_rps=command)
+    angles = np.degrees(states[:, 14:])
+    until_s = (13.6 - 6.0) / 60.0
+    time_s = np.arange(len(states)) * 0.01
+    expected = np.where(
+        time_s < until_s, 60.0 * time_s, 13.6 - 6.0 * np.exp(-(time_s - until_s) / 0.1)
+    )
+    np.testing.assert_allclose(angles[:, 0], expected, atol=0.05)
+    np.testing.assert_allclose(angles[:, 1], -(1.0 - np.exp(-time_s / 0.1)), atol=1e-3)
+
+
+def test_runge_kutta_agrees_with_an_adaptive_method() -> None:
+    """Propeller and fins at work, moved at will every 2 s, in a current that changes with depth and
+    time. Positions in m, attitudes in rad, velocities in m/s and rad/s. The rate limit of the
+    drives, and the stall, have kinks: the error hangs on how steps fall about them."""
+    rng = np.random.default_rng(5)
+    times = np.arange(0.0, 21.0, 2.0)
+    commands = rng.uniform(-1, 1, (len(times) - 1, 3)) * np.array([6.0, 0.2, 0.25])
+    commands[:, 0] += 9.0
+    loads = np.zeros((len(times) - 1, 6))
+    nu, attitude = np.array([1.0, 0.05, -0.04, 0.05, -0.03, 0.1]), (0.1, -0.05, 0.7)
+    start = np.array([0.0, 0.0, 5.0, *attitude])
+    at_rest = np.zeros(REMUS.actuators)
+    eta, velocity, actuators = oracle.integrate(
+        REMUS, SHEAR_AND_TIDE, start, nu, at_rest, times, commands, loads, thrust_of_all_laws
+    )
+    assert np.all(np.ptp(velocity, axis=0) > 0.05)
+    rows = [state_of(REMUS, nu, attitude)]
+    for i, time_s in enumerate(times[:-1]):
+        state = advance(REMUS, rows[-1], 2.0, 0.01, loads[i], SHEAR_AND_TIDE, time_s, commands[i])
+        rows.append(state[-1])
+    states = np.array(rows)
+    truth = Rotation.from_matrix([oracle.ned_from_body(row[3:]) for row in eta])
+    errors = (
+        np.abs(states[:, :3] - eta[:, :3]).max(),
+        (rotations(states).inv() * truth).magnitude().max(),
+        np.abs(states[:, 7:13] - velocity).max(),
+        np.abs(states[:, 13:] - actuators).max(),
+    )
+    assert 1e-7 < max(errors) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"shaft_body": (1.0, 0.0, 0.0)}, "square to x"),
+        ({"shaft_body": (0.0, 2.0, 0.0)}, "square to x"),
+        ({"area_m2": 0.0}, "area_m2 0.0"),
+        ({"most_angle_deg": 120.0}, "most_angle_deg"),
+        ({"positions_body_m": ()}, "positions_body_m"),
+        ({"aspect_ratio": -1.0}, "aspect_ratio"),
+    ],
+)
+def test_what_is_no_fin_is_refused(changes: dict[str, object], named: str) -> None:
+    with pytest.raises(VehicleError, match=named):
+        replace(PLANE, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,128 @@
+"""The closed loop as a whole: what it records must be one motion, and the same each time."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.dynamics import STATE, rk4_step, scratch_for
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.navigation.sensors import SensorSuite
+from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.pilot.memory import APPROACH, ASCEND, DIVE, DONE, FOLLOW, PHASE
+from alice_survey.sim.vehicle.pilot.path import path_from_legs
+from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
+from alice_survey.sim.vehicle.sea import Disturbance, constant_current
+from alice_survey.sim.vehicle.simulated_vehicle import STEPS, TICK_S
+from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
+
+CURRENT = constant_current(0.1, 60.0)
+STILL = Disturbance()
+GUSTS = Disturbance(sigma=(3.0, 3.0, 3.0, 0.0, 0.0, 0.0))
+
+
+def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
+    """A line of 6 m, 2 m above a floor at 5 m."""
+    craft = vehicle_from("alice")
+    path = path_from_legs([(0.0, 0.0)], [0.3], [6.0], [0.0], [0], 2.0, 0.2)
+    gains = gains_for(craft, 0.2)
+    return Setup(
+        vehicle=craft,
+        path=path,
+        guidance=pilot_guidance(gains, path, "sway", most_depth_m=5.0),
+        gains=gains,
+        sensors=SensorSuite().pack(),
+        floor=level_floor(5.0),
+        current=CURRENT,
+        disturbance=disturbance,
+        health={} if failed is None else {failed: 0.0},
+        start_heading_rad=0.3,
+    )
+
+
+@pytest.fixture(scope="module")
+def calm() -> Flown:
+    return simulate(setup(), np.random.default_rng(1), longest_s=300.0, label="test")
+
+
+@pytest.fixture(scope="module")
+def gusty() -> Flown:
+    return simulate(setup(GUSTS), np.random.default_rng(1), longest_s=300.0, label="test")
+
+
+def test_a_mission_passes_through_its_phases_in_order(calm: Flown) -> None:
+    phases = calm.report[:, PHASE]
+    seen = phases[np.concatenate([[True], np.diff(phases) != 0])]
+    order = [DIVE, APPROACH, FOLLOW, ASCEND, DONE]
+    assert seen.tolist() == order
+    assert 60.0 < calm.time_s[-1] < 200.0
+    np.testing.assert_allclose(np.diff(calm.time_s), TICK_S, rtol=1e-9)
+
+
+def test_the_recorded_velocity_is_that_of_the_recorded_positions(calm: Flown) -> None:
+    way = np.diff(calm.truth[:, :3], axis=0)
+    mean = 0.5 * (calm.truth[1:, 7:10] + calm.truth[:-1, 7:10])
+    # The trapezium rule's error is the change of acceleration within a tick.
+    assert np.abs(way / TICK_S - mean).max() < 2e-3
+    turned = Rotation.from_quat(calm.truth[:-1, 3:7]).inv() * Rotation.from_quat(
+        calm.truth[1:, 3:7]
+    )
+    rates = 0.5 * (calm.truth[1:, 10:13] + calm.truth[:-1, 10:13])
+    assert np.abs(turned.as_rotvec() / TICK_S - rates).max() < 5e-3
+
+
+def test_velocity_over_ground_is_that_through_water_and_the_current(calm: Flown) -> None:
+    to_ned = Rotation.from_quat(calm.state[:, 3:7])
+    water = calm.truth[:, 7:10] - to_ned.apply(calm.state[:, 7:10])
+    expected = [0.1 * math.cos(math.radians(60)), 0.1 * math.sin(math.radians(60)), 0.0]
+    np.testing.assert_allclose(water, np.tile(expected, (len(water), 1)), atol=1e-12)
+
+
+def test_commands_replayed_give_the_same_motion(calm: Flown) -> None:
+    plant, state = vehicle_from("alice").plant, calm.state[0].copy()
+    scratch, load = scratch_for(5), np.zeros(6)
+    for k in range(len(calm.time_s) - 1):
+        for i in range(STEPS):
+            time_s = calm.time_s[k] + i * TICK_S / STEPS
+            rk4_step(
+                time_s, TICK_S / STEPS, state, calm.command_rps[k].copy(), load, plant, CURRENT,
+                scratch,
+            )  # fmt: skip
+    np.testing.assert_array_equal(state, calm.state[-1])
+
+
+def test_gusts_shake_the_vehicle_and_calm_water_does_not(calm: Flown, gusty: Flown) -> None:
+    def wobble(flown: Flown) -> float:
+        rows = flown.report[:, PHASE] == FOLLOW
+        return float(np.std(np.diff(flown.state[rows, 8])))
+
+    assert wobble(gusty) > 1.2 * wobble(calm)
+
+
+def test_the_same_seed_flies_the_same_way_and_another_does_not(gusty: Flown) -> None:
+    again = simulate(setup(GUSTS), np.random.default_rng(1), longest_s=300.0, label="test")
+    other = simulate(setup(GUSTS), np.random.default_rng(2), longest_s=300.0, label="test")
+    np.testing.assert_array_equal(again.state, gusty.state)
+    np.testing.assert_array_equal(again.navigation, gusty.navigation)
+    rows = min(len(other.state), len(gusty.state))
+    assert np.abs(other.state[:rows, :3] - gusty.state[:rows, :3]).max() > 1e-3
+
+
+def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
+    flown = simulate(setup(), np.random.default_rng(1), longest_s=10.0, label="test")
+    assert len(flown.time_s) == 200
+    assert flown.report[-1, PHASE] == DIVE
+
+
+def test_an_unknown_thruster_cannot_fail() -> None:
+    with pytest.raises(VehicleError, match=r"'warp'.* starboard, port"):
+        simulate(setup(failed="warp"), np.random.default_rng(1), longest_s=1.0, label="test")
+
+
+def test_a_failed_thruster_does_not_turn() -> None:
+    flown = simulate(setup(failed="stern"), np.random.default_rng(1), longest_s=120.0, label="test")
+    assert np.all(flown.state[:, STATE + 4] == 0.0)
+    assert np.abs(flown.state[:, STATE + 3]).max() > 1.0

@@ -1,0 +1,100 @@
+"""Steady motion against the equations of motion."""
+
+import math
+
+import numpy as np
+import pytest
+
+from alice_survey.sim.vehicle.dynamics import derivative, initial_state, scratch_for
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.propulsion import add_thrust
+from alice_survey.sim.vehicle.sea import constant_current
+from alice_survey.sim.vehicle.steady import BALANCED, drag_power, steady_flight
+
+ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
+RNG = np.random.default_rng(1)
+
+
+def _planar() -> np.ndarray:
+    """Motions of a survey: surge, sway, a little heave, turning."""
+    nu = np.zeros((30, 6))
+    nu[:, 0] = RNG.uniform(-0.2, 0.6, 30)
+    nu[:, 1] = RNG.uniform(-0.25, 0.25, 30)
+    nu[:, 2] = RNG.uniform(-0.05, 0.05, 30)
+    nu[:, 5] = RNG.uniform(-0.2, 0.2, 30)
+    return nu
+
+
+def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
+    """No acceleration is left in surge, sway, heave and yaw: force, N and N m, below 1e-6."""
+    nu = _planar()
+    flight = steady_flight(ALICE, nu)
+    assert np.all(np.isfinite(flight.power_w))
+    plant, still = ALICE.plant, constant_current(0.0, 0.0)
+    scratch = scratch_for(5)
+    for i in range(len(nu)):
+        state = initial_state(np.array([0.0, 0.0, 10.0]), np.zeros(3), 5, nu[i])
+        state[13:] = flight.rps[i]
+        rate = np.zeros(18)
+        derivative(0.0, state, flight.rps[i], np.zeros(6), plant, still, scratch, rate)
+        force = plant.body.mass @ rate[7:13]
+        assert np.abs(force[list(BALANCED)]).max() < 1e-6
+
+
+def test_power_of_a_sound_figure_is_known() -> None:
+    """0.2 m/s ahead: 15.23 x 0.04 N of drag, and 0.98 N of buoyancy held down."""
+    nu = np.zeros((1, 6))
+    nu[0, 0] = 0.2
+    flight = steady_flight(ALICE, nu)
+    assert drag_power(ALICE.plant.body, nu)[0] == pytest.approx(15.23 * 0.2**3, rel=1e-12)
+    made = np.zeros(6)
+    add_thrust(ALICE.plant.propulsion, flight.rps[0], nu[0], made)
+    assert made[0] == pytest.approx(15.23 * 0.2**2, abs=1e-9)
+    assert made[2] == pytest.approx(0.1 * 9.80665, abs=1e-9)
+    assert made[1] == pytest.approx(0.0, abs=1e-9)
+    assert 1.5 < flight.power_w[0] < 3.0  # 0.12 W of drag through small, lossy propellers
+    assert 0.0 < flight.load[0] < 0.1
+
+
+def test_what_cannot_be_kept_is_nan_and_a_slip_may_be_left() -> None:
+    nu = np.array([[0.2, 0.1, 0, 0, 0, 0], [0.2, 0.0, 0, 0, 0, 0], [9.0, 0.0, 0, 0, 0, 0.0]])
+    flight = steady_flight(SPARUS, nu)
+    assert np.isnan(flight.power_w).tolist() == [True, False, True]
+    assert np.isnan(flight.rps).all(axis=1).tolist() == [True, False, True]
+    slipping = steady_flight(SPARUS, nu, slips=True)
+    assert np.isnan(slipping.power_w).tolist() == [False, False, True]
+
+
+def test_a_share_of_thrust_bounds_the_load() -> None:
+    nu = np.zeros((60, 6))
+    nu[:, 1] = np.linspace(0.01, 0.6, 60)
+    whole, part = steady_flight(ALICE, nu), steady_flight(ALICE, nu, share=0.5)
+    kept = np.isfinite(part.power_w)
+    assert 10 < kept.sum() < np.isfinite(whole.power_w).sum() < 60
+    assert np.all(part.load[kept] <= 0.5 + 1e-9)
+    assert np.all(whole.load[~kept & np.isfinite(whole.load)] > 0.5 - 1e-9)
+    # Speeds squared are thrust but for the drag of the flow: at the bound the share is used up.
+    assert part.load[kept].max() > 0.45
+
+
+def test_one_lateral_thruster_is_made_up_for_by_the_pair_astern() -> None:
+    nu = np.zeros((1, 6))
+    nu[0, :2] = 0.2, 0.08
+    sound, lame = steady_flight(ALICE, nu), steady_flight(ALICE.without(["bow"]), nu)
+    assert lame.power_w[0] > 2 * sound.power_w[0]
+    assert math.isfinite(lame.power_w[0])
+
+
+def test_turning_while_the_water_stands_still_over_ground_takes_its_acceleration() -> None:
+    """Turning in place in a current, velocity relative to the water turns in the body: M nu'."""
+    nu = np.array([[0.1, 0.05, 0, 0, 0, 0.2]])
+    rate = np.array([[0.2 * 0.05, -0.2 * 0.1, 0, 0, 0, 0]])
+    flight = steady_flight(ALICE, nu, rate)
+    plant = ALICE.plant
+    state = initial_state(np.array([0.0, 0.0, 10.0]), np.zeros(3), 5, nu[0])
+    state[13:] = flight.rps[0]
+    out = np.zeros(18)
+    still = constant_current(0.0, 0.0)
+    derivative(0.0, state, flight.rps[0], np.zeros(6), plant, still, scratch_for(5), out)
+    left = plant.body.mass @ (out[7:13] - rate[0])
+    assert np.abs(left[list(BALANCED)]).max() < 1e-6
